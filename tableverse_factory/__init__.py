@@ -9,27 +9,27 @@ if TYPE_CHECKING:
     from tableverse_factory.dataset.dataset import Dataset, open_dataset
     from tableverse_factory.dataset.scene import Scene
     from tableverse_factory.delivery.learning import (
-        Grid,
-        ManyScenes,
         SceneDataset,
+        SceneGrid,
         SceneStream,
         TableEnv,
         Variation,
-        scene_grid,
+        VectorSim,
+        build_scene_grid,
     )
 
 __all__ = [
     "Dataset",
-    "Grid",
-    "ManyScenes",
     "Scene",
     "SceneDataset",
+    "SceneGrid",
     "SceneStream",
     "TableEnv",
     "Variation",
+    "VectorSim",
     "__version__",
+    "build_scene_grid",
     "open_dataset",
-    "scene_grid",
 ]
 
 _DATASET = {"Dataset", "Scene", "open_dataset"}

@@ -1,4 +1,4 @@
-"""A dataset without what may not be passed on: whole shards rewritten, scene by scene byte for byte the same."""
+"""Dataset filtered by license for redistribution: shards are rewritten, each remaining scene byte for byte the same."""
 
 import json
 import re
@@ -13,27 +13,13 @@ import pyarrow as pa
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
-from tableverse_factory.core.storage.files import (
-    StoragePath,
-    atomic_file,
-    list_names,
-    open_to_read,
-    read_table,
-    write_atomic,
-)
-from tableverse_factory.dataset.card import dataset_card
-from tableverse_factory.dataset.consolidated_tables import write_merged
+from tableverse_factory.core.storage.files import StoragePath, atomic_file, list_names, open_stream, write_atomic
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet, read_table
+from tableverse_factory.dataset.card import make_dataset_card
+from tableverse_factory.dataset.consolidated_tables import write_merged_tables
 from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, scene_license
 from tableverse_factory.dataset.shard_plan import Plan, read_plan, write_plan
-from tableverse_factory.dataset.shards import (
-    SPARSE,
-    TarShard,
-    committed_shards,
-    parquet_bytes,
-    rows_to_table,
-    shard_path,
-    tar_order,
-)
+from tableverse_factory.dataset.shards import SPARSE, TarShard, committed_shards, shard_path, tar_sort_key
 from tableverse_factory.models.local.hf_weights import hub_name
 from tableverse_factory.run_record import diff_run_records, read_run, resume_refused_error, write_run
 
@@ -43,26 +29,24 @@ _TABLES: Mapping[str, pa.Schema] = {
     "timings": TIMINGS,
     "trajectories": TRAJECTORIES,
 }
-_BEGUN = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
-"""What an export that was killed before `run.json` leaves."""
+_LEFTOVER_FILES = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
+"""Files of an export that was killed before `run.json`."""
 
 _PRIVATE_SUFFIXES = ("_dir", "_url")
-"""Values of the configuration whose names end so are places of whoever built."""
-_PROGRAM = re.compile(r"[\w.+-]+")
-_WORD = "…"
-"""For each word of a command that is not passed on."""
-
+"""Configuration keys with these suffixes name the builder's own paths and addresses."""
+_PLAIN_NAME = re.compile(r"[\w.+-]+")
+_REDACTED = "…"  # replaces each word of a command
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class FilterResult:
-    """What was passed on.
+    """Summary of a filtered dataset.
 
     Attributes:
         kept: Scenes with a row in the new dataset.
         done: Those of them that have files.
-        left_out: Scenes that stayed behind, by verdict.
+        left_out: Number of scenes left out, by verdict.
     """
 
     kept: int
@@ -71,55 +55,54 @@ class FilterResult:
 
 
 def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str) -> FilterResult:
-    """Writes the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
+    """Write the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
 
-    Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Of `uri` only what
-    the public may open stays (see `public_uri`), and of the configuration what `redact_config` leaves.
-
-    Only one process may write to `dest` at a time: the caller holds its lock.
+    Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Private parts of
+    `uri` (see `redact_uri`) and of the configuration (see `redact_config`) are removed. The caller holds the lock of
+    `dest`.
 
     Args:
         out: A finished dataset.
-        dest: A new or empty folder, or one where the same was begun.
+        dest: A new or empty folder, or one where the same export was begun.
         profile: One of `licences.PROFILES`.
 
     Raises:
-        BuildError: if `out` is not finished, `dest` holds something else, or the disk refuses.
-        InputError: if a table of `out` does not read; `nothing_to_publish` if no licence allows it.
+        BuildError: if `out` is not finished, `dest` holds other files, or the disk refuses.
+        InputError: if a table of `out` cannot be read; `nothing_to_publish` if no license allows it.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     missing = plan.n_shards - len(committed_shards(out))
     if missing:
         raise BuildError(f"{out} is not finished: {missing} of {plan.n_shards} shards are missing; build on first")
-    shards, left_out = _allowed(out, plan.n_shards, profile)
+    shards, left_out = _select_rows(out, plan.n_shards, profile)
     kept = [row for _, rows in shards for row in rows]
     if not kept:
-        raise InputError(_nothing(profile, left_out), "nothing_to_publish")
+        raise InputError(_explain_nothing(profile, left_out), "nothing_to_publish")
     digest = content_hash(json.dumps(shards, sort_keys=True).encode())
     published = {"profile": profile, "scenes": len(kept), "rows_sha256": digest}
     record = {**run, "config": redact_config(run.get("config", {})), "published": published}
-    _begin(dest, record, shards)
+    _start_dataset(dest, record, shards)
     there = committed_shards(dest)
     for number, (source, rows) in enumerate(shards):
         if number not in there:
             _write_shard(out, source, dest, number, rows)
-    write_merged(dest, len(shards))
-    write_atomic(dest / "README.md", dataset_card(dest, record, range(len(shards))).encode())
+    write_merged_tables(dest, len(shards))
+    write_atomic(dest / "README.md", make_dataset_card(dest, record, range(len(shards))).encode())
     return FilterResult(len(kept), sum(row["status"] == "done" for row in kept), left_out)
 
 
-def _allowed(
+def _select_rows(
     out: StoragePath, n_shards: int, profile: str
 ) -> tuple[list[tuple[int, list[Row]]], Counter[LicenceVerdict]]:
-    """The rows that may be passed on, by the number of their shard; shards without any are left out."""
+    """Select rows that may be redistributed, by shard number, without empty shards."""
     allowed, left_out = PROFILES[profile], Counter[LicenceVerdict]()
     shards: list[tuple[int, list[Row]]] = []
     for number in range(n_shards):
         rows = []
-        for row in _rows(out, "scenes", number, SCENES):
+        for row in _read_rows(out, "scenes", number, SCENES):
             verdict = scene_license(row)
             if verdict in allowed:
-                places = {"uri": public_uri(row["uri"] or ""), "url": public_uri(row["url"] or "") or None}
+                places = {"uri": redact_uri(row["uri"] or ""), "url": redact_uri(row["url"] or "") or None}
                 rows.append({**row, **places, "detail": None, "licence_verdict": verdict.value})
             else:
                 left_out[verdict] += 1
@@ -128,8 +111,8 @@ def _allowed(
     return shards, left_out
 
 
-def _nothing(profile: str, left_out: Mapping[LicenceVerdict, int]) -> str:
-    """Why nothing may be passed on, and where licences are stated."""
+def _explain_nothing(profile: str, left_out: Mapping[LicenceVerdict, int]) -> str:
+    """Explain why nothing may be redistributed, and where licenses are stated."""
     counts = ", ".join(f"{count} {verdict.value}" for verdict, count in sorted(left_out.items()))
     return (
         f"no scene may be passed on as {profile}: {counts}. A licence is stated where the input lies: in source.json "
@@ -138,13 +121,13 @@ def _nothing(profile: str, left_out: Mapping[LicenceVerdict, int]) -> str:
     )
 
 
-def _begin(dest: StoragePath, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
+def _start_dataset(dest: StoragePath, record: Mapping[str, Any], shards: Sequence[tuple[int, Sequence[Row]]]) -> None:
     run_json = dest / "run.json"
     if run_json.exists():
         if differing := diff_run_records(read_run(run_json), record):
             raise resume_refused_error(str(dest), differing, "")
         return
-    if dest.is_file() or not _BEGUN.issuperset(list_names(dest)):
+    if dest.is_file() or not _LEFTOVER_FILES.issuperset(list_names(dest)):
         raise BuildError(f"{dest} holds something else: give a new or an empty folder")
     placed = [(row, number) for number, (_, rows) in enumerate(shards) for row in rows]
     ids, kinds = (tuple(str(row[key]) for row, _ in placed) for key in ("scene_id", "kind"))
@@ -153,31 +136,31 @@ def _begin(dest: StoragePath, record: Mapping[str, Any], shards: Sequence[tuple[
 
 
 def _write_shard(out: StoragePath, source: int, dest: StoragePath, number: int, rows: Sequence[Row]) -> None:
-    """One shard, its scenes file last: that is the commit."""
+    """Write one shard, its scenes file last as the commit."""
     places: dict[str, tuple[int, int]] = {}
-    with open_to_read(shard_path(out, "mjcf", source)) as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
+    with open_stream(shard_path(out, "mjcf", source)) as old, atomic_file(shard_path(dest, "mjcf", number)) as file:
         tar = TarShard(file)
-        for row in sorted(rows, key=lambda row: tar_order(row["scene_id"])):
+        for row in sorted(rows, key=lambda row: tar_sort_key(row["scene_id"])):
             if row["tar_offset"] is not None:
                 places[row["scene_id"]] = tar.copy(old, row["tar_offset"], row["tar_size"])
         tar.close()
     kept = {row["scene_id"] for row in rows}
     for table, schema in _TABLES.items():
-        own = [row for row in _rows(out, table, source, schema) if row["scene_id"] in kept]
+        own = [row for row in _read_rows(out, table, source, schema) if row["scene_id"] in kept]
         if table in SPARSE and not own:
             continue
-        write_atomic(shard_path(dest, table, number), parquet_bytes(rows_to_table(own, schema)))
-    scenes = [_placed(row, number, places.get(row["scene_id"])) for row in rows]
-    write_atomic(shard_path(dest, "scenes", number), parquet_bytes(rows_to_table(scenes, SCENES)))
+        write_atomic(shard_path(dest, table, number), encode_parquet(build_table(own, schema)))
+    scenes = [_place_row(row, number, places.get(row["scene_id"])) for row in rows]
+    write_atomic(shard_path(dest, "scenes", number), encode_parquet(build_table(scenes, SCENES)))
 
 
-def _placed(row: Row, number: int, place: tuple[int, int] | None) -> Row:
+def _place_row(row: Row, number: int, place: tuple[int, int] | None) -> Row:
     offset, size = place or (None, None)
     return {**row, "shard": number, "tar_offset": offset, "tar_size": size}
 
 
-def public_uri(uri: str) -> str:
-    """An address on the web without user, query and fragment; of everything else the last name, without its folders."""
+def redact_uri(uri: str) -> str:
+    """Reduce a web address to scheme, host and path, and anything else to its last name."""
     try:
         parts = urlsplit(uri)
         on_the_web = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
@@ -189,38 +172,38 @@ def public_uri(uri: str) -> str:
 
 
 def redact_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration with empty paths and addresses, and no word of a command but its program's name.
+    """Empty paths and addresses of a configuration, and all words of commands except the program's name.
 
-    Of the robot's file, of weights on the disk and of a program the last name stays, without its folders; weights of
-    the hub stay as they are. What is without places already stays as it is.
+    The robot's file, local weights and programs keep their last name; weights of the hub stay as they are. A redacted
+    configuration stays unchanged.
     """
-    return {key: _without_places(key, value) for key, value in config.items()}
+    return {key: _redact_value(key, value) for key, value in config.items()}
 
 
-def _without_places(key: str, value: Any) -> Any:
+def _redact_value(key: str, value: Any) -> Any:
     if isinstance(value, Mapping):
         return redact_config(value)
     if key.endswith(_PRIVATE_SUFFIXES):
         return ""
     if key.endswith("_command"):
-        return [_program(str(word)) if place == 0 else _WORD for place, word in enumerate(value)]
+        return [_redact_program(str(word)) if place == 0 else _REDACTED for place, word in enumerate(value)]
     if key.endswith("_weights"):
         on_hub = key != "detector_weights" and hub_name(str(value)) is not None
-        return value if on_hub else _last_name(str(value))
-    return public_uri(str(value)) if key == "robot" else value
+        return value if on_hub else _strip_folders(str(value))
+    return redact_uri(str(value)) if key == "robot" else value
 
 
-def _program(word: str) -> str:
-    """Of what starts a process no more than a plain name: arguments may hold tokens, hosts and folders in any form."""
-    name = _last_name(word)
-    return name if _PROGRAM.fullmatch(name) else _WORD
+def _redact_program(word: str) -> str:
+    """Keep a program's plain name; arguments may hold tokens, hosts and folders in any form."""
+    name = _strip_folders(word)
+    return name if _PLAIN_NAME.fullmatch(name) else _REDACTED
 
 
-def _last_name(path: str) -> str:
+def _strip_folders(path: str) -> str:
     return re.split(r"[/\\]", path.rstrip("/\\"))[-1]
 
 
-def _rows(out: StoragePath, table: str, number: int, schema: pa.Schema) -> list[Row]:
+def _read_rows(out: StoragePath, table: str, number: int, schema: pa.Schema) -> list[Row]:
     path = shard_path(out, table, number)
     try:
         rows: list[Row] = read_table(path, schema).to_pylist()

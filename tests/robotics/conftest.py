@@ -3,9 +3,9 @@
 import pytest
 
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.robots.panda import build_panda
 
 
 @pytest.fixture(scope="session")
 def arm() -> Arm:
-    return panda()
+    return build_panda()

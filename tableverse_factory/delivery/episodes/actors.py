@@ -1,4 +1,4 @@
-"""Who moves in a film, and who stands: the arm, the carried object, what was pushed, and the rest of the scene."""
+"""Meshes of a recorded scene: what moves (arm, carried and pushed objects), and what stands still."""
 
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
@@ -11,42 +11,43 @@ import trimesh
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.episodes.incremental_renderer import Props
-from tableverse_factory.geometry.math.transforms import compose, inverse, normalized_quaternion, transform_points
-from tableverse_factory.physics.mjcf.drawables import box_mesh, geom_color, geom_mesh, scenery_of_model
+from tableverse_factory.delivery.episodes.incremental_renderer import PaintedMeshes
+from tableverse_factory.geometry.math.transforms import (
+    compose_poses,
+    invert_pose,
+    normalize_quaternion,
+    transform_points,
+)
+from tableverse_factory.physics.mjcf.drawables import load_scenery, make_box_mesh, read_geom_color, read_geom_mesh
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import PEDESTAL_HEIGHT_M, PEDESTAL_SHARE, PEDESTAL_TOP_M
 
 _VISUAL_GROUP = 2
 _PEDESTAL_COLOR = (82, 87, 94)
-_SECTIONS = 24
-"""Sides of what is round."""
+_SECTIONS = 24  # sides of round primitives
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cast(Frozen):
-    """Everything that a film shows.
+class RenderScene(Frozen):
+    """Meshes to render.
 
     Attributes:
         still: In the table frame.
-        moving: Each in its own frame: first those of objects, then the arm's.
-        names: Of the object that each of the first of `moving` belongs to.
+        moving: Each in its own frame: objects first, then the arm's.
+        names: Object id of each of the first of `moving`.
     """
 
-    still: Props
-    moving: Props
+    still: PaintedMeshes
+    moving: PaintedMeshes
     names: tuple[str, ...]
 
 
-class ArmFigure:
-    """An arm as meshes, a part per body, and where they are for its joints."""
+class ArmMeshes:
+    """Arm as one mesh per body, with their poses as functions of the joints."""
 
     def __init__(self, arm: Arm) -> None:
-        """Compiles the arm on its own.
-
-        Args:
-            arm: Which.
+        """Compile the arm on its own.
 
         Raises:
             InputError: `bad_arm` if MuJoCo refuses it.
@@ -58,50 +59,50 @@ class ArmFigure:
         self._data = mujoco.MjData(self._model)
         joints = (*arm.joint_names, *arm.finger_joints)
         self._addresses = [int(self._model.joint(name).qposadr[0]) for name in joints]
-        shown = _shown_geoms(self._model)
+        shown = _list_visual_geoms(self._model)
         self._bodies = sorted({int(self._model.geom_bodyid[geom]) for geom in shown})
-        self._column = _cylinder(PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2)
-        self.meshes = tuple(_body_mesh(self._model, body, shown) for body in self._bodies)
+        self._column = _make_cylinder(PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2)
+        self.meshes = tuple(_merge_body_mesh(self._model, body, shown) for body in self._bodies)
 
     @property
     def n_positions(self) -> int:
-        """Joints and fingers."""
+        """Number of joints and fingers."""
         return len(self._addresses)
 
     def pedestal(self, base: Pose) -> TriangleMesh:
-        """What the base stands on, in the table frame; on the table, the slab hides most of it."""
+        """Return the base's pedestal in the table frame; on the table, the slab hides most of it."""
         middle = np.array([0.0, 0.0, PEDESTAL_TOP_M - PEDESTAL_HEIGHT_M / 2])
         return TriangleMesh(transform_points(base, self._column.vertices + middle), self._column.faces)
 
     def poses(self, positions: np.ndarray, base: Pose) -> list[Pose]:
-        """Poses of the meshes in the table frame; positions of joints and fingers of shape (j + f,), base there."""
+        """Compute the meshes' poses in the table frame from positions of joints and fingers. Shape (j + f,)."""
         self._data.qpos[self._addresses] = positions
         mujoco.mj_kinematics(self._model, self._data)
         return [
-            compose(
-                base, Pose(np.array(self._data.xpos[body]), normalized_quaternion(np.array(self._data.xquat[body])))
+            compose_poses(
+                base, Pose(np.array(self._data.xpos[body]), normalize_quaternion(np.array(self._data.xquat[body])))
             )
             for body in self._bodies
         ]
 
 
-def cast_of(scene: Scene, x_id: str, figure: ArmFigure, recording: Recording) -> Cast:
-    """The scene's meshes told apart by whether their object was recorded as moved, and the arm on its pedestal.
+def build_recorded_scene(scene: Scene, x_id: str, figure: ArmMeshes, recording: Recording) -> RenderScene:
+    """Split the scene's meshes into recorded as moved and still, and add the arm on its pedestal.
 
     Raises:
-        InputError: if the scene does not load, or has no object `x_id` or none that was recorded.
+        InputError: if the scene does not load, or has no object `x_id` or one that was recorded.
     """
-    return cast_with(scene, {x_id, *recording.moved_ids}, figure, recording.base)
+    return build_render_scene(scene, {x_id, *recording.moved_ids}, figure, recording.base)
 
 
-def cast_with(scene: Scene, moved: AbstractSet[str], figure: ArmFigure, base: Pose) -> Cast:
-    """The same with any objects that may move, and the arm's base in the table frame.
+def build_render_scene(scene: Scene, moved: AbstractSet[str], figure: ArmMeshes, base: Pose) -> RenderScene:
+    """Split the scene's meshes into `moved` and still objects, and add the arm with its base in the table frame.
 
     Raises:
-        InputError: if the scene does not load, or has none of an object.
+        InputError: if the scene does not load, or lacks an object.
     """
     model = scene.model()
-    scenery = scenery_of_model(model)
+    scenery = load_scenery(model)
     if absent := sorted(moved - set(scenery.names)):
         raise InputError(f"scene {scene.scene_id} has no object {absent[0][:80]!r} to move", "no_such_object")
     data = mujoco.MjData(model)
@@ -112,22 +113,22 @@ def cast_with(scene: Scene, moved: AbstractSet[str], figure: ArmFigure, base: Po
     meshes = []
     for k in taken:
         body = data.body(names[k])
-        to_object = inverse(Pose(np.array(body.xpos), normalized_quaternion(np.array(body.xquat))))
+        to_object = invert_pose(Pose(np.array(body.xpos), normalize_quaternion(np.array(body.xquat))))
         meshes.append(replace(scenery.parts[k], vertices=transform_points(to_object, scenery.parts[k].vertices)))
-    return Cast(
-        Props(
+    return RenderScene(
+        PaintedMeshes(
             (*(scenery.parts[k] for k in still), figure.pedestal(base)),
             (*(scenery.colors[k] for k in still), _PEDESTAL_COLOR),
         ),
-        Props((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),
+        PaintedMeshes((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),
         tuple(names[k] for k in taken),
     )
 
 
-def poses_over_time(
-    cast: Cast, figure: ArmFigure, recording: Recording, samples: Sequence[int]
+def iterate_poses(
+    cast: RenderScene, figure: ArmMeshes, recording: Recording, samples: Sequence[int]
 ) -> Iterator[list[Pose]]:
-    """Poses of everything that moves, at some samples of a recording.
+    """Iterate poses of everything that moves, at some samples of a recording.
 
     Raises:
         InputError: `bad_arrays` if the recording is of another arm.
@@ -146,45 +147,45 @@ def poses_over_time(
 
 def _pose(numbers: np.ndarray) -> Pose:
     values = numbers.astype(np.float64)
-    return Pose(values[:3], normalized_quaternion(values[3:]))
+    return Pose(values[:3], normalize_quaternion(values[3:]))
 
 
-def _shown_geoms(model: mujoco.MjModel) -> list[int]:
-    """Geoms made to be looked at; all of them where there is none."""
+def _list_visual_geoms(model: mujoco.MjModel) -> list[int]:
+    """List visual geoms, or all where there are none."""
     solid = [geom for geom in range(model.ngeom) if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE]
     return [geom for geom in solid if model.geom_group[geom] == _VISUAL_GROUP] or solid
 
 
-def _body_mesh(model: mujoco.MjModel, body: int, shown: Sequence[int]) -> TriangleMesh:
-    """All geoms of a body as one mesh in its frame, each in its own colour."""
+def _merge_body_mesh(model: mujoco.MjModel, body: int, shown: Sequence[int]) -> TriangleMesh:
+    """Merge all geoms of a body into one mesh in its frame, each in its own color."""
     vertices, faces, colors, first = [], [], [], 0
     for geom in (geom for geom in shown if model.geom_bodyid[geom] == body):
-        mesh = _geom_solid(model, geom)
-        quaternion = normalized_quaternion(np.array(model.geom_quat[geom]))
+        mesh = _load_geom_mesh(model, geom)
+        quaternion = normalize_quaternion(np.array(model.geom_quat[geom]))
         vertices.append(transform_points(Pose(np.array(model.geom_pos[geom]), quaternion), mesh.vertices))
         faces.append(mesh.faces + first)
-        colors.append(np.tile(np.array(geom_color(model, geom), dtype=np.uint8), (len(mesh.vertices), 1)))
+        colors.append(np.tile(np.array(read_geom_color(model, geom), dtype=np.uint8), (len(mesh.vertices), 1)))
         first += len(mesh.vertices)
     return TriangleMesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.concatenate(colors))
 
 
-def _geom_solid(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+def _load_geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), np.array(model.geom_size[geom])
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return geom_mesh(model, geom)
+        return read_geom_mesh(model, geom)
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return box_mesh(size)
+        return make_box_mesh(size)
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         solid = trimesh.creation.capsule(height=2 * size[1], radius=size[0], count=[_SECTIONS, _SECTIONS // 2])
         solid.apply_translation([0.0, 0.0, -solid.bounds.mean(axis=0)[2]])
     elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return _cylinder(size[0], size[1])
+        return _make_cylinder(size[0], size[1])
     else:
         solid = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
         solid.apply_scale(size if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0])
     return TriangleMesh(np.array(solid.vertices), np.array(solid.faces, dtype=np.int32))
 
 
-def _cylinder(radius: float, half_height: float) -> TriangleMesh:
+def _make_cylinder(radius: float, half_height: float) -> TriangleMesh:
     solid = trimesh.creation.cylinder(height=2 * half_height, radius=radius, sections=_SECTIONS)
     return TriangleMesh(np.array(solid.vertices), np.array(solid.faces, dtype=np.int32))

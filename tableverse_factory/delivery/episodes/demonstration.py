@@ -1,4 +1,4 @@
-"""An episode as robomimic's samples: what was seen, what was done, and the simulator's whole state."""
+"""Episode as a robomimic demonstration: observations, actions, and the simulator's full state."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,18 +12,16 @@ from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.delivery.episodes.selection import Episode
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.robotics.robots.station import PREFIX, station_spec
+from tableverse_factory.robotics.robots.station import PREFIX, build_station_spec
 
 ENVIRONMENT = "TableVerse"
-_GYM_TYPE = 2
-"""robomimic knows three types of environments; this is the one that asks for nothing else."""
-
+_GYM_TYPE = 2  # robomimic's environment type with the fewest requirements
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demonstration(Frozen):
-    """One episode, `n` samples.
+    """Episode of `n` samples.
 
     Attributes:
         actions: Command that leads to the next sample, -1 to 1 between its limits. Shape (n, j + 1).
@@ -31,8 +29,8 @@ class Demonstration(Frozen):
         dones: 1 at the end. Shape (n,), int64.
         states: Time, qpos and qvel of the model. Shape (n, 1 + nq + nv).
         observations: By name, each of shape (n, …).
-        model: MJCF of the scene with the arm where it stood.
-        assets: Files that the model names.
+        model: MJCF of the scene with the arm in place.
+        assets: Files that the model references.
     """
 
     actions: Float32[np.ndarray, "n k"]
@@ -44,19 +42,19 @@ class Demonstration(Frozen):
     assets: Mapping[str, bytes]
 
 
-def demonstration(episode: Episode, arm: Arm) -> Demonstration:
-    """The episode's samples.
+def build_demonstration(episode: Episode, arm: Arm) -> Demonstration:
+    """Build the episode's samples.
 
     Raises:
         InputError: if the scene does not load with the arm, or the recording is of another arm or object.
     """
     recording, count = episode.recording, len(episode.recording)
     files = episode.scene.files()
-    spec = station_spec(files, arm)
+    spec = build_station_spec(files, arm)
     pedestal = spec.body(f"{PREFIX}pedestal")
     pedestal.pos, pedestal.quat = recording.base.position, recording.base.quaternion_wxyz
     model = spec.compile()
-    low, high = action_limits(arm)
+    low, high = compute_action_limits(arm)
     following = np.minimum(np.arange(count) + 1, count - 1)
     scaled = 2.0 * (recording.command[following] - low) / (high - low) - 1.0
     last = np.arange(count) == count - 1
@@ -66,21 +64,21 @@ def demonstration(episode: Episode, arm: Arm) -> Demonstration:
         actions=np.clip(scaled, -1.0, 1.0).astype(np.float32),
         rewards=(last & bool(episode.row["success"])).astype(np.float32),
         dones=last.astype(np.int64),
-        states=_states(model, episode, arm),
-        observations=_observations(model, episode, len(arm.joint_names)),
+        states=_build_states(model, episode, arm),
+        observations=_build_observations(model, episode, len(arm.joint_names)),
         model=spec.to_xml(),
         assets={name: known[name] for name in sorted(used) if name in known},
     )
 
 
-def action_limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest command: joints [rad], then the opening [m]. Both of shape (j + 1,)."""
+def compute_action_limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest command: joints [rad], then the opening [m]. Both of shape (j + 1,)."""
     return np.array([*arm.lower, 0.0]), np.array([*arm.upper, arm.max_opening_m])
 
 
-def shared_arguments(episode: Episode, arm: Arm) -> dict[str, Any]:
-    """What robomimic keeps of the environment: `env_args`."""
-    low, high = action_limits(arm)
+def build_env_args(episode: Episode, arm: Arm) -> dict[str, Any]:
+    """Build robomimic's `env_args`."""
+    low, high = compute_action_limits(arm)
     return {
         "env_name": ENVIRONMENT,
         "type": _GYM_TYPE,
@@ -95,8 +93,8 @@ def shared_arguments(episode: Episode, arm: Arm) -> dict[str, Any]:
     }
 
 
-def _states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
-    """The model's state at each sample: what was recorded, and what did not move as it was exported.
+def _build_states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
+    """Build the model's state at each sample; objects that did not move stand as exported.
 
     Speeds of objects are differences of their poses.
     """
@@ -111,7 +109,7 @@ def _states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
         *((name, recording.poses_of(name)) for name in recording.moved_ids),
         (str(episode.row["x_id"]), recording.object_pose),
     ):
-        first = _free_joint(model, episode, name)
+        first = _find_free_joint(model, episode, name)
         qpos[:, first : first + 7] = poses
     qvel = np.zeros((len(recording), model.nv))
     for sample in range(1, len(recording)):
@@ -120,10 +118,10 @@ def _states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
     return np.concatenate([recording.time_s[:, None].astype(np.float64), qpos, qvel], axis=1)
 
 
-def _observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dict[str, np.ndarray]:
-    """Low-dimensional observations under robosuite's names and, as there, with quaternions xyzw."""
+def _build_observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dict[str, np.ndarray]:
+    """Build low-dimensional observations under robosuite's names and, as there, with quaternions xyzw."""
     recording, y_id = episode.recording, str(episode.row["y_id"])
-    body, reference = _body(model, episode, y_id), recording.poses_of(y_id)
+    body, reference = _find_body(model, episode, y_id), recording.poses_of(y_id)
     if reference is None:
         standing = np.concatenate([body.pos, body.quat]).astype(np.float32)
         reference = np.tile(standing, (len(recording), 1))
@@ -139,16 +137,16 @@ def _observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dic
     }
 
 
-def _free_joint(model: mujoco.MjModel, episode: Episode, name: str) -> int:
-    """Where an object's position and quaternion begin in qpos."""
-    body = _body(model, episode, name)
+def _find_free_joint(model: mujoco.MjModel, episode: Episode, name: str) -> int:
+    """Find where an object's position and quaternion begin in qpos."""
+    body = _find_body(model, episode, name)
     joint = int(body.jntadr[0])
     if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
         raise InputError(f"{episode.name}: {name[:80]!r} is no object that can move", "no_such_object")
     return int(model.jnt_qposadr[joint])
 
 
-def _body(model: mujoco.MjModel, episode: Episode, name: str) -> Any:
+def _find_body(model: mujoco.MjModel, episode: Episode, name: str) -> Any:
     try:
         return model.body(name)
     except KeyError:

@@ -1,4 +1,4 @@
-"""The film of a trajectory: the recorded states seen by a camera, without GL and without physics."""
+"""Film of a trajectory, rendered from recorded states without GL and without physics."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -8,48 +8,39 @@ from PIL import Image
 
 from schemas.geometry import Picture
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.episodes.actors import ArmFigure, cast_of, poses_over_time
-from tableverse_factory.delivery.episodes.incremental_renderer import MovingPictures
-from tableverse_factory.physics.render.views import Eye
+from tableverse_factory.delivery.episodes.actors import ArmMeshes, build_recorded_scene, iterate_poses
+from tableverse_factory.delivery.episodes.incremental_renderer import IncrementalRenderer
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.robotics.execution.arrays import Recording
 
 _QUALITY = 82
 _REST_MS = 1500
-_METHOD = 4
-"""Of the WebP encoder, 0 to 6: effort against size."""
+_METHOD = 4  # WebP encoder effort against size, 0 to 6
 
 
-def frames(
-    scene: Scene, x_id: str, recording: Recording, figure: ArmFigure, eye: Eye, samples: Sequence[int]
+def render_frames(
+    scene: Scene, x_id: str, recording: Recording, figure: ArmMeshes, eye: PosedCamera, samples: Sequence[int]
 ) -> Iterator[Picture]:
-    """A picture for each of the samples of a recording.
-
-    Args:
-        scene: Everything but what moves stands as it was exported.
-        x_id: The object that is carried.
-        recording: Of the trajectory.
-        figure: The arm that it was recorded with.
-        eye: The camera.
-        samples: Indices into the recording.
+    """Render samples of a recording; everything that did not move stands as exported.
 
     Raises:
-        InputError: if the scene does not load, has no such object, or the recording is of another arm.
+        InputError: if the scene does not load, lacks object `x_id`, or the recording is of another arm.
     """
-    cast = cast_of(scene, x_id, figure, recording)
-    pictures = MovingPictures(cast.still, cast.moving, eye)
-    for poses in poses_over_time(cast, figure, recording, samples):
-        yield pictures.frame(poses)
+    cast = build_recorded_scene(scene, x_id, figure, recording)
+    pictures = IncrementalRenderer(cast.still, cast.moving, eye)
+    for poses in iterate_poses(cast, figure, recording, samples):
+        yield pictures.render(poses)
 
 
-def samples_at(recording: Recording, fps: float) -> list[int]:
-    """The samples nearest to `fps` pictures per second, the first and the last among them."""
+def choose_samples(recording: Recording, fps: float) -> list[int]:
+    """Choose the samples nearest to `fps` frames per second, including the first and last."""
     last = len(recording) - 1
     count = max(int(np.ceil(last * recording.step_s * fps)), 1)
     return sorted(set(np.rint(np.linspace(0, last, count + 1)).astype(int).tolist()))
 
 
-def webp_bytes(pictures: Sequence[Picture], fps: float) -> bytes:
-    """An animated WebP that repeats after a rest at its end; every browser shows it without a player."""
+def encode_webp(pictures: Sequence[Picture], fps: float) -> bytes:
+    """Encode an animated WebP that repeats after a rest at its end."""
     images = [Image.fromarray(np.ascontiguousarray(picture)) for picture in pictures]
     file = io.BytesIO()
     images[0].save(

@@ -1,4 +1,4 @@
-"""An episode as the frames of a LeRobot dataset: what is seen, what is done next, when, and how it ends."""
+"""Episode as frames of a LeRobot dataset: state, action, time and outcome."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,24 +17,24 @@ _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A column of data/: its type, how many numbers it has, and their names."""
+    """Column of data/: its type, number of components, and their names."""
 
     dtype: str
     size: int
     names: tuple[str, ...] | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """As it stands in meta/info.json."""
+        """Return the entry of meta/info.json."""
         return {"dtype": self.dtype, "shape": [self.size], "names": list(self.names) if self.names else None}
 
     def arrow_type(self) -> pa.DataType:
-        """One number is a scalar, several a list of fixed length."""
+        """Return a scalar type for one component, else a list of fixed length."""
         kind = pa.type_for_alias(self.dtype)
         return kind if self.size == 1 else pa.list_(kind, self.size)
 
 
-def features(arm: Arm) -> dict[str, Feature]:
-    """Every column of data/ by name; `observation.…` and `action` are what policies take by themselves."""
+def list_features(arm: Arm) -> dict[str, Feature]:
+    """List every column of data/; policies read `observation.…` and `action` by default."""
     joints = arm.joint_names
     return {
         STATE: Feature("float32", len(joints) + len(arm.finger_joints), (*joints, *arm.finger_joints)),
@@ -52,11 +52,11 @@ def features(arm: Arm) -> dict[str, Feature]:
     }
 
 
-def stride(recording: Recording, fps: int | None) -> tuple[int, int]:
-    """Every how many samples a frame is taken, and the frames per second that this makes.
+def compute_stride(recording: Recording, fps: int | None) -> tuple[int, int]:
+    """Compute the samples per frame and the resulting frames per second.
 
     Raises:
-        InputError: `bad_fps` if the rhythm of the recording is no whole number per second, or no multiple of `fps`.
+        InputError: `bad_fps` if the recording's rate is not a whole number per second, or no multiple of `fps`.
     """
     rate = round(1.0 / recording.step_s)
     if abs(rate * recording.step_s - 1.0) > 1e-6:
@@ -74,17 +74,11 @@ def frame_samples(recording: Recording, every: int) -> list[int]:
     return list(range(0, len(recording), every))
 
 
-def columns(recording: Recording, samples: Sequence[int], fps: int, success: bool) -> dict[str, np.ndarray]:
-    """The columns of an episode that it decides by itself; `numbered` adds the others.
+def build_columns(recording: Recording, samples: Sequence[int], fps: int, success: bool) -> dict[str, np.ndarray]:
+    """Build an episode's own columns; `number_columns` adds the others.
 
-    A frame's action is the command that leads to the next frame: the state was measured just as the command of its
-    own sample was reached. The last frame's action is the last command.
-
-    Args:
-        recording: Of the episode.
-        samples: Those that become frames.
-        fps: Frames per second.
-        success: How it ended.
+    A frame's action is the command that leads to the next frame, as a state is measured when its own command has just
+    been reached. The last frame's action is the last command.
     """
     count = len(samples)
     following = [*samples[1:], len(recording) - 1]
@@ -102,15 +96,8 @@ def columns(recording: Recording, samples: Sequence[int], fps: int, success: boo
     }
 
 
-def numbered(values: dict[str, np.ndarray], episode: int, first: int, task: int) -> dict[str, np.ndarray]:
-    """All columns of an episode.
-
-    Args:
-        values: Its own.
-        episode: Its number.
-        first: Number of its first frame in the whole dataset.
-        task: Number of its sentence.
-    """
+def number_columns(values: dict[str, np.ndarray], episode: int, first: int, task: int) -> dict[str, np.ndarray]:
+    """Add the episode's number, the dataset-wide index from `first` on, and the task's number."""
     frame = values["frame_index"]
     return {
         **values,
@@ -120,8 +107,8 @@ def numbered(values: dict[str, np.ndarray], episode: int, first: int, task: int)
     }
 
 
-def table_of(values: dict[str, np.ndarray], known: dict[str, Feature]) -> pa.Table:
-    """The columns as Arrow."""
+def build_frame_table(values: dict[str, np.ndarray], known: dict[str, Feature]) -> pa.Table:
+    """Convert the columns to Arrow."""
     arrays = []
     for name, feature in known.items():
         flat = pa.array(np.ascontiguousarray(values[name]).reshape(-1), type=pa.type_for_alias(feature.dtype))

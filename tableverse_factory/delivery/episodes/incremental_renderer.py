@@ -1,7 +1,7 @@
-"""Many pictures of one scene, cheaply: what stands still is drawn once, only what moves is cast again.
+"""Incremental ray casting of a scene: still surfaces are rendered once, only moving parts are cast again.
 
-The look is that of `physics.render`: the same light, the same colours. What moves throws shadows on what stands still;
-it is not shadowed itself. Same input, same bytes.
+The look is that of `physics.render`: the same light and colors. Moving parts cast shadows on still surfaces and receive
+none. Same input, same bytes.
 """
 
 from collections.abc import Sequence
@@ -10,85 +10,85 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.geometry import Camera, Frozen, Picture, Points, Pose, TriangleMesh
-from tableverse_factory.geometry.math.transforms import compose, inverse, rotation_matrix, transform_points
+from tableverse_factory.geometry.math.camera import PosedCamera
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, rotation_matrix, transform_points
 from tableverse_factory.physics.render.raycast import Hits, Raycaster
-from tableverse_factory.physics.render.render import GAMMA, Lighting, Paint, Surfaces, light_maps, linear_light, lit
-from tableverse_factory.physics.render.views import Eye, resized
+from tableverse_factory.physics.render.render import (
+    GAMMA,
+    Lighting,
+    Paint,
+    Surfaces,
+    compute_light,
+    compute_light_maps,
+    srgb_to_linear,
+)
+from tableverse_factory.physics.render.views import resize_camera
 
-_FINE = 2
-"""Samples per pixel, along each side."""
-
+_SUPERSAMPLING = 2  # samples per pixel, along each side
 _SKY_RAYS = 6
 _LEVELS = 1 << 14
-_BEHIND_M = 0.02
-"""A part nearer to the camera's plane than this is looked for in the whole picture."""
-
+_NEAR_PLANE_M = 0.02  # A part nearer to the camera's plane than this is searched in the whole picture
 _SHADOW_MARGIN_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Props(Frozen):
-    """Meshes with their paints, in the table frame or each in a frame of its own."""
+class PaintedMeshes(Frozen):
+    """Meshes with their paints, in the table frame or each in its own frame."""
 
     meshes: tuple[TriangleMesh, ...]
     paints: tuple[Paint, ...]
 
 
-class MovingPictures:
-    """A scene as one camera sees it, ready to be drawn with its moving parts anywhere."""
+class IncrementalRenderer:
+    """Scene as one camera sees it, ready to be rendered with its moving parts anywhere."""
 
-    def __init__(self, still: Props, moving: Props, eye: Eye, lighting: Lighting | None = None) -> None:
-        """Draws what stands still.
-
-        Args:
-            still: In the table frame.
-            moving: Each in its own frame; `frame` says where those are.
-            eye: The camera and where it is.
-            lighting: Key light and sky; soft daylight by default.
-        """
+    def __init__(
+        self, still: PaintedMeshes, moving: PaintedMeshes, eye: PosedCamera, lighting: Lighting | None = None
+    ) -> None:
+        """Render still meshes in the table frame; moving ones are in their own frames. Soft daylight by default."""
         self._eye = eye
         self._lighting = lighting or Lighting()
-        self._fine = resized(eye.camera, _FINE * eye.camera.width)
-        self._moving = [_Part(mesh, paint) for mesh, paint in zip(moving.meshes, moving.paints, strict=True)]
+        self._fine = resize_camera(eye.camera, _SUPERSAMPLING * eye.camera.width)
+        self._moving = [_MovingPart(mesh, paint) for mesh, paint in zip(moving.meshes, moving.paints, strict=True)]
         self._levels = np.rint(255.0 * np.linspace(0.0, 1.0, _LEVELS) ** (1 / GAMMA)).astype(np.uint8)
         self._draw_still(still)
 
-    def _draw_still(self, still: Props) -> None:
+    def _draw_still(self, still: PaintedMeshes) -> None:
         caster, surfaces = Raycaster(still.meshes), Surfaces(still.meshes, still.paints)
         pose, shape = self._eye.camera_to_table, (self._fine.height, self._fine.width)
         hits = caster.cast(self._fine, pose)
         normals, albedo = surfaces.at(hits)
-        ambient, direct = lit(hits.points, normals, albedo, pose.position, self._lighting)
-        key, sky = light_maps(caster, hits, shape, self._lighting, True, _SKY_RAYS)
+        ambient, direct = compute_light(hits.points, normals, albedo, pose.position, self._lighting)
+        key, sky = compute_light_maps(caster, hits, shape, self._lighting, True, _SKY_RAYS)
         images = np.zeros((2, shape[0] * shape[1], 3), dtype=np.float32)
-        images[0] = linear_light(np.array(self._lighting.background))
+        images[0] = srgb_to_linear(np.array(self._lighting.background))
         images[0, hits.pixels] = ambient * sky[hits.pixels, None]
         images[1, hits.pixels] = direct * key[hits.pixels, None]
-        self._ambient, self._direct = (_coarse(image.reshape(*shape, 3)) for image in images)
+        self._ambient, self._direct = (_downsample(image.reshape(*shape, 3)) for image in images)
         self._depth = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
         self._depth[hits.pixels] = hits.depth
-        self._ground = _Ground(hits, self._fine, np.array(self._lighting.key_direction))
+        self._ground = _ShadowReceiver(hits, self._fine, np.array(self._lighting.key_direction))
 
-    def frame(self, poses: Sequence[Pose]) -> Picture:
-        """The picture with each moving part at its pose in the table frame. Shape (h, w, 3) sRGB."""
+    def render(self, poses: Sequence[Pose]) -> Picture:
+        """Render the picture with each moving part at its pose in the table frame. Shape (h, w, 3) sRGB."""
         height, width = self._eye.camera.height, self._eye.camera.width
         open_share = self._ground.open_share(self._moving, poses).reshape(height, width, 1)
         picture = (self._ambient + self._direct * open_share).reshape(-1, 3)
         pixels, colors = self._seen(poses)
         if len(pixels):
-            rows, columns = pixels // self._fine.width // _FINE, pixels % self._fine.width // _FINE
+            rows, columns = pixels // self._fine.width // _SUPERSAMPLING, pixels % self._fine.width // _SUPERSAMPLING
             coarse = rows * width + columns
             covered = np.bincount(coarse, minlength=len(picture))
             total = np.stack([np.bincount(coarse, colors[:, k], len(picture)) for k in range(3)], axis=1)
             touched = np.flatnonzero(covered)
-            share = (covered[touched] / _FINE**2)[:, None]
-            picture[touched] = picture[touched] * (1.0 - share) + total[touched] / _FINE**2
+            share = (covered[touched] / _SUPERSAMPLING**2)[:, None]
+            picture[touched] = picture[touched] * (1.0 - share) + total[touched] / _SUPERSAMPLING**2
         indices = (np.clip(picture, 0.0, 1.0) * (_LEVELS - 1)).astype(np.int32)
         levels: Picture = self._levels[indices].reshape(height, width, 3)
         return levels
 
     def _seen(self, poses: Sequence[Pose]) -> tuple[np.ndarray, np.ndarray]:
-        """Fine pixels in which something that moves is nearest, and the linear colours there."""
+        """Find subpixels in which a moving part is nearest, and their linear colors."""
         depth = self._depth.copy()
         owner = np.full(len(depth), -1, dtype=np.int32)
         looks = [
@@ -103,12 +103,12 @@ class MovingPictures:
         for number, (part, hits, pose) in enumerate(zip(self._moving, looks, poses, strict=True)):
             won = np.flatnonzero(owner[hits.pixels] == number)
             pixels.append(hits.pixels[won])
-            colors.append(part.colors(_chosen(hits, won), pose, self._eye.camera_to_table, self._lighting))
+            colors.append(part.colors(_select_hits(hits, won), pose, self._eye.camera_to_table, self._lighting))
         return np.concatenate(pixels), np.concatenate(colors)
 
 
-class _Part:
-    """One rigid part in its own frame: its tree of triangles is built once."""
+class _MovingPart:
+    """Rigid part in its own frame, with its triangle tree."""
 
     def __init__(self, mesh: TriangleMesh, paint: Paint) -> None:
         self.caster = Raycaster([mesh])
@@ -117,21 +117,21 @@ class _Part:
         self.corners: Points = np.array([[(low, high)[k >> a & 1][a] for a in range(3)] for k in range(8)])
 
     def look(self, camera: Camera, camera_to_table: Pose, pose: Pose) -> Hits:
-        """Where the camera's rays meet it: pixels of the whole picture, the rest in its own frame."""
+        """Cast the camera's rays on the part: pixels of the whole picture, the rest in its own frame."""
         left, top, width, height = self._window(camera, camera_to_table, pose)
         if width <= 0 or height <= 0:
-            return _nothing()
+            return _make_empty_hits()
         window = replace(camera, cx=camera.cx - left, cy=camera.cy - top, width=width, height=height)
-        hits = self.caster.cast(window, compose(inverse(pose), camera_to_table))
+        hits = self.caster.cast(window, compose_poses(invert_pose(pose), camera_to_table))
         rows, columns = np.divmod(hits.pixels, width)
         return replace(hits, pixels=(rows + top) * camera.width + columns + left)
 
     def _window(self, camera: Camera, camera_to_table: Pose, pose: Pose) -> tuple[int, int, int, int]:
-        """Left, top, width and height of the pixels that it may touch."""
-        seen = transform_points(compose(inverse(camera_to_table), pose), self.corners)
+        """Compute left, top, width and height of the pixels that it may cover."""
+        seen = transform_points(compose_poses(invert_pose(camera_to_table), pose), self.corners)
         if seen[:, 2].max() <= 0.0:
             return 0, 0, 0, 0
-        if seen[:, 2].min() < _BEHIND_M:
+        if seen[:, 2].min() < _NEAR_PLANE_M:
             return 0, 0, camera.width, camera.height
         x = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx
         y = camera.fy * seen[:, 1] / seen[:, 2] + camera.cy
@@ -139,23 +139,23 @@ class _Part:
         return left, top, min(int(x.max()) + 2, camera.width) - left, min(int(y.max()) + 2, camera.height) - top
 
     def colors(self, hits: Hits, pose: Pose, camera_to_table: Pose, lighting: Lighting) -> np.ndarray:
-        """Linear colours at hits in its own frame. Shape (n, 3)."""
+        """Compute linear colors at hits in its own frame. Shape (n, 3)."""
         if not len(hits.pixels):
             return np.zeros((0, 3))
         normals, albedo = self._surfaces.at(hits)
         turned = normals @ rotation_matrix(pose.quaternion_wxyz).T
         points = transform_points(pose, hits.points)
-        ambient, direct = lit(points, turned, albedo, camera_to_table.position, lighting)
+        ambient, direct = compute_light(points, turned, albedo, camera_to_table.position, lighting)
         total: np.ndarray = ambient + direct
         return total
 
 
-class _Ground:
-    """The surfaces that stand still, one point per pixel, as what moves may shadow them."""
+class _ShadowReceiver:
+    """Still surfaces that moving parts may shadow, one point per pixel."""
 
     def __init__(self, hits: Hits, fine: Camera, to_light: np.ndarray) -> None:
         rows, columns = np.divmod(hits.pixels, fine.width)
-        here = np.flatnonzero((rows % _FINE == 0) & (columns % _FINE == 0))
+        here = np.flatnonzero((rows % _SUPERSAMPLING == 0) & (columns % _SUPERSAMPLING == 0))
         self._to_light = to_light / np.linalg.norm(to_light)
         side = np.cross(self._to_light, [0.0, 1.0, 0.0])
         side /= np.linalg.norm(side)
@@ -163,27 +163,27 @@ class _Ground:
         flat = hits.points[here] @ self._axes
         order = np.argsort(flat[:, 0], kind="stable")
         here, flat = here[order], flat[order]
-        self._hits = _chosen(hits, here)
+        self._hits = _select_hits(hits, here)
         self._across, self._along = np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1])
-        self._shape = fine.height // _FINE, fine.width // _FINE
-        self._pixels = rows[here] // _FINE * self._shape[1] + columns[here] // _FINE
+        self._shape = fine.height // _SUPERSAMPLING, fine.width // _SUPERSAMPLING
+        self._pixels = rows[here] // _SUPERSAMPLING * self._shape[1] + columns[here] // _SUPERSAMPLING
 
-    def open_share(self, parts: Sequence[_Part], poses: Sequence[Pose]) -> np.ndarray:
-        """The share of the key light that what moves lets through, for each pixel. Shape (h * w,)."""
+    def open_share(self, parts: Sequence[_MovingPart], poses: Sequence[Pose]) -> np.ndarray:
+        """Compute the share of the key light that moving parts let through, per pixel. Shape (h * w,)."""
         blocked = np.zeros(len(self._pixels), dtype=bool)
         for part, pose in zip(parts, poses, strict=True):
             near = self._behind(transform_points(pose, part.corners), blocked)
             if len(near):
                 turn = rotation_matrix(pose.quaternion_wxyz)
                 points = (self._hits.points[near] - pose.position) @ turn
-                start = replace(_chosen(self._hits, near), points=points, normals=self._hits.normals[near] @ turn)
+                start = replace(_select_hits(self._hits, near), points=points, normals=self._hits.normals[near] @ turn)
                 blocked[near] = part.caster.blocked(start, self._to_light @ turn)
         share = np.ones(self._shape, dtype=np.float32)
         share.reshape(-1)[self._pixels[blocked]] = 0.0
-        return _blurred(share).reshape(-1)
+        return _blur(share).reshape(-1)
 
     def _behind(self, corners: Points, blocked: np.ndarray) -> np.ndarray:
-        """Points that a box may shadow and that are not shadowed yet: those in its outline as the light sees it."""
+        """Find unshadowed points in a box's outline as seen from the light."""
         flat = corners @ self._axes
         low, high = flat.min(axis=0) - _SHADOW_MARGIN_M, flat.max(axis=0) + _SHADOW_MARGIN_M
         first, last = np.searchsorted(self._across, [low[0], high[0]])
@@ -192,8 +192,8 @@ class _Ground:
         return near
 
 
-def _blurred(image: np.ndarray) -> np.ndarray:
-    """Means over 3 x 3 pixels, the edge repeated."""
+def _blur(image: np.ndarray) -> np.ndarray:
+    """Average over 3 x 3 pixels, the edge repeated."""
     for axis in (0, 1):
         size = image.shape[axis]
         before = np.take(image, np.maximum(np.arange(size) - 1, 0), axis)
@@ -202,13 +202,15 @@ def _blurred(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _coarse(image: np.ndarray) -> np.ndarray:
+def _downsample(image: np.ndarray) -> np.ndarray:
     height, width, channels = image.shape
-    mean: np.ndarray = image.reshape(height // _FINE, _FINE, width // _FINE, _FINE, channels).mean(axis=(1, 3))
+    mean: np.ndarray = image.reshape(
+        height // _SUPERSAMPLING, _SUPERSAMPLING, width // _SUPERSAMPLING, _SUPERSAMPLING, channels
+    ).mean(axis=(1, 3))
     return mean
 
 
-def _chosen(hits: Hits, indices: np.ndarray) -> Hits:
+def _select_hits(hits: Hits, indices: np.ndarray) -> Hits:
     return Hits(
         hits.pixels[indices],
         hits.depth[indices],
@@ -220,6 +222,6 @@ def _chosen(hits: Hits, indices: np.ndarray) -> Hits:
     )
 
 
-def _nothing() -> Hits:
+def _make_empty_hits() -> Hits:
     none, three = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32)
     return Hits(none, np.zeros(0, dtype=np.float32), none, none, three, np.zeros((0, 3)), three)

@@ -1,7 +1,7 @@
-"""LeRobot datasets, version 3.0, by pyarrow and PyAV alone: the package `lerobot` is not needed to write them.
+"""LeRobot datasets, version 3.0, by pyarrow and PyAV, without the package `lerobot`.
 
     DEST/meta/info.json, stats.json, tasks.parquet
-    DEST/meta/episodes/chunk-000/file-000.parquet     a row per episode: where its frames lie, and its figures
+    DEST/meta/episodes/chunk-000/file-000.parquet     a row per episode: where its frames lie, and its statistics
     DEST/data/chunk-000/file-000.parquet              a row per frame, many episodes in a file
     DEST/videos/KEY/chunk-000/file-000.mp4            the same frames as one camera sees them
 
@@ -17,35 +17,40 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
-from tableverse_factory.delivery.episodes.frames import features, stride
+from tableverse_factory.delivery.episodes.frames import compute_stride, list_features
 from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
-from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, SCENE_CAMERA, RenderSetting, shots
-from tableverse_factory.delivery.episodes.robot import recorded_arm
+from tableverse_factory.delivery.episodes.render_workers import (
+    ROBOT_CAMERA,
+    SCENE_CAMERA,
+    RenderSetting,
+    render_episodes,
+)
+from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
     Episode,
-    check_new,
-    instruction_of,
-    kind_of,
+    check_new_path,
+    get_kind,
     open_episode,
-    selected_rows,
+    read_instruction,
+    select_rows,
 )
-from tableverse_factory.delivery.episodes.video import need_av
+from tableverse_factory.delivery.episodes.video import import_av
 
 _CAMERAS = {"robot": ROBOT_CAMERA, "scene": SCENE_CAMERA}
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
-    """How episodes are exported.
+class LeRobotOptions:
+    """Export options.
 
     Attributes:
-        failed: Failures too.
+        failed: Include failed trajectories.
         width: Of the pictures [px], even.
         height: Of the pictures [px], even.
-        fps: Frames per second; None for all that were recorded.
-        cameras: Of `robot` and `scene`. The latter is the photograph's, which the arm hides where it stands there.
-        jobs: Processes that draw.
-        robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
+        fps: Frames per second; None for all recorded ones.
+        cameras: `robot`, `scene` or both. The latter is the photograph's, which the arm may hide.
+        jobs: Rendering processes.
+        robot: Arm of recordings whose robot is not built in: a file, or `menagerie:NAME`.
     """
 
     failed: bool = False
@@ -58,8 +63,8 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
-    """What was exported."""
+class LeRobotResult:
+    """Summary of an export."""
 
     episodes: int
     frames: int
@@ -67,57 +72,57 @@ class Written:
 
 
 def export_lerobot(
-    dataset: Dataset, dest: Path, options: Options, progress: Callable[[int, int], None] | None = None
-) -> Written:
-    """Writes the trajectories of a dataset to a new folder, which appears when it is complete.
+    dataset: Dataset, dest: Path, options: LeRobotOptions, progress: Callable[[int, int], None] | None = None
+) -> LeRobotResult:
+    """Write the trajectories of a dataset to a new folder, which appears when it is complete.
 
-    The same dataset and options give the same bytes, however many processes draw.
+    The same dataset and options give the same bytes for any number of processes.
 
     Args:
         dataset: With trajectories.
         dest: A folder that does not exist yet.
-        options: What and how.
+        options: Selection and format.
         progress: Called with the number of episodes written and of all.
 
     Raises:
-        InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, a
-            camera is asked for that a scene lacks, PyAV is missing, or as `recorded_arm`.
+        InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, a scene
+            lacks a requested camera, PyAV is missing, or as `load_recorded_arm`.
     """
-    need_av()
-    check_new(dest)
-    rows = selected_rows(dataset, options.failed)
+    import_av()
+    check_new_path(dest)
+    rows = select_rows(dataset, options.failed)
     first = open_episode(dataset, rows[0])
-    setting, arm = _setting(first, options), recorded_arm(first.recording, options.robot)
-    licences = _licences(dataset)
+    setting, arm = _build_setting(first, options), load_recorded_arm(first.recording, options.robot)
+    licences = _read_licences(dataset)
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        files = LeRobotFiles(Path(scratch) / "dataset", setting, features(arm))
+        files = LeRobotFiles(Path(scratch) / "dataset", setting, list_features(arm))
         with closing(files):
-            for row, shot in zip(rows, shots(dataset.path, setting, rows, options.jobs), strict=True):
-                files.add(instruction_of(row), shot, _origin(row, licences))
+            for row, shot in zip(rows, render_episodes(dataset.path, setting, rows, options.jobs), strict=True):
+                files.add(read_instruction(row), shot, _build_origin(row, licences))
                 if progress is not None:
                     progress(files.n_episodes, len(rows))
             files.finish().rename(dest)
-    return Written(files.n_episodes, files.n_frames, setting.cameras)
+    return LeRobotResult(files.n_episodes, files.n_frames, setting.cameras)
 
 
-def _setting(first: Episode, options: Options) -> RenderSetting:
-    """What is the same for all episodes."""
+def _build_setting(first: Episode, options: LeRobotOptions) -> RenderSetting:
+    """Build the setting shared by all episodes."""
     if options.width % 2 or options.height % 2:
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
-    every, fps = stride(first.recording, options.fps)
+    every, fps = compute_stride(first.recording, options.fps)
     cameras = tuple(_CAMERAS[name] for name in options.cameras)
-    return RenderSetting(kind_of(first), cameras, options.width, options.height, every, fps, options.robot)
+    return RenderSetting(get_kind(first), cameras, options.width, options.height, every, fps, options.robot)
 
 
-def _licences(dataset: Dataset) -> dict[str, str]:
+def _read_licences(dataset: Dataset) -> dict[str, str]:
     table = dataset.scenes.to_table(columns=["scene_id", "licence"])
     return {row["scene_id"]: row["licence"] or "" for row in table.to_pylist()}
 
 
-def _origin(row: Mapping[str, Any], licences: Mapping[str, str]) -> dict[str, Any]:
-    """Columns of meta/episodes that LeRobot does not know: where an episode comes from, and how it ended."""
+def _build_origin(row: Mapping[str, Any], licences: Mapping[str, str]) -> dict[str, Any]:
+    """Build columns of meta/episodes beyond LeRobot's: origin and outcome of an episode."""
     return {
         "scene_id": row["scene_id"],
         "task_id": row["task_id"],

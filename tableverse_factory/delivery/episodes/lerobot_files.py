@@ -1,4 +1,4 @@
-"""The files of a LeRobot dataset, version 3.0, as episodes are added to them."""
+"""Incremental writer of a LeRobot dataset, version 3.0."""
 
 import json
 from collections.abc import Mapping
@@ -9,26 +9,24 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from tableverse_factory.delivery.episodes.frames import Feature, numbered, table_of
-from tableverse_factory.delivery.episodes.render_workers import RenderSetting, Shot
-from tableverse_factory.delivery.episodes.statistics import Figures, merged, vector_figures
+from tableverse_factory.delivery.episodes.frames import Feature, build_frame_table, number_columns
+from tableverse_factory.delivery.episodes.render_workers import RenderedEpisode, RenderSetting
+from tableverse_factory.delivery.episodes.statistics import FeatureStats, compute_vector_stats, merge_stats
 from tableverse_factory.delivery.episodes.video import PIXELS, VideoFile
 
 VERSION = "v3.0"
 CHUNK_FILES = 1000
-DATA_MB, VIDEO_MB = 100, 200
-"""Largest files of data/ and videos/; a single episode that is larger stays whole."""
-
-_PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-DATA_PATH = f"data/{_PLACE}.parquet"
-VIDEO_PATH = f"videos/{{video_key}}/{_PLACE}.mp4"
-EPISODES_PATH = f"meta/episodes/{_PLACE}.parquet"
-_NO_FIGURES = frozenset({"next.done", "next.success"})
+DATA_MB, VIDEO_MB = 100, 200  # maximum file sizes of data/ and videos/; a single larger episode stays whole
+_CHUNK_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{_CHUNK_PATH}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{_CHUNK_PATH}.mp4"
+EPISODES_PATH = f"meta/episodes/{_CHUNK_PATH}.parquet"
+_NO_STATS = frozenset({"next.done", "next.success"})
 _MB = 1024**2
 
 
 class LeRobotFiles:
-    """A dataset that grows by episodes; `finish` makes it whole."""
+    """Dataset that grows by episodes; `finish` completes it."""
 
     def __init__(
         self,
@@ -38,20 +36,12 @@ class LeRobotFiles:
         data_mb: float = DATA_MB,
         video_mb: float = VIDEO_MB,
     ) -> None:
-        """Makes the folder.
-
-        Args:
-            folder: New.
-            setting: Robot, cameras, size and rhythm.
-            features: Columns of data/.
-            data_mb: Largest file of data/ [MB].
-            video_mb: Largest file of videos/ [MB].
-        """
+        """Create the folder; `features` are the columns of data/, the sizes are maxima per file [MB]."""
         self._folder, self._setting, self._features = folder, setting, dict(features)
         self._data_mb, self._video_mb = data_mb, video_mb
         self._tasks: dict[str, int] = {}
         self._rows: list[dict[str, Any]] = []
-        self._figures: dict[str, list[Figures]] = {}
+        self._figures: dict[str, list[FeatureStats]] = {}
         self._data: list[pa.Table] = []
         self._data_number = 0
         self._videos: dict[str, tuple[int, VideoFile]] = {}
@@ -60,25 +50,19 @@ class LeRobotFiles:
 
     @property
     def n_episodes(self) -> int:
-        """Added so far."""
+        """Number of episodes added."""
         return len(self._rows)
 
-    def add(self, instruction: str, shot: Shot, origin: Mapping[str, Any]) -> None:
-        """Adds an episode.
-
-        Args:
-            instruction: Sentence of its task.
-            shot: Its numbers and videos.
-            origin: More columns of its row in meta/episodes: where it comes from.
-        """
+    def add(self, instruction: str, shot: RenderedEpisode, origin: Mapping[str, Any]) -> None:
+        """Add an episode; `origin` are more columns of its row in meta/episodes."""
         task = self._tasks.setdefault(instruction, len(self._tasks))
-        values = numbered(shot.values, self.n_episodes, self.n_frames, task)
+        values = number_columns(shot.values, self.n_episodes, self.n_frames, task)
         count = len(values["index"])
         row: dict[str, Any] = {"episode_index": self.n_episodes, "tasks": [instruction], "length": count}
-        row |= self._add_data(table_of(values, self._features), count)
+        row |= self._add_data(build_frame_table(values, self._features), count)
         for key, video in shot.videos.items():
             row |= self._add_video(key, video, count)
-        figures = {name: vector_figures(values[name]) for name in self._features if name not in _NO_FIGURES}
+        figures = {name: compute_vector_stats(values[name]) for name in self._features if name not in _NO_STATS}
         for name, figure in {**shot.figures, **figures}.items():
             self._figures.setdefault(name, []).append(figure)
             row |= {f"stats/{name}/{key}": value.tolist() for key, value in figure.items()}
@@ -98,7 +82,7 @@ class LeRobotFiles:
         }
 
     def _write_data(self) -> None:
-        _write(self._folder / _placed(DATA_PATH, self._data_number), self._data)
+        _write_parquet(self._folder / _format_path(DATA_PATH, self._data_number), self._data)
         self._data, self._data_number = [], self._data_number + 1
 
     def _add_video(self, key: str, video: bytes, count: int) -> dict[str, Any]:
@@ -107,7 +91,7 @@ class LeRobotFiles:
             if file is not None:
                 file.close()
             number += 1
-            path = self._folder / _placed(VIDEO_PATH, number, video_key=key)
+            path = self._folder / _format_path(VIDEO_PATH, number, video_key=key)
             path.parent.mkdir(parents=True, exist_ok=True)
             file = VideoFile(path, self._setting.fps)
             self._videos[key] = (number, file)
@@ -121,19 +105,19 @@ class LeRobotFiles:
         }
 
     def close(self) -> None:
-        """Closes the videos that are open; may be repeated."""
+        """Close open videos; may be repeated."""
         for _, file in self._videos.values():
             file.close()
         self._videos = {}
 
     def finish(self) -> Path:
-        """Writes what is left, and meta/; returns the folder."""
+        """Write remaining data and meta/; return the folder."""
         self.close()
         self._write_data()
         rows = [{**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} for row in self._rows]
-        _write(self._folder / _placed(EPISODES_PATH, 0), [pa.Table.from_pylist(rows)])
-        _write(self._folder / "meta/tasks.parquet", [tasks_table(self._tasks)])
-        stats = {name: _as_lists(merged(figures)) for name, figures in self._figures.items()}
+        _write_parquet(self._folder / _format_path(EPISODES_PATH, 0), [pa.Table.from_pylist(rows)])
+        _write_parquet(self._folder / "meta/tasks.parquet", [build_tasks_table(self._tasks)])
+        stats = {name: _to_lists(merge_stats(figures)) for name, figures in self._figures.items()}
         self._write_json("meta/stats.json", stats)
         self._write_json("meta/info.json", self._info())
         return self._folder
@@ -177,8 +161,8 @@ class LeRobotFiles:
         (self._folder / name).write_text(text, encoding="utf-8")
 
 
-def tasks_table(tasks: Mapping[str, int]) -> pa.Table:
-    """The sentences with their numbers; the sentence is the index where pandas reads it, as LeRobot has it."""
+def build_tasks_table(tasks: Mapping[str, int]) -> pa.Table:
+    """Build the numbered instructions; pandas reads the instruction as index, as LeRobot expects."""
     column = {"field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     index = {"field_name": "task", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
     frame = {
@@ -191,16 +175,16 @@ def tasks_table(tasks: Mapping[str, int]) -> pa.Table:
     return table.replace_schema_metadata({b"pandas": json.dumps(frame).encode()})
 
 
-def _placed(template: str, number: int, **names: str) -> str:
+def _format_path(template: str, number: int, **names: str) -> str:
     return template.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES, **names)
 
 
-def _as_lists(figures: Figures) -> dict[str, Any]:
+def _to_lists(figures: FeatureStats) -> dict[str, Any]:
     return {name: np.asarray(value).tolist() for name, value in figures.items()}
 
 
-def _write(path: Path, tables: list[pa.Table]) -> None:
-    """A row group per table: what is read by episode is found by episode."""
+def _write_parquet(path: Path, tables: list[pa.Table]) -> None:
+    """Write a row group per table, so that readers find episodes without scanning."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(path, tables[0].schema, compression="snappy") as writer:
         for table in tables:

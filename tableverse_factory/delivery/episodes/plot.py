@@ -1,8 +1,7 @@
-"""Joints and gripper of a recording over time, as a small SVG without text of foreign origin and without styles.
+"""Plot of a recording's joints and gripper over time, as a small SVG without foreign text and without styles.
 
-Colours come from the page's style sheet by class, so that it is readable on light and dark paper: `.plot .j1` to `.j7`
-for joints, `.band` for every second phase, `.axis`, `.grid`, `.open` (the gripper) and `.told` (its command, dashed);
-`.line` is one of the legend.
+Colors come from the page's style sheet by class, for light and dark pages: `.plot .j1` to `.j7` for joints, `.band` for
+every second phase, `.axis`, `.grid`, `.open` (the gripper), `.told` (its command, dashed), and `.line` in the legend.
 """
 
 import numpy as np
@@ -16,24 +15,15 @@ _LEFT, _RIGHT, _TOP = 38.0, 8.0, 27.0
 _JOINTS, _GAP, _GRIPPER = 130.0, 14.0, 44.0
 _POINTS = 100
 _WORDS = {phase: phase.value.replace("_", "-") for phase in Phase}
-_CHARACTER = 5.0
-"""Width of a letter."""
-
-_ROWS = (_TOP - 5.0, _TOP - 15.0)
-"""Where names of phases stand: a phase is often shorter than its name."""
-
-_SWATCH, _SPACE = 12.0, 5.0
-"""Length of a line in the legend, and what is left free behind it; behind a word, twice that."""
+_CHARACTER = 5.0  # width of a letter
+_ROWS = (_TOP - 5.0, _TOP - 15.0)  # heights of phase names, which are often wider than their phase
+_SWATCH, _SPACE = 12.0, 5.0  # length of a legend line, and the gap behind it (twice that behind a word)
 
 
 def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max_opening_m: float) -> str:
-    """The plot, as markup that may stand within a page.
+    """Draw the plot as inline markup.
 
-    Args:
-        recording: Of the trajectory.
-        closed: Positions of the fingers' joints when closed. Shape (f,).
-        opened: The same with open fingers. Shape (f,).
-        max_opening_m: Distance between the open fingers [m].
+    `closed` and `opened` are positions of the fingers' joints. Both of shape (f,).
     """
     n_joints = recording.command.shape[1] - 1
     shown = np.unique(np.rint(np.linspace(0, len(recording) - 1, min(len(recording), _POINTS))).astype(int))
@@ -42,38 +32,40 @@ def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max
     joints = recording.qpos[shown, :n_joints]
     span = opened - closed
     opening = (recording.qpos[shown, n_joints:] - closed) @ span / (span @ span) * max_opening_m
-    low, high = _whole_range(joints)
+    low, high = _round_range(joints)
     top = _TOP + _JOINTS + _GAP
     parts = [
         f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
         f'aria-label="Joint angles and gripper opening over {end_s:.1f} seconds, by phase">',
-        *_bands(recording, end_s),
-        *_grid(low, high, max_opening_m, top),
+        *_draw_bands(recording, end_s),
+        *_draw_grid(low, high, max_opening_m, top),
     ]
     for joint in range(n_joints):
-        points = _points(across, joints[:, joint], low, high, _TOP, _JOINTS)
+        points = _format_points(across, joints[:, joint], low, high, _TOP, _JOINTS)
         parts.append(f'<polyline class="j{joint % COLORS + 1}" points="{points}"/>')
-    told = _points(across, recording.command[shown, -1], 0.0, max_opening_m, top, _GRIPPER)
+    told = _format_points(across, recording.command[shown, -1], 0.0, max_opening_m, top, _GRIPPER)
     parts.append(f'<polyline class="told" points="{told}"/>')
-    parts.append(f'<polyline class="open" points="{_points(across, opening, 0.0, max_opening_m, top, _GRIPPER)}"/>')
-    parts += _seconds(end_s, top + _GRIPPER)
-    parts += _legend(n_joints)
+    parts.append(
+        f'<polyline class="open" points="{_format_points(across, opening, 0.0, max_opening_m, top, _GRIPPER)}"/>'
+    )
+    parts += _draw_time_axis(end_s, top + _GRIPPER)
+    parts += _draw_legend(n_joints)
     return "".join([*parts, "</svg>"])
 
 
-def _whole_range(values: np.ndarray) -> tuple[float, float]:
-    """From the largest whole number below the values to the smallest above [rad]."""
+def _round_range(values: np.ndarray) -> tuple[float, float]:
+    """Widen a range to whole numbers [rad]."""
     low, high = float(np.floor(values.min())), float(np.ceil(values.max()))
     return low, max(high, low + 1.0)
 
 
-def _points(across: np.ndarray, values: np.ndarray, low: float, high: float, top: float, height: float) -> str:
+def _format_points(across: np.ndarray, values: np.ndarray, low: float, high: float, top: float, height: float) -> str:
     down = top + height * (1.0 - np.clip((values - low) / (high - low), -0.1, 1.1))
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
 
 
-def _bands(recording: Recording, end_s: float) -> list[str]:
-    """Every second phase shaded from where it begins to where the next does, each with its name above it."""
+def _draw_bands(recording: Recording, end_s: float) -> list[str]:
+    """Shade every second phase until the next begins, with all names above."""
     parts, wide = [], WIDTH - _LEFT - _RIGHT
     starts = [int(np.searchsorted(recording.phase, number)) for number in range(len(Phase) + 1)]
     times = [float(recording.time_s[min(start, len(recording) - 1)]) / end_s for start in starts]
@@ -94,8 +86,7 @@ def _bands(recording: Recording, end_s: float) -> list[str]:
     return parts
 
 
-def _legend(n_joints: int) -> list[str]:
-    """What each line is, in one row below."""
+def _draw_legend(n_joints: int) -> list[str]:
     entries = [(f"j{joint % COLORS + 1}", f"{joint + 1}") for joint in range(n_joints)]
     parts, x, y = [], _LEFT, HEIGHT - 8.0
     for kind, word in (("", "joints"), *entries, ("open", "gripper"), ("told", "its command")):
@@ -107,7 +98,7 @@ def _legend(n_joints: int) -> list[str]:
     return parts
 
 
-def _grid(low: float, high: float, max_opening_m: float, top: float) -> list[str]:
+def _draw_grid(low: float, high: float, max_opening_m: float, top: float) -> list[str]:
     step = 1.0 if high - low <= 4.0 else 2.0
     values = np.arange(np.ceil(low / step) * step, high + 1e-9, step)
     lines = [(_TOP + _JOINTS * (1.0 - (value - low) / (high - low)), f"{value:.0f}") for value in values]
@@ -122,7 +113,7 @@ def _grid(low: float, high: float, max_opening_m: float, top: float) -> list[str
     return parts
 
 
-def _seconds(end_s: float, bottom: float) -> list[str]:
+def _draw_time_axis(end_s: float, bottom: float) -> list[str]:
     step = next((step for step in (0.5, 1.0, 2.0, 5.0, 10.0, 20.0) if end_s / step <= 10.0), end_s)
     parts = [f'<path class="axis" d="M{_LEFT} {bottom}H{WIDTH - _RIGHT}"/>']
     for time in np.arange(0.0, end_s + 1e-6, step):

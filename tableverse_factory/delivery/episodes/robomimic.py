@@ -1,12 +1,12 @@
-"""One HDF5 file of demonstrations as robomimic reads them, and with it what is needed to put them back into MuJoCo.
+"""Demonstrations in one robomimic HDF5 file, with everything needed to restore them in MuJoCo.
 
     data                attributes: total, env_args (JSON)
     data/demo_0         attributes: num_samples, model_file (MJCF), ep_meta (JSON: lang, scene, task, success)
         actions (n, j + 1)   rewards (n,)   dones (n,)   states (n, 1 + nq + nv)   obs/…   next_obs/…
-    mask/success, mask/failed    names of demonstrations; each is there if it has any
-    assets/SCENE_ID/…   files that model_file names
+    mask/success, mask/failed    names of demonstrations; each exists if it has any
+    assets/SCENE_ID/…   files that model_file references
 
-The layout is that of robomimic's public documentation; `assets` stands beside `data` and is not known to it.
+The layout is that of robomimic's public documentation, which does not know `assets`.
 """
 
 import json
@@ -18,44 +18,44 @@ from typing import Any
 
 import numpy as np
 
-from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.dataset.dataset import Dataset
-from tableverse_factory.delivery.episodes.demonstration import Demonstration, demonstration, shared_arguments
-from tableverse_factory.delivery.episodes.robot import recorded_arm
+from tableverse_factory.delivery.episodes.demonstration import Demonstration, build_demonstration, build_env_args
+from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
     check_kind,
-    check_new,
-    instruction_of,
-    kind_of,
+    check_new_path,
+    get_kind,
     open_episodes,
-    selected_rows,
+    read_instruction,
+    select_rows,
 )
 
 
 @dataclass(frozen=True, slots=True)
-class WrittenDemos:
-    """What was exported."""
+class RobomimicResult:
+    """Summary of an export."""
 
     demos: int
     samples: int
 
 
-def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: str | None = None) -> WrittenDemos:
-    """Writes the trajectories of a dataset to a new file, which appears when it is complete. Same input, same bytes.
+def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: str | None = None) -> RobomimicResult:
+    """Write the trajectories of a dataset to a new file, which appears when it is complete. Same input, same bytes.
 
     Args:
         dataset: With trajectories.
         dest: A file that does not exist yet.
-        failed: Failures too.
-        robot: The arm of recordings whose robot is none of ours: a file, or `menagerie:NAME`.
+        failed: Include failed trajectories.
+        robot: Arm of recordings whose robot is not built in: a file, or `menagerie:NAME`.
 
     Raises:
         InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, or h5py
-            is missing; or as `recorded_arm`.
+            is missing; or as `load_recorded_arm`.
     """
-    h5py = require_extra("h5py", "HDF5", "episodes")
-    check_new(dest)
-    rows = selected_rows(dataset, failed)
+    h5py = import_extra("h5py", "HDF5", "episodes")
+    check_new_path(dest)
+    rows = select_rows(dataset, failed)
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
@@ -64,27 +64,27 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
         with h5py.File(partial, "w") as file:
             data = file.create_group("data")
             for number, episode in enumerate(open_episodes(dataset, rows)):
-                first = first or kind_of(episode)
+                first = first or get_kind(episode)
                 check_kind(first, episode)
-                arm = recorded_arm(episode.recording, robot)
-                demo = demonstration(episode, arm)
-                meta = _episode_meta(episode.row)
+                arm = load_recorded_arm(episode.recording, robot)
+                demo = build_demonstration(episode, arm)
+                meta = _build_episode_meta(episode.row)
                 _write_demo(data.create_group(f"demo_{number}"), demo, meta)
                 _write_assets(file, episode.scene.scene_id, demo.assets)
                 names[bool(episode.row["success"])].append(f"demo_{number}")
                 total += len(demo.actions)
-                data.attrs["env_args"] = json.dumps(shared_arguments(episode, arm))
+                data.attrs["env_args"] = json.dumps(build_env_args(episode, arm))
             data.attrs["total"] = total
             for key, success in (("success", True), ("failed", False)):
                 if names[success]:
-                    _put(file.require_group("mask"), key, np.array(names[success], dtype="S"))
+                    _write_array(file.require_group("mask"), key, np.array(names[success], dtype="S"))
         partial.rename(dest)
-    return WrittenDemos(len(rows), total)
+    return RobomimicResult(len(rows), total)
 
 
-def _episode_meta(row: Mapping[str, Any]) -> dict[str, Any]:
+def _build_episode_meta(row: Mapping[str, Any]) -> dict[str, Any]:
     keys = ("scene_id", "task_id", "x_id", "y_id", "relation", "success", "failed_phase", "reason")
-    return {"lang": instruction_of(row), **{key: row[key] for key in keys}}
+    return {"lang": read_instruction(row), **{key: row[key] for key in keys}}
 
 
 def _write_demo(group: Any, demo: Demonstration, meta: Mapping[str, Any]) -> None:
@@ -92,21 +92,21 @@ def _write_demo(group: Any, demo: Demonstration, meta: Mapping[str, Any]) -> Non
     group.attrs["model_file"] = demo.model
     group.attrs["ep_meta"] = json.dumps(meta)
     for name in ("actions", "rewards", "dones", "states"):
-        _put(group, name, getattr(demo, name))
+        _write_array(group, name, getattr(demo, name))
     following = np.minimum(np.arange(len(demo.actions)) + 1, len(demo.actions) - 1)
     for name, values in demo.observations.items():
-        _put(group.require_group("obs"), name, values)
-        _put(group.require_group("next_obs"), name, values[following])
+        _write_array(group.require_group("obs"), name, values)
+        _write_array(group.require_group("next_obs"), name, values[following])
 
 
 def _write_assets(file: Any, scene_id: str, assets: Mapping[str, bytes]) -> None:
-    """Files by their names; a name holds slashes, which HDF5 takes for groups."""
+    """Write files by name; slashes in names make HDF5 groups."""
     group = file.require_group(f"assets/{scene_id}")
     for name, data in sorted(assets.items()):
         if name not in group:
-            _put(group, name, np.frombuffer(data, dtype=np.uint8))
+            _write_array(group, name, np.frombuffer(data, dtype=np.uint8))
 
 
-def _put(group: Any, name: str, values: np.ndarray) -> None:
+def _write_array(group: Any, name: str, values: np.ndarray) -> None:
     packing = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size > 64 else {}
     group.create_dataset(name, data=values, track_times=False, **packing)

@@ -1,4 +1,4 @@
-"""Figures of features by which learners scale them, as LeRobot keeps them: of an episode, and of all of them."""
+"""Feature statistics for normalization in LeRobot's format, per episode and aggregated."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,28 +6,25 @@ import numpy as np
 
 from schemas.geometry import Picture
 
-Figures = dict[str, np.ndarray]
-"""`min`, `max`, `mean`, `std` and the quantiles of each component, and `count`."""
-
+FeatureStats = dict[str, np.ndarray]  # `min`, `max`, `mean`, `std` and quantiles of each component, and `count`
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-_PICTURES = 100
-"""Of an episode, spread over it; every second pixel of every second row of each."""
+_MAX_PICTURES = 100  # pictures used per episode, spread over it; every second pixel of every second row of each
 
 
-def vector_figures(values: np.ndarray) -> Figures:
-    """Of numbers over time, shape (t,) or (t, n): each figure has shape (1,) or (n,), and `count` is t."""
-    return _figures(values.reshape(len(values), -1).astype(np.float64), len(values))
+def compute_vector_stats(values: np.ndarray) -> FeatureStats:
+    """Compute statistics of values over time, shape (t,) or (t, n), each of shape (1,) or (n,); `count` is t."""
+    return _compute_stats(values.reshape(len(values), -1).astype(np.float64), len(values))
 
 
-def picture_figures(pictures: Sequence[Picture]) -> Figures:
-    """Of pictures: each figure has shape (3, 1, 1), a channel's share of 255; `count` is how many were looked at."""
-    chosen = np.unique(np.rint(np.linspace(0, len(pictures) - 1, min(len(pictures), _PICTURES))).astype(int))
+def compute_picture_stats(pictures: Sequence[Picture]) -> FeatureStats:
+    """Compute statistics of pictures, each of shape (3, 1, 1) as a share of 255; `count` is the pictures used."""
+    chosen = np.unique(np.rint(np.linspace(0, len(pictures) - 1, min(len(pictures), _MAX_PICTURES))).astype(int))
     pixels = np.concatenate([pictures[k][::2, ::2].reshape(-1, 3) for k in chosen])
-    figures = _figures(pixels.astype(np.float64) / 255.0, len(chosen))
+    figures = _compute_stats(pixels.astype(np.float64) / 255.0, len(chosen))
     return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in figures.items()}
 
 
-def _figures(values: np.ndarray, count: int) -> Figures:
+def _compute_stats(values: np.ndarray, count: int) -> FeatureStats:
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
     return {
         "min": values.min(axis=0),
@@ -39,8 +36,8 @@ def _figures(values: np.ndarray, count: int) -> Figures:
     }
 
 
-def merged(all_figures: Sequence[Mapping[str, np.ndarray]]) -> Figures:
-    """Of all episodes from those of each: exact but for the quantiles, which are means weighted by `count`."""
+def merge_stats(all_figures: Sequence[Mapping[str, np.ndarray]]) -> FeatureStats:
+    """Merge statistics of episodes: exact except for the quantiles, which are means weighted by `count`."""
     counts = np.array([figures["count"][0] for figures in all_figures], dtype=np.float64)
     weights = counts / counts.sum()
 

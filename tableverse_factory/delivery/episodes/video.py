@@ -1,4 +1,4 @@
-"""H.264 in MP4 by PyAV: an episode at a time, then many in one file without encoding them again."""
+"""H.264 in MP4 by PyAV: encoded per episode, then concatenated without encoding again."""
 
 import io
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Picture
-from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.optional_imports import import_extra
 
 CODEC, PIXELS = "libx264", "yuv420p"
 _OPTIONS = {
@@ -20,22 +20,21 @@ _OPTIONS = {
     "bf": "0",  # frames in the order in which they are shown: episodes can be put one after the other
     "threads": "1",  # more would make the bytes depend on the machine
 }
-_TICKS = 1000
-"""Ticks of the file's clock per frame."""
+_TICKS = 1000  # clock ticks per frame
 
 
-def need_av() -> ModuleType:
-    """PyAV.
+def import_av() -> ModuleType:
+    """Import PyAV.
 
     Raises:
         InputError: `no_extra` if it is not installed.
     """
-    return require_extra("av", "a video", "episodes")
+    return import_extra("av", "a video", "episodes")
 
 
-def mp4_bytes(pictures: Iterable[Picture], fps: int) -> bytes:
-    """Pictures as a video of its own; their sides must be even. Equal pictures give equal bytes."""
-    av, file = need_av(), io.BytesIO()
+def encode_mp4(pictures: Iterable[Picture], fps: int) -> bytes:
+    """Encode pictures with even sides as a video; equal pictures give equal bytes."""
+    av, file = import_av(), io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
         stream = None
         for number, picture in enumerate(pictures):
@@ -52,23 +51,18 @@ def mp4_bytes(pictures: Iterable[Picture], fps: int) -> bytes:
 
 
 class VideoFile:
-    """A growing MP4 of many episodes: frame k is shown from k / fps on, whatever episode it is of."""
+    """MP4 of many episodes; dataset-wide frame k is shown from k / fps on."""
 
     def __init__(self, path: Path, fps: int) -> None:
-        """Opens the file.
-
-        Args:
-            path: In a folder that exists.
-            fps: Of every episode.
-        """
-        self._av, self._fps = need_av(), fps
+        """Open the file, in an existing folder."""
+        self._av, self._fps = import_av(), fps
         self._container = self._av.open(str(path), "w", format="mp4")
         self._stream: Any = None
         self.n_frames = 0
         self.n_bytes = 0
 
     def add(self, video: bytes) -> None:
-        """Appends what `mp4_bytes` made, packet by packet."""
+        """Append a video of `encode_mp4`, packet by packet."""
         with self._av.open(io.BytesIO(video)) as source:
             stream = source.streams.video[0]
             if self._stream is None:
@@ -88,5 +82,5 @@ class VideoFile:
         self.n_bytes += len(video)
 
     def close(self) -> None:
-        """Writes the index; only then is it a video."""
+        """Write the index, which completes the video."""
         self._container.close()

@@ -1,4 +1,4 @@
-"""One scene of a dataset as files in a folder, in the format asked for."""
+"""Extraction of one scene as files in a folder, in any format."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,19 +9,14 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.formats.folders import SCENE_GLB
-from tableverse_factory.delivery.formats.glb import glb_bytes
-from tableverse_factory.delivery.formats.model_contents import ModelContents, contents_of
-from tableverse_factory.delivery.formats.urdf import urdf_files
-from tableverse_factory.delivery.formats.usd import usd_files
+from tableverse_factory.delivery.formats.glb import encode_glb
+from tableverse_factory.delivery.formats.model_contents import ModelContents, read_model_contents
+from tableverse_factory.delivery.formats.urdf import encode_urdf
+from tableverse_factory.delivery.formats.usd import encode_usd
 
 
 def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[Path, ...]:
-    """Writes the scene below a new or empty folder and returns the paths.
-
-    Args:
-        scene: Of a dataset.
-        dest: The folder.
-        file_format: A key of `FORMATS`.
+    """Write the scene to a new or empty folder, in a format of `FORMATS`, and return the paths.
 
     Raises:
         InputError: if the folder is not empty, the format unknown, or the scene does not load.
@@ -30,10 +25,10 @@ def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[
         raise InputError(f"format {file_format!r:.40}: give one of {', '.join(FORMATS)}")
     if dest.exists() and (not dest.is_dir() or any(dest.iterdir())):
         raise InputError(f"{dest}: already there; give a new or an empty folder")
-    contents = contents_of(scene.model())
+    contents = read_model_contents(scene.model())
     for content in (*contents.objects, *contents.still):
         _check_name(content.name)
-    files = FORMATS[file_format](scene, contents, labels_of(scene.meta))
+    files = FORMATS[file_format](scene, contents, read_labels(scene.meta))
     for name, data in files.items():
         path = dest / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -41,14 +36,14 @@ def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[
     return tuple(dest / name for name in files)
 
 
-def labels_of(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Labels of the objects by their ids, from a `meta.json`; what has none is called as its id."""
+def read_labels(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Read labels of the objects by id from a `meta.json`; the default is the id."""
     entries = [(str(entry["object_id"]), entry) for entry in meta.get("objects", ())]
     return {object_id: clean_label(str(entry.get("label", object_id))) for object_id, entry in entries}
 
 
 def _check_name(name: str) -> None:
-    """Names of bodies become names of files: a scene that somebody else wrote may hold anything."""
+    """Check that a body's name is a safe file name, as foreign scenes may hold anything."""
     try:
         check_id(name)
     except ValueError as error:
@@ -57,22 +52,11 @@ def _check_name(name: str) -> None:
         ) from None
 
 
-def _mjcf(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
-    return {**scene.files(), SCENE_GLB: glb_bytes(contents, labels)}
-
-
-def _glb(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
-    return {SCENE_GLB: glb_bytes(contents, labels)}
-
-
-def _urdf(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
-    return urdf_files(contents, labels)
-
-
-def _usd(scene: Scene, contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:  # noqa: ARG001
-    return usd_files(contents, labels)
-
-
 Writer = Callable[[Scene, ModelContents, Mapping[str, str]], dict[str, bytes]]
 
-FORMATS: dict[str, Writer] = {"mjcf": _mjcf, "glb": _glb, "urdf": _urdf, "usd": _usd}
+FORMATS: dict[str, Writer] = {
+    "mjcf": lambda scene, contents, labels: {**scene.files(), SCENE_GLB: encode_glb(contents, labels)},
+    "glb": lambda _, contents, labels: {SCENE_GLB: encode_glb(contents, labels)},
+    "urdf": lambda _, contents, labels: encode_urdf(contents, labels),
+    "usd": lambda _, contents, labels: encode_usd(contents, labels),
+}

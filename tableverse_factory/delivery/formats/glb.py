@@ -1,4 +1,4 @@
-"""A scene as GLB: a node per object at its settled pose, the table included, textures embedded, Y-up as glTF asks."""
+"""GLB of a scene: a node per object at its settled pose, table included, textures embedded, Y-up as in glTF."""
 
 from collections.abc import Mapping
 
@@ -10,32 +10,28 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
-from tableverse_factory.geometry.math.transforms import matrix_from_pose
+from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
+from tableverse_factory.geometry.math.transforms import homogeneous_matrix, matrix_from_pose
 
-Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 ROUGHNESS = 0.8
 
 
-def glb_bytes(contents: ModelContents, labels: Mapping[str, str]) -> bytes:
-    """The file.
+def encode_glb(contents: ModelContents, labels: Mapping[str, str]) -> bytes:
+    """Encode the file. Nodes are named after bodies; each mesh is in its object's own frame.
 
-    Node names are the names of the bodies, `table` the table's; each mesh stands in its object's own frame.
-
-    Args:
-        contents: What there is.
-        labels: Of the objects by name; they go into the nodes' `extras`, where JSON holds any text.
+    `labels` by object name go into the nodes' `extras`, where JSON holds any text.
     """
     scene = trimesh.Scene(base_frame="scene")
     for content in (*contents.objects, *contents.still):
-        _add(scene, content, labels.get(content.name))
+        _add_object(scene, content, labels.get(content.name))
     data: bytes = scene.export(file_type="glb", include_normals=False)
     return data
 
 
-def _add(scene: trimesh.Scene, content: ModelObject, label: str | None) -> None:
-    pose = Z_UP_TO_Y_UP @ matrix_from_pose(content.pose)
+def _add_object(scene: trimesh.Scene, content: ModelObject, label: str | None) -> None:
+    pose = homogeneous_matrix(Y_UP_TO_Z_UP.T) @ matrix_from_pose(content.pose)
     extras = {} if label is None else {"metadata": {"label": label}}
-    meshes = [_textured(look) for look in content.looks]
+    meshes = [_build_mesh(look) for look in content.looks]
     if len(meshes) == 1:
         scene.add_geometry(meshes[0], node_name=content.name, geom_name=content.name)
         scene.graph.update(content.name, matrix=pose, geometry=content.name, **extras)
@@ -46,7 +42,7 @@ def _add(scene: trimesh.Scene, content: ModelObject, label: str | None) -> None:
         scene.add_geometry(mesh, node_name=part, geom_name=part, parent_node_name=content.name)
 
 
-def _textured(look: VisualMesh) -> trimesh.Trimesh:
+def _build_mesh(look: VisualMesh) -> trimesh.Trimesh:
     mesh, texture = look.mesh, look.mesh.texture
     if texture is None:
         color = [*look.color, 255]
@@ -59,7 +55,7 @@ def _textured(look: VisualMesh) -> trimesh.Trimesh:
 
 
 def split_at_seams(mesh: TriangleMesh, texture: Texture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices, faces and a point of the picture for each vertex: copies where faces disagree on that point."""
+    """Return vertices, faces and a texture coordinate per vertex, duplicating vertices where faces disagree on it."""
     corners = np.column_stack([mesh.faces.reshape(-1), texture.corner_uv.reshape(-1, 2)])
     distinct, index = np.unique(corners, axis=0, return_inverse=True)
     vertices = mesh.vertices[distinct[:, 0].astype(np.int64)]

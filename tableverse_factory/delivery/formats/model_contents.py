@@ -1,6 +1,6 @@
-"""What a compiled MuJoCo model holds, object by object: what is seen, what collides, what it weighs.
+"""Contents of a compiled MuJoCo model by object: visuals, colliders, mass properties.
 
-One reading of a scene for every format it is written in, and for everything that is measured on anybody's MJCF.
+Shared by all output formats, and by measurements of any MJCF.
 """
 
 from collections.abc import Sequence
@@ -10,31 +10,23 @@ import mujoco
 import numpy as np
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.transforms import compose, inverse, pose_from_matrix, rotation_matrix
-from tableverse_factory.geometry.mesh.hulls import hull_mesh
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.physics.mjcf.drawables import Rgb, geom_box, geom_color, geom_mesh
-from tableverse_factory.physics.mjcf.hidden_geoms import geoms_without_visual
-from tableverse_factory.physics.simulate.model_solids import body_name, geom_shape
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_matrix, rotation_matrix
+from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
+from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.physics.mjcf.drawables import Rgb, make_geom_box, read_geom_color, read_geom_mesh
+from tableverse_factory.physics.mjcf.hidden_geoms import find_geoms_without_visual
+from tableverse_factory.physics.simulate.model_solids import body_name, make_geom_mesh
 
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
-"""Names, in small letters, of what objects stand on: it is never taken for one of them."""
+"""Lowercase names of supports, which are never taken for objects."""
 
-HIDDEN_GROUP = 3
-"""Geoms of this group and above are hidden in MuJoCo's viewer: there shapes lie that only collide."""
-
-UNBOUNDED_PLANE_M = 1.0
-"""Half the side that a plane without an end is drawn with [m]."""
+HIDDEN_GROUP = 3  # geoms of this group and above are hidden in MuJoCo's viewer: usually shapes that only collide
+UNBOUNDED_PLANE_M = 1.0  # half the side drawn for an infinite plane [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisualMesh(Frozen):
-    """Something seen: a mesh with its texture, or in one colour.
-
-    Attributes:
-        mesh: In the object's own frame [m].
-        color: sRGB where the mesh has no texture.
-    """
+    """Visual mesh in its object's own frame [m], with an sRGB color for meshes without texture."""
 
     mesh: TriangleMesh
     color: Rgb
@@ -42,18 +34,18 @@ class VisualMesh(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelObject(Frozen):
-    """One object, in its own frame, which is that of its body.
+    """Object in its own frame, which is that of its body.
 
     Attributes:
         name: Of the body; `#7` where body 7 has none.
         pose: Its own frame in the world.
-        looks: What MuJoCo's viewer shows of it; everything, where that is nothing.
-        unseen: What collides where nothing of the looks stands for it: part of the shape all the same.
-        hulls: Convex shapes that collide.
-        mass_kg: With all that hangs on it.
-        center: Centre of mass [m].
-        inertia: About the centre of mass [kg m²]. Shape (3, 3).
-        friction: Sliding friction of the shapes that collide, the largest.
+        looks: Visuals in MuJoCo's viewer, or everything where there are none.
+        unseen: Colliders that no visual represents, part of the shape all the same.
+        hulls: Convex colliders.
+        mass_kg: Including attached bodies.
+        center: Center of mass [m].
+        inertia: About the center of mass [kg m²]. Shape (3, 3).
+        friction: Largest sliding friction of the colliders.
     """
 
     name: str
@@ -69,54 +61,54 @@ class ModelObject(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class ModelContents:
-    """A scene.
+    """Objects of a scene.
 
     Attributes:
-        objects: What can move; in a model in which nothing can, every body on the world but the table.
-        still: What stands still: the table, as a rule.
+        objects: Movable ones; in a model without any, every body on the world but the table.
+        still: Static ones, usually the table.
     """
 
     objects: tuple[ModelObject, ...]
     still: tuple[ModelObject, ...]
 
 
-def contents_of(model: mujoco.MjModel) -> ModelContents:
-    """Reads a model in its initial state."""
+def read_model_contents(model: mujoco.MjModel) -> ModelContents:
+    """Read a model in its initial state."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     roots = [int(root) for root in np.unique(model.body_rootid[model.geom_bodyid])]
     moving = {int(root) for root in np.unique(model.body_rootid[model.jnt_bodyid])}
     chosen = moving or {root for root in roots if root > 0 and not is_table(body_name(model, root))}
     return ModelContents(
-        tuple(_content(model, data, root) for root in roots if root in chosen),
-        tuple(_content(model, data, root) for root in roots if root not in chosen),
+        tuple(_read_object(model, data, root) for root in roots if root in chosen),
+        tuple(_read_object(model, data, root) for root in roots if root not in chosen),
     )
 
 
 def is_table(name: str) -> bool:
-    """Whether a name says that this is what the others stand on."""
+    """Test whether a name is that of a support."""
     return name.strip().lower() in TABLE_NAMES
 
 
-def _content(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> ModelObject:
-    pose = _pose(data.xpos[root], data.xmat[root])
+def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> ModelObject:
+    pose = _build_pose(data.xpos[root], data.xmat[root])
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-    seen = _seen(model, geoms)
-    looks = [_look(model, data, geom, pose) for geom in seen]
-    unseen = (_look(model, data, geom, pose) for geom in geoms_without_visual(model, data, seen, solid))
-    hulls = [hull for hull in (_hull(model, data, geom, pose) for geom in solid) if hull is not None]
-    mass, center, inertia = _mass(model, data, root, pose)
+    seen = _list_visual_geoms(model, geoms)
+    looks = [_load_visual(model, data, geom, pose) for geom in seen]
+    unseen = (_load_visual(model, data, geom, pose) for geom in find_geoms_without_visual(model, data, seen, solid))
+    hulls = [hull for hull in (_compute_hull(model, data, geom, pose) for geom in solid) if hull is not None]
+    mass, center, inertia = _compute_mass_properties(model, data, root, pose)
     friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0
     looks_there = tuple(look for look in looks if look is not None)
     shape = tuple(look.mesh for look in unseen if look is not None)
     return ModelObject(body_name(model, root), pose, looks_there, shape, tuple(hulls), mass, center, inertia, friction)
 
 
-def _seen(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
-    """What the viewer shows. Whether a geom collides says nothing of that: a decal beside a solid is not all there is.
+def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
+    """List geoms that the viewer shows, whether they collide or not.
 
-    Of geoms that are the same mesh at the same place, one to be seen and one to collide, the first is enough.
+    Of equal meshes at the same place, one visual and one collider, the first is enough.
     """
     once: dict[tuple[object, ...], int] = {}
     for geom in [g for g in geoms if model.geom_group[g] < HIDDEN_GROUP] or geoms:
@@ -125,42 +117,46 @@ def _seen(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
     return list(once.values())
 
 
-def _look(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> VisualMesh | None:
+def _load_visual(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> VisualMesh | None:
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     shape: TriangleMesh | None
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        shape = geom_mesh(model, geom)
+        shape = read_geom_mesh(model, geom)
     elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-        shape = geom_box(model, geom)
+        shape = make_geom_box(model, geom)
     elif kind == mujoco.mjtGeom.mjGEOM_PLANE:
-        shape = _sheet(size)
+        shape = _make_plane(size)
     else:
-        shape = geom_shape(model, geom)
-    return None if shape is None else VisualMesh(_in_frame(shape, data, geom, pose), geom_color(model, geom))
+        shape = make_geom_mesh(model, geom)
+    return (
+        None if shape is None else VisualMesh(_to_object_frame(shape, data, geom, pose), read_geom_color(model, geom))
+    )
 
 
-def _sheet(size: np.ndarray) -> TriangleMesh:
+def _make_plane(size: np.ndarray) -> TriangleMesh:
     x, y = (float(half) if half > 0.0 else UNBOUNDED_PLANE_M for half in size[:2])
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
 
 
-def _hull(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh | None:
-    """What MuJoCo collides with: the convex hull of a mesh, a primitive as a fine polyhedron; None for a plane."""
-    shape = None if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE else geom_shape(model, geom)
+def _compute_hull(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh | None:
+    """Compute a collider as a convex hull, with primitives as fine polyhedra; None for a plane."""
+    shape = None if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE else make_geom_mesh(model, geom)
     if shape is None:
         return None
-    hull = hull_mesh(_in_frame(shape, data, geom, pose).vertices)
+    hull = make_hull_mesh(_to_object_frame(shape, data, geom, pose).vertices)
     return hull if len(hull.faces) else None
 
 
-def _in_frame(mesh: TriangleMesh, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh:
-    """A geom's mesh in the frame of the object."""
-    return placed_mesh(mesh, compose(inverse(pose), _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
+def _to_object_frame(mesh: TriangleMesh, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh:
+    """Transform a geom's mesh to the object's frame."""
+    return place_mesh(mesh, compose_poses(invert_pose(pose), _build_pose(data.geom_xpos[geom], data.geom_xmat[geom])))
 
 
-def _mass(model: mujoco.MjModel, data: mujoco.MjData, root: int, pose: Pose) -> tuple[float, Vector3, Matrix3]:
-    """Mass, centre and inertia of a body and all that hangs on it, in the object's own frame."""
+def _compute_mass_properties(
+    model: mujoco.MjModel, data: mujoco.MjData, root: int, pose: Pose
+) -> tuple[float, Vector3, Matrix3]:
+    """Compute mass, center and inertia of a body and all attached bodies, in the object's own frame."""
     bodies = [int(b) for b in np.flatnonzero(model.body_rootid == root)] if root else []
     mass = float(model.body_mass[bodies].sum()) if bodies else 0.0
     if mass <= 0.0:
@@ -177,7 +173,7 @@ def _mass(model: mujoco.MjModel, data: mujoco.MjData, root: int, pose: Pose) -> 
     return mass, local, turn.T @ inertia @ turn
 
 
-def _pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
+def _build_pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
     homogeneous = np.eye(4)
     homogeneous[:3, :3], homogeneous[:3, 3] = matrix.reshape(3, 3), position
     return pose_from_matrix(homogeneous)

@@ -1,7 +1,7 @@
 """URDF: a file per object, and one of the whole scene with every object on a floating joint at its settled pose.
 
-Meshes are OBJ files under `meshes/`. URDF has no words for labels and friction: they stand in elements of their own
-(`label`, and Gazebo's and Bullet's for friction), which readers that do not know them pass over.
+Meshes are OBJ files under `meshes/`. Labels and friction, which URDF lacks, are in extra elements (`label`, and
+Gazebo's and Bullet's for friction) that other readers ignore.
 """
 
 import xml.etree.ElementTree as ET
@@ -11,51 +11,47 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from schemas.geometry import Matrix3, Pose
-from schemas.identity import file_stem
+from schemas.identity import make_file_stem
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject
-from tableverse_factory.delivery.formats.textured_obj import obj_files
+from tableverse_factory.delivery.formats.textured_obj import encode_obj_files
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.physics.mjcf.obj_assets import obj_bytes
+from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 
 MESHES = "meshes"
 WORLD = "world"
 
 
-def urdf_files(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
-    """`scene.urdf`, `<object>.urdf` for each object, and their meshes, by path.
-
-    Args:
-        contents: What there is.
-        labels: Of the objects by name: untrusted text.
+def encode_urdf(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
+    """Encode `scene.urdf`, `<object>.urdf` for each object, and their meshes, by path; `labels` are untrusted text.
 
     Raises:
         InputError: `bad_name` if two links or two files would have the same name.
     """
     files: list[tuple[str, bytes]] = []
-    scene = _robot("scene")
+    scene = _make_robot("scene")
     ET.SubElement(scene, "link", name=WORLD)
-    _refuse_doubles("links", [WORLD, *map(_link_name, (*contents.still, *contents.objects))])
+    _check_unique_names("links", [WORLD, *map(_name_link, (*contents.still, *contents.objects))])
     for content in (*contents.still, *contents.objects):
         moves = content in contents.objects
-        link, meshes = _link(content, moves)
+        link, meshes = _build_link(content, moves)
         files += meshes
         scene.append(link)
-        scene.append(_joint(content, "floating" if moves else "fixed"))
+        scene.append(_build_joint(content, "floating" if moves else "fixed"))
         if moves:
-            alone = _robot(content.name)
+            alone = _make_robot(content.name)
             alone.append(link)
             for root in (alone, scene):
                 _add_label(root, content.name, labels.get(content.name))
-            files.append((f"{file_stem(content.name)}.urdf", _document(alone)))
-    files.append(("scene.urdf", _document(scene)))
-    _refuse_doubles("files", [name for name, _ in files])
+            files.append((f"{make_file_stem(content.name)}.urdf", _serialize(alone)))
+    files.append(("scene.urdf", _serialize(scene)))
+    _check_unique_names("files", [name for name, _ in files])
     return dict(files)
 
 
-def _refuse_doubles(what: str, names: Sequence[str]) -> None:
-    """An object called `scene` or `a_look_01` takes a file from another, and `Cup` from `cup` on some disks."""
+def _check_unique_names(what: str, names: Sequence[str]) -> None:
+    """Refuse names that differ only in case, or objects named like another's file."""
     counts = Counter(name.lower() for name in names)
     if doubled := [sanitize_line(name, 100) for name, count in counts.items() if count > 1]:
         raise InputError(
@@ -63,7 +59,7 @@ def _refuse_doubles(what: str, names: Sequence[str]) -> None:
         )
 
 
-def _robot(name: str) -> ET.Element:
+def _make_robot(name: str) -> ET.Element:
     robot = ET.Element("robot", name=name)
     # For MuJoCo alone: meshes are where they are said to be, and a body without a joint keeps its mass.
     compiler = {"strippath": "false", "fusestatic": "false", "discardvisual": "false"}
@@ -71,56 +67,61 @@ def _robot(name: str) -> ET.Element:
     return robot
 
 
-def _link(content: ModelObject, moves: bool) -> tuple[ET.Element, list[tuple[str, bytes]]]:
-    link = ET.Element("link", name=_link_name(content))
-    stem = file_stem(content.name)
+def _build_link(content: ModelObject, moves: bool) -> tuple[ET.Element, list[tuple[str, bytes]]]:
+    link = ET.Element("link", name=_name_link(content))
+    stem = make_file_stem(content.name)
     if moves:
-        link.append(_inertial(content))
+        link.append(_build_inertial(content))
     files: list[tuple[str, bytes]] = []
     for index, look in enumerate(content.looks):
         name = stem if index == 0 else f"{stem}_look_{index:02d}"
-        files += [(f"{MESHES}/{file}", data) for file, data in obj_files(look, name).items()]
-        visual = _shape("visual", name)
+        files += [(f"{MESHES}/{file}", data) for file, data in encode_obj_files(look, name).items()]
+        visual = _build_shape("visual", name)
         if look.mesh.texture is None:
             material = ET.SubElement(visual, "material", name=name)
-            ET.SubElement(material, "color", rgba=_numbers([*(np.array(look.color) / 255.0), 1.0]))
+            ET.SubElement(material, "color", rgba=_format_numbers([*(np.array(look.color) / 255.0), 1.0]))
         link.append(visual)
     for index, hull in enumerate(content.hulls):
         name = f"{stem}_piece_{index:02d}"
-        files.append((f"{MESHES}/{name}.obj", obj_bytes(hull)))
-        link.append(_shape("collision", name))
+        files.append((f"{MESHES}/{name}.obj", encode_obj(hull)))
+        link.append(_build_shape("collision", name))
     contact = ET.SubElement(link, "contact")
-    ET.SubElement(contact, "lateral_friction", value=_numbers([content.friction]))
+    ET.SubElement(contact, "lateral_friction", value=_format_numbers([content.friction]))
     return link, files
 
 
-def _link_name(content: ModelObject) -> str:
-    """The object's name; what belongs to no body is not called as the root is."""
+def _name_link(content: ModelObject) -> str:
+    """Name the link after its object, except for the world body, as the root has that name."""
     return "surroundings" if content.name == WORLD else content.name
 
 
-def _inertial(content: ModelObject) -> ET.Element:
+def _build_inertial(content: ModelObject) -> ET.Element:
     inertial = ET.Element("inertial")
-    ET.SubElement(inertial, "origin", xyz=_numbers(content.center), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=_numbers([content.mass_kg]))
+    ET.SubElement(inertial, "origin", xyz=_format_numbers(content.center), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=_format_numbers([content.mass_kg]))
     i = content.inertia
     keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2], "iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
-    ET.SubElement(inertial, "inertia", {key: _numbers([value]) for key, value in keys.items()})
+    ET.SubElement(inertial, "inertia", {key: _format_numbers([value]) for key, value in keys.items()})
     return inertial
 
 
-def _shape(kind: str, mesh: str) -> ET.Element:
+def _build_shape(kind: str, mesh: str) -> ET.Element:
     shape = ET.Element(kind, name=mesh)
     ET.SubElement(shape, "origin", xyz="0 0 0", rpy="0 0 0")
     ET.SubElement(ET.SubElement(shape, "geometry"), "mesh", filename=f"{MESHES}/{mesh}.obj")
     return shape
 
 
-def _joint(content: ModelObject, kind: str) -> ET.Element:
-    joint = ET.Element("joint", name=f"{WORLD}_to_{_link_name(content)}", type=kind)
-    ET.SubElement(joint, "origin", xyz=_numbers(content.pose.position), rpy=_numbers(roll_pitch_yaw(content.pose)))
+def _build_joint(content: ModelObject, kind: str) -> ET.Element:
+    joint = ET.Element("joint", name=f"{WORLD}_to_{_name_link(content)}", type=kind)
+    ET.SubElement(
+        joint,
+        "origin",
+        xyz=_format_numbers(content.pose.position),
+        rpy=_format_numbers(compute_roll_pitch_yaw(content.pose)),
+    )
     ET.SubElement(joint, "parent", link=WORLD)
-    ET.SubElement(joint, "child", link=_link_name(content))
+    ET.SubElement(joint, "child", link=_name_link(content))
     return joint
 
 
@@ -129,8 +130,8 @@ def _add_label(root: ET.Element, name: str, label: str | None) -> None:
         ET.SubElement(root, "label", link=name).text = label
 
 
-def roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
-    """URDF's angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); with the nose straight up or down, roll is 0."""
+def compute_roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
+    """Compute URDF's angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); roll is 0 at the poles."""
     R: Matrix3 = rotation_matrix(pose.quaternion_wxyz)
     level = float(np.hypot(R[0, 0], R[1, 0]))
     pitch = float(np.arctan2(-R[2, 0], level))
@@ -139,11 +140,11 @@ def roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
     return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
 
 
-def _numbers(values: Sequence[float] | np.ndarray) -> str:
+def _format_numbers(values: Sequence[float] | np.ndarray) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
 
 
-def _document(root: ET.Element) -> bytes:
+def _serialize(root: ET.Element) -> bytes:
     ET.indent(root)
     data: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return data + b"\n"

@@ -1,6 +1,6 @@
-"""USD with physics: rigid bodies with mass and inertia, convex colliders, preview surfaces; z up, metres.
+"""USD with physics: rigid bodies with mass and inertia, convex colliders, preview surfaces; z up, meters.
 
-Needs the package `usd-core`, which is the optional extra `usd`.
+Needs the package `usd-core`, the optional extra `usd`.
 """
 
 import tempfile
@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from schemas.geometry import Matrix3, Quaternion, TriangleMesh
-from schemas.identity import file_stem
-from tableverse_factory.core.optional_imports import require_extra
-from tableverse_factory.core.png import png_bytes
+from schemas.identity import make_file_stem
+from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
 
@@ -24,19 +24,16 @@ ROOT = "/World"
 TEXTURES = "textures"
 
 
-def usd_files(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
-    """`scene.usd` (binary) and its pictures under `textures/`, by path.
+def encode_usd(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
+    """Encode `scene.usd` (binary) and its pictures under `textures/`, by path.
 
-    Prims are called after the objects as far as USD allows; object ids and labels stand in `customData`.
-
-    Args:
-        contents: What there is.
-        labels: Of the objects by name: untrusted text.
+    Prims are named after the objects as far as USD allows; object ids and `labels`, untrusted text, are in
+    `customData`.
 
     Raises:
         InputError: `no_extra` if usd-core is not installed.
     """
-    require_extra("pxr", "USD", "usd")
+    import_extra("pxr", "USD", "usd")
     from pxr import Usd, UsdGeom, UsdPhysics
 
     files: dict[str, bytes] = {}
@@ -51,18 +48,18 @@ def usd_files(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, b
         physics.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
         physics.CreateGravityMagnitudeAttr(9.81)
         for content in contents.still:
-            files |= _add(stage, content, None)
+            files |= _add_object(stage, content, None)
         for content in contents.objects:
-            files |= _add(stage, content, labels.get(content.name, ""))
+            files |= _add_object(stage, content, labels.get(content.name, ""))
         stage.GetRootLayer().Save()
         return {"scene.usd": path.read_bytes(), **files}
 
 
-def _add(stage: "Usd.Stage", content: ModelObject, label: str | None) -> dict[str, bytes]:
-    """One object; a label of None stands for what does not move."""
+def _add_object(stage: "Usd.Stage", content: ModelObject, label: str | None) -> dict[str, bytes]:
+    """Add an object, static if its label is None."""
     from pxr import Gf, Tf, UsdGeom
 
-    path = _free_path(stage, Tf.MakeValidIdentifier(content.name))
+    path = _find_free_path(stage, Tf.MakeValidIdentifier(content.name))
     body = UsdGeom.Xform.Define(stage, path)
     body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*content.pose.position.tolist()))
     turn = Gf.Quatd(*content.pose.quaternion_wxyz.tolist())
@@ -73,14 +70,14 @@ def _add(stage: "Usd.Stage", content: ModelObject, label: str | None) -> dict[st
         body.GetPrim().SetDisplayName(label or content.name)
         _add_mass(body, content)
     files: dict[str, bytes] = {}
-    stem = file_stem(content.name)
+    stem = make_file_stem(content.name)
     for index, look in enumerate(content.looks):
-        files |= _add_look(stage, f"{path}/look_{index:02d}", look, f"{stem}_{index:02d}")
+        files |= _add_visual(stage, f"{path}/look_{index:02d}", look, f"{stem}_{index:02d}")
     _add_colliders(stage, path, content)
     return files
 
 
-def _free_path(stage: "Usd.Stage", name: str) -> str:
+def _find_free_path(stage: "Usd.Stage", name: str) -> str:
     path, count = f"{ROOT}/{name}", 1
     while stage.GetPrimAtPath(path):
         count += 1
@@ -93,25 +90,25 @@ def _add_mass(body: "UsdGeom.Xform", content: ModelObject) -> None:
 
     UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
     mass = UsdPhysics.MassAPI.Apply(body.GetPrim())
-    moments, axes = principal_axes(content.inertia)
+    moments, axes = compute_principal_axes(content.inertia)
     mass.CreateMassAttr(content.mass_kg)
     mass.CreateCenterOfMassAttr(Gf.Vec3f(*content.center.tolist()))
     mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments.tolist()))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*axes.tolist()))
 
 
-def principal_axes(inertia: Matrix3) -> tuple[np.ndarray, Quaternion]:
-    """Principal moments [kg m²], smallest first, and the rotation of their axes (a right-handed frame)."""
+def compute_principal_axes(inertia: Matrix3) -> tuple[np.ndarray, Quaternion]:
+    """Compute principal moments [kg m²], smallest first, and the rotation of their right-handed axes."""
     moments, axes = np.linalg.eigh(inertia)
     if np.linalg.det(axes) < 0.0:
         axes[:, 2] *= -1.0
     return moments, quaternion_from_matrix(axes)
 
 
-def _add_look(stage: "Usd.Stage", path: str, look: VisualMesh, stem: str) -> dict[str, bytes]:
+def _add_visual(stage: "Usd.Stage", path: str, look: VisualMesh, stem: str) -> dict[str, bytes]:
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
-    mesh = _mesh(stage, path, look.mesh)
+    mesh = _define_mesh(stage, path, look.mesh)
     material = UsdShade.Material.Define(stage, f"{path}/material")
     surface = UsdShade.Shader.Define(stage, f"{path}/material/surface")
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -129,11 +126,11 @@ def _add_look(stage: "Usd.Stage", path: str, look: VisualMesh, stem: str) -> dic
         "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
     )
     points.Set(Vt.Vec2fArray.FromNumpy(np.asarray(texture.corner_uv, dtype=np.float32).reshape(-1, 2)))
-    _add_picture(stage, f"{path}/material", color, f"./{TEXTURES}/{stem}.png")
-    return {f"{TEXTURES}/{stem}.png": png_bytes(np.asarray(texture.picture))}
+    _add_texture(stage, f"{path}/material", color, f"./{TEXTURES}/{stem}.png")
+    return {f"{TEXTURES}/{stem}.png": encode_png(np.asarray(texture.picture))}
 
 
-def _add_picture(stage: "Usd.Stage", path: str, color: "UsdShade.Input", file: str) -> None:
+def _add_texture(stage: "Usd.Stage", path: str, color: "UsdShade.Input", file: str) -> None:
     from pxr import Sdf, UsdShade
 
     reader = UsdShade.Shader.Define(stage, f"{path}/points")
@@ -159,7 +156,7 @@ def _add_colliders(stage: "Usd.Stage", path: str, content: ModelObject) -> None:
     contact.CreateStaticFrictionAttr(content.friction)
     contact.CreateDynamicFrictionAttr(content.friction)
     for index, hull in enumerate(content.hulls):
-        piece = _mesh(stage, f"{path}/piece_{index:02d}", hull)
+        piece = _define_mesh(stage, f"{path}/piece_{index:02d}", hull)
         piece.CreatePurposeAttr(UsdGeom.Tokens.guide)
         UsdPhysics.CollisionAPI.Apply(piece.GetPrim())
         UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
@@ -167,7 +164,7 @@ def _add_colliders(stage: "Usd.Stage", path: str, content: ModelObject) -> None:
         binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
-def _mesh(stage: "Usd.Stage", path: str, mesh: TriangleMesh) -> "UsdGeom.Mesh":
+def _define_mesh(stage: "Usd.Stage", path: str, mesh: TriangleMesh) -> "UsdGeom.Mesh":
     from pxr import UsdGeom, Vt
 
     prim = UsdGeom.Mesh.Define(stage, path)

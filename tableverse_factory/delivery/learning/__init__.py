@@ -1,4 +1,4 @@
-"""What learners need: scenes as a stream, many simulated at once, a scene and a task as an environment."""
+"""Dataset access for learning: scene streams, vectorized simulation, and a Gymnasium environment."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -7,22 +7,22 @@ from tableverse_factory.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tableverse_factory.delivery.learning.environment import TableEnv
-    from tableverse_factory.delivery.learning.grid import Grid, scene_grid
+    from tableverse_factory.delivery.learning.grid import SceneGrid, build_scene_grid
     from tableverse_factory.delivery.learning.loader import SceneDataset
     from tableverse_factory.delivery.learning.stream import SceneStream
     from tableverse_factory.delivery.learning.variation import Variation
-    from tableverse_factory.delivery.learning.vector_sim import ManyScenes
+    from tableverse_factory.delivery.learning.vector_sim import VectorSim
 
-__all__ = ["Grid", "ManyScenes", "SceneDataset", "SceneStream", "TableEnv", "Variation", "scene_grid"]
+__all__ = ["SceneDataset", "SceneGrid", "SceneStream", "TableEnv", "Variation", "VectorSim", "build_scene_grid"]
 
 _HOMES = {
-    "Grid": "grid",
-    "ManyScenes": "vector_sim",
+    "SceneGrid": "grid",
+    "VectorSim": "vector_sim",
     "SceneDataset": "loader",
     "SceneStream": "stream",
     "TableEnv": "environment",
     "Variation": "variation",
-    "scene_grid": "grid",
+    "build_scene_grid": "grid",
 }
 _INSTALL = {"torch": "pip install torch", "gymnasium": "pip install 'tableverse-factory[gym]'"}
 

@@ -1,4 +1,4 @@
-"""Pictures of a cell while it runs, by rays on the CPU: no GL and no display, the same bytes again."""
+"""Camera pictures of a running simulation, ray-cast on the CPU: no GL, no display, deterministic."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,20 +7,20 @@ import numpy as np
 
 from schemas.geometry import Picture, Pose, Texture, TriangleMesh
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.episodes.actors import ArmFigure, cast_with
-from tableverse_factory.delivery.episodes.cameras import robot_eye
-from tableverse_factory.delivery.episodes.incremental_renderer import MovingPictures, Props
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
-from tableverse_factory.physics.mjcf.scene_objects import slab_of
+from tableverse_factory.delivery.episodes.actors import ArmMeshes, build_render_scene
+from tableverse_factory.delivery.episodes.cameras import place_robot_camera
+from tableverse_factory.delivery.episodes.incremental_renderer import IncrementalRenderer, PaintedMeshes
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.physics.mjcf.scene_objects import read_slab
 from tableverse_factory.physics.render.render import Lighting
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.sources.textures.catalogue import TILE_M, texture
+from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture
 
 _TEXTURE_PX = 512
 
 
-class Sight:
-    """A camera that stands with the robot, across the table from it, as the exports for learning have it."""
+class RobotCamera:
+    """Camera across the table from the robot, as in the episode exports."""
 
     def __init__(
         self,
@@ -31,44 +31,41 @@ class Sight:
         table: int | None = None,
         lighting: Lighting | None = None,
     ) -> None:
-        """Draws what stands still.
+        """Render the still parts; every object of the scene may move.
 
         Args:
-            scene: All its objects may move.
+            scene: With all its objects.
             arm: Beside it.
             base: Of the arm, in the table frame.
             size: Height and width of the pictures [px].
-            table: Seed of a texture for the table; None leaves it as it is.
+            table: Seed of a texture for the table; None keeps its own.
             lighting: Soft daylight by default.
 
         Raises:
             InputError: if the scene does not load, or has no table.
         """
-        self._figure, self._base = ArmFigure(arm), base
+        self._figure, self._base = ArmMeshes(arm), base
         objects = {str(item["object_id"]) for item in scene.meta["objects"]}
-        cast = cast_with(scene, objects, self._figure, base)
-        still = cast.still if table is None else _with_table(cast.still, scene, table)
+        cast = build_render_scene(scene, objects, self._figure, base)
+        still = cast.still if table is None else _retexture_table(cast.still, scene, table)
         self._names = cast.names
-        self._pictures = MovingPictures(still, cast.moving, robot_eye(base, size[1], size[0]), lighting)
+        self._renderer = IncrementalRenderer(still, cast.moving, place_robot_camera(base, size[1], size[0]), lighting)
 
     def picture(self, poses: Mapping[str, np.ndarray], positions: np.ndarray) -> Picture:
-        """What it sees.
-
-        Args:
-            poses: Of each object: position [m] and quaternion wxyz in the table frame. Each of shape (7,).
-            positions: Of the arm's joints and fingers. Shape (j + f,).
-        """
-        objects = [Pose(poses[name][:3].copy(), normalized_quaternion(poses[name][3:])) for name in self._names]
-        return self._pictures.frame([*objects, *self._figure.poses(positions, self._base)])
+        """Render the picture at object poses (position [m], quaternion wxyz) and positions of joints and fingers."""
+        objects = [Pose(poses[name][:3].copy(), normalize_quaternion(poses[name][3:])) for name in self._names]
+        return self._renderer.render([*objects, *self._figure.poses(positions, self._base)])
 
 
-def _with_table(still: Props, scene: Scene, seed: int) -> Props:
-    """The table, which is the last part but the pedestal, in another texture."""
-    index, slab = len(still.meshes) - 2, slab_of(scene.files())
+def _retexture_table(still: PaintedMeshes, scene: Scene, seed: int) -> PaintedMeshes:
+    """Replace the texture of the table, the last mesh but the pedestal."""
+    index, slab = len(still.meshes) - 2, read_slab(scene.files())
     board = still.meshes[index]
     c, s = np.cos(slab.yaw), np.sin(slab.yaw)
     along = (board.vertices[:, :2] - slab.center_xy) @ np.array([[c, -s], [s, c]]) / TILE_M
-    covered = TriangleMesh(board.vertices, board.faces, texture=Texture(texture(seed, _TEXTURE_PX), along[board.faces]))
+    covered = TriangleMesh(
+        board.vertices, board.faces, texture=Texture(make_texture(seed, _TEXTURE_PX), along[board.faces])
+    )
     meshes, paints = list(still.meshes), list(still.paints)
     meshes[index], paints[index] = covered, None
     return replace(still, meshes=tuple(meshes), paints=tuple(paints))

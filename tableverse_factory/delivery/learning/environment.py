@@ -1,4 +1,4 @@
-"""A scene and a task as a Gymnasium environment, `TableVerse/PickPlace-v0` where this module is imported."""
+"""Gymnasium environment of a scene and a task, registered as `TableVerse/PickPlace-v0` on import."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,31 +11,29 @@ from schemas.geometry import Picture, Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene, open_dataset
-from tableverse_factory.delivery.learning.camera import Sight
-from tableverse_factory.delivery.learning.pick_place_sim import Cell, Standing
-from tableverse_factory.delivery.learning.variation import Variation, lighting_of, table_seed
+from tableverse_factory.delivery.learning.camera import RobotCamera
+from tableverse_factory.delivery.learning.pick_place_sim import PickPlaceSim, SimState
+from tableverse_factory.delivery.learning.variation import Variation, draw_lighting, draw_table_seed
 from tableverse_factory.physics.render.render import Lighting
 
 ENVIRONMENT_ID = "TableVerse/PickPlace-v0"
 FPS = 50
 MAX_STEPS = 1000
 _MAX_PX = 4096
-
-_ROOM_M, _SPEED = 3.0, 20.0
-"""Observations are cut to these: positions [m], and speeds of joints [rad/s]."""
+_MAX_POSITION_M, _MAX_JOINT_SPEED = 3.0, 20.0  # bounds of observations: positions [m], and speeds of joints [rad/s]
 
 
 class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignore[misc]
     """Pick up X and bring it into a relation to Y, with an arm on an exported scene.
 
-    An action of shape (j + 1,) in -1 … 1 says where the joints are to be, between their limits, and how far the gripper
-    is to open, after 1/50 s. What counts as done is what counts in trajectories/ (`learning.cell`); then the reward is
-    1 and the episode terminates. It also terminates, with `info["failure"]`, when it cannot succeed any more. An
-    episode that has ended takes no further step.
+    An action of shape (j + 1,) in -1 … 1 sets the joint targets, between their limits, and the gripper's opening after
+    1/50 s. Success is defined as in trajectories/ (`learning.pick_place_sim`); then the reward is 1 and the episode
+    terminates. It also terminates, with `info["failure"]`, when it cannot succeed any more. An episode that has ended
+    takes no further step.
 
     Observations, all in the table frame: `state` (joints [rad], their speeds [rad/s], opening [m], gripper's position
     and quaternion wxyz), `objects` (position and quaternion wxyz of X, of Y and of all others, then zeros up to
-    `max_objects`), and `camera` where asked for.
+    `max_objects`), and optionally `camera`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 - as Gymnasium has it
@@ -56,51 +54,51 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         render_mode: str | None = None,
         render_size: tuple[int, int] = (480, 640),
     ) -> None:
-        """Compiles the scene with its arm; pictures are prepared when the first is asked for.
+        """Compile the scene with its arm; cameras are prepared on first use.
 
         Args:
             scene: Of a dataset.
             task: Id of one of its tasks, or one of your own: `x_id`, `y_id` and `relation`.
-            robot: As in `robots.doors.arm_of`.
-            base: Where the arm stands; by default as in `learning.cell.Cell`.
-            reward: `sparse`: 1 when done, else 0. `dense`: besides, what was gained or lost on the way since the step
-                before, 1 at most in all (`learning.reward`).
-            max_steps: After so many steps of 1/50 s the episode is truncated; None: never.
-            max_objects: Rows of `objects`, where environments of several scenes are to have equal spaces.
-            max_disturbed_m: How far any other object may be moved [m].
+            robot: As in `robots.registry.load_arm`.
+            base: Pose of the arm's base; by default as in `PickPlaceSim`.
+            reward: `sparse`: 1 on success, else 0. `dense`: adds the progress gained or lost in the step, at most 1 in
+                all (`learning.reward`).
+            max_steps: Steps of 1/50 s after which the episode is truncated; None: never.
+            max_objects: Rows of `objects`, for equal spaces over several scenes.
+            max_disturbed_m: Allowed displacement of any other object [m].
             variation: What resets change; nothing by default. `reset(options={"variation": …})` replaces it once.
             camera: Height and width of the picture in each observation [px]; none by default.
             render_mode: `rgb_array` or None.
-            render_size: Height and width of what `render` gives [px].
+            render_size: Height and width of the pictures of `render` [px].
 
         Raises:
-            InputError: as `Cell`.
-            ConfigError: for an argument that is none, or more objects than `max_objects`.
+            InputError: as `PickPlaceSim`.
+            ConfigError: for an invalid argument, or more objects than `max_objects`.
         """
         if reward not in ("sparse", "dense") or render_mode not in (None, "rgb_array"):
             raise ConfigError(
                 f"reward {reward!r}, render_mode {render_mode!r}: 'sparse' or 'dense', None or 'rgb_array'"
             )
         self.render_mode = render_mode
-        self.cell = Cell(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
+        self.sim = PickPlaceSim(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
         self._scene, self._reward = scene, reward
-        self._max_steps = None if max_steps is None else _count("max_steps", max_steps, 1)
-        self._variation = _variation(Variation() if variation is None else variation)
-        self._camera = None if camera is None else _size("camera", camera)
-        self._render_size = _size("render_size", render_size)
-        objects = len(self.cell.object_ids)
-        self._rows = objects if max_objects is None else _count("max_objects", max_objects, objects)
-        self._sights: dict[tuple[int, int], Sight] = {}
+        self._max_steps = None if max_steps is None else _check_count("max_steps", max_steps, 1)
+        self._variation = _check_variation(Variation() if variation is None else variation)
+        self._camera = None if camera is None else _check_size("camera", camera)
+        self._render_size = _check_size("render_size", render_size)
+        objects = len(self.sim.object_ids)
+        self._rows = objects if max_objects is None else _check_count("max_objects", max_objects, objects)
+        self._cameras: dict[tuple[int, int], RobotCamera] = {}
         self._look: tuple[int | None, Lighting | None] = (None, None)
         self._steps = 0
-        self._standing: Standing | None = None
-        arm = self.cell.station.arm
+        self._state: SimState | None = None
+        arm = self.sim.station.arm
         self._low, self._high = np.array([*arm.lower, 0.0]), np.array([*arm.upper, arm.max_opening_m])
         self.action_space = spaces.Box(-1.0, 1.0, (len(self._low),), np.float32)
         self.observation_space = self._observation_space(len(arm.lower), arm.max_opening_m)
 
-    def command_of(self, action: np.ndarray) -> np.ndarray:
-        """Targets of the joints [rad] and the opening [m] that an action means. Shape (j + 1,).
+    def action_to_command(self, action: np.ndarray) -> np.ndarray:
+        """Convert an action to targets of the joints [rad] and the opening [m]. Shape (j + 1,).
 
         Raises:
             InputError: `bad_action` if it has another shape, or is not finite.
@@ -109,11 +107,11 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         command: np.ndarray = self._low + share * (self._high - self._low)
         return command
 
-    def action_of(self, command: np.ndarray) -> np.ndarray:
-        """The action that means a command, as recorded trajectories hold them. Shape (j + 1,).
+    def command_to_action(self, command: np.ndarray) -> np.ndarray:
+        """Convert a command, as in recorded trajectories, to an action. Shape (j + 1,).
 
         Raises:
-            InputError: as `command_of`.
+            InputError: as `action_to_command`.
         """
         share = (self._numbers("command", command) - self._low) / (self._high - self._low)
         action: np.ndarray = np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
@@ -122,50 +120,50 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The scene as exported, but for what the variation asks for; the arm at home.
+        """Restore the exported scene, varied as requested, with the arm at home.
 
         Args:
-            seed: Of everything that is drawn, from now on.
-            options: `variation`: another one for this episode.
+            seed: Seed of all draws from now on.
+            options: `variation` replaces the environment's for this episode.
 
         Raises:
-            ConfigError: for another option, or a variation that is none.
+            ConfigError: for another option, or an invalid variation.
         """
         super().reset(seed=seed)
         if other := [name for name in options or {} if name != "variation"]:
             raise ConfigError(f"no option {sanitize_line(repr(other[0]), 60)}; there is 'variation'")
-        variation = _variation((options or {}).get("variation", self._variation))
-        standing = self._standing = self.cell.reset(self.np_random, variation)
-        table = table_seed(self.np_random) if variation.table else None
-        lighting = lighting_of(self.np_random) if variation.lights else None
+        variation = _check_variation((options or {}).get("variation", self._variation))
+        state = self._state = self.sim.reset(self.np_random, variation)
+        table = draw_table_seed(self.np_random) if variation.table else None
+        lighting = draw_lighting(self.np_random) if variation.lights else None
         if (table, lighting) != self._look:
-            self._look, self._sights = (table, lighting), {}
+            self._look, self._cameras = (table, lighting), {}
         self._steps = 0
-        return self._observation(standing), self._info(standing)
+        return self._observation(state), self._info(state)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """One command, 1/50 s.
+        """Execute one action for 1/50 s.
 
         Raises:
-            InputError: as `command_of`.
+            InputError: as `action_to_command`.
             gymnasium.error.ResetNeeded: before the first reset, and once the episode has ended.
         """
         before = self._now.progress
         if self._steps > 0 and any(self._ends(self._now)):
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset()")
-        standing = self._standing = self.cell.step(self.command_of(action))
+        state = self._state = self.sim.step(self.action_to_command(action))
         self._steps += 1
-        reward = standing.progress - before if self._reward == "dense" else 0.0
-        ended, truncated = self._ends(standing)
-        return self._observation(standing), reward + standing.success, ended, truncated, self._info(standing)
+        reward = state.progress - before if self._reward == "dense" else 0.0
+        ended, truncated = self._ends(state)
+        return self._observation(state), reward + state.success, ended, truncated, self._info(state)
 
     def render(self) -> Picture | None:
-        """What the camera that stands with the robot sees, of shape (h, w, 3); None where no render mode was asked."""
+        """Render the robot camera's picture, of shape (h, w, 3); None without a render mode."""
         return None if self.render_mode is None else self._picture(self._render_size)
 
-    def _ends(self, standing: Standing) -> tuple[bool, bool]:
-        """Whether the episode is terminated, or else truncated."""
-        ended = standing.success or bool(standing.failure)
+    def _ends(self, state: SimState) -> tuple[bool, bool]:
+        """Return whether the episode is terminated, or else truncated."""
+        ended = state.success or bool(state.failure)
         return ended, not ended and self._max_steps is not None and self._steps >= self._max_steps
 
     def _numbers(self, name: str, values: np.ndarray) -> np.ndarray:
@@ -176,9 +174,9 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return numbers
 
     def _observation_space(self, joints: int, opening_m: float) -> spaces.Dict:
-        pose = [*[_ROOM_M] * 3, *[1.0] * 4]
-        low = [*self._low[:-1] - 0.1, *[-_SPEED] * joints, -0.01, *np.negative(pose)]
-        high = [*self._high[:-1] + 0.1, *[_SPEED] * joints, opening_m + 0.01, *pose]
+        pose = [*[_MAX_POSITION_M] * 3, *[1.0] * 4]
+        low = [*self._low[:-1] - 0.1, *[-_MAX_JOINT_SPEED] * joints, -0.01, *np.negative(pose)]
+        high = [*self._high[:-1] + 0.1, *[_MAX_JOINT_SPEED] * joints, opening_m + 0.01, *pose]
         rows = np.tile(np.array(pose, dtype=np.float32), (self._rows, 1))
         seen: dict[str, spaces.Space[Any]] = {
             "state": spaces.Box(np.array(low, dtype=np.float32), np.array(high, dtype=np.float32), dtype=np.float32),
@@ -188,13 +186,13 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             seen["camera"] = spaces.Box(0, 255, (*self._camera, 3), np.uint8)
         return spaces.Dict(seen)
 
-    def _observation(self, standing: Standing) -> dict[str, np.ndarray]:
-        sample, joints = standing.sample, len(self._low) - 1
-        opening = self.cell.opening()
-        state = np.concatenate([sample.qpos[:joints], sample.qvel[:joints], [opening], sample.tcp])
+    def _observation(self, state: SimState) -> dict[str, np.ndarray]:
+        sample, joints = state.sample, len(self._low) - 1
+        opening = self.sim.opening()
+        robot = np.concatenate([sample.qpos[:joints], sample.qvel[:joints], [opening], sample.tcp])
         objects = np.zeros((self._rows, 7), dtype=np.float32)
-        objects[: len(self.cell.object_ids)] = self.cell.poses()
-        seen = {"state": state.astype(np.float32), "objects": objects}
+        objects[: len(self.sim.object_ids)] = self.sim.poses()
+        seen = {"state": robot.astype(np.float32), "objects": objects}
         for name, values in seen.items():
             space = self.observation_space[name]
             np.clip(values, space.low, space.high, out=values)
@@ -202,37 +200,37 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
 
     def _picture(self, size: tuple[int, int]) -> Picture:
         sample = self._now.sample
-        if size not in self._sights:
-            station = self.cell.station
-            self._sights[size] = Sight(self._scene, station.arm, station.base, size, *self._look)
-        poses = dict(zip(self.cell.object_ids, self.cell.poses(), strict=True))
-        return self._sights[size].picture(poses, sample.qpos)
+        if size not in self._cameras:
+            station = self.sim.station
+            self._cameras[size] = RobotCamera(self._scene, station.arm, station.base, size, *self._look)
+        poses = dict(zip(self.sim.object_ids, self.sim.poses(), strict=True))
+        return self._cameras[size].picture(poses, sample.qpos)
 
     @property
-    def _now(self) -> Standing:
-        if self._standing is None:
+    def _now(self) -> SimState:
+        if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset() first")
-        return self._standing
+        return self._state
 
-    def _info(self, standing: Standing) -> dict[str, Any]:
+    def _info(self, state: SimState) -> dict[str, Any]:
         return {
-            "success": standing.success,
-            "failure": standing.failure,
-            "lifted": standing.lifted,
-            "at_rest": standing.at_rest,
-            "fingers": int(standing.sample.pads).bit_count(),
-            "disturbed_m": standing.disturbed_m,
+            "success": state.success,
+            "failure": state.failure,
+            "lifted": state.lifted,
+            "at_rest": state.at_rest,
+            "fingers": int(state.sample.pads).bit_count(),
+            "disturbed_m": state.disturbed_m,
         }
 
 
-def made(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
-    """The environment by names alone, as `gymnasium.make` and processes of their own can take them.
+def make_environment(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
+    """Make the environment from names alone, for `gymnasium.make` and worker processes.
 
     Args:
         dataset: As in `open_dataset`.
         scene: Id of one of its scenes.
         task: Id of one of its tasks.
-        options: As in `TableEnv`, but for `max_steps`: Gymnasium itself truncates.
+        options: As in `TableEnv`, except `max_steps`: Gymnasium itself truncates.
 
     Raises:
         ConfigError: as `TableEnv`, or for `max_steps`.
@@ -242,23 +240,23 @@ def made(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
     return TableEnv(open_dataset(dataset).scene(scene), task, max_steps=None, **options)
 
 
-def _count(name: str, value: object, least: int) -> int:
+def _check_count(name: str, value: object, least: int) -> int:
     if not isinstance(value, int | np.integer) or value < least:
         raise ConfigError(f"{name} {value!r}: give a whole number from {least} on")
     return int(value)
 
 
-def _size(name: str, value: object) -> tuple[int, int]:
+def _check_size(name: str, value: object) -> tuple[int, int]:
     sides = tuple(value) if isinstance(value, Sequence | np.ndarray) else ()
     if len(sides) != 2 or not all(isinstance(side, int | np.integer) and 1 <= side <= _MAX_PX for side in sides):
         raise ConfigError(f"{name} {value!r}: give height and width, each from 1 to {_MAX_PX} px")
     return int(sides[0]), int(sides[1])
 
 
-def _variation(value: object) -> Variation:
+def _check_variation(value: object) -> Variation:
     if not isinstance(value, Variation):
         raise ConfigError(f"variation {sanitize_line(repr(value), 60)}: give a Variation")
     return value
 
 
-gymnasium.register(ENVIRONMENT_ID, entry_point=f"{__name__}:made", max_episode_steps=MAX_STEPS)
+gymnasium.register(ENVIRONMENT_ID, entry_point=f"{__name__}:make_environment", max_episode_steps=MAX_STEPS)

@@ -1,4 +1,4 @@
-"""What an item of a stream is made of: a name for each part of a scene, and how it is decoded."""
+"""Parts of a stream's items: decoders by name."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.core.storage.untrusted import decode_image, finite_number, open_picture
+from tableverse_factory.core.storage.untrusted import decode_image, open_image, parse_finite
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 
@@ -15,43 +15,45 @@ _BOUNDS = ObserveConfig()
 _RECORDED = ("command", "phase", "qpos", "qvel", "tcp", "object_pose")
 
 
-def _photograph(scene: Scene) -> np.ndarray | None:
-    """The picture that the scene was made from, sRGB. Shape (h, w, 3) uint8."""
-    return _picture(scene, "observation/color.jpg", "RGB")
+def _load_photograph(scene: Scene) -> np.ndarray | None:
+    """Load the input photograph, sRGB. Shape (h, w, 3) uint8."""
+    return _load_picture(scene, "observation/color.jpg", "RGB")
 
 
-def _masks(scene: Scene) -> np.ndarray | None:
-    """Instance ids as found in the picture, 0 = background. Shape (h, w) int32."""
-    pixels = _picture(scene, "observation/masks.png", None)
+def _load_masks(scene: Scene) -> np.ndarray | None:
+    """Load instance ids of the photograph, 0 = background. Shape (h, w) int32."""
+    pixels = _load_picture(scene, "observation/masks.png", None)
     return None if pixels is None else pixels.astype(np.int32)
 
 
-def _picture(scene: Scene, name: str, mode: str | None) -> np.ndarray | None:
+def _load_picture(scene: Scene, name: str, mode: str | None) -> np.ndarray | None:
     data = scene.files().get(name)
     if data is None:
         return None
     called = f"scene {scene.scene_id}: {name}"
-    return decode_image(open_picture(data, called, _BOUNDS, "bad_picture"), called, mode, "bad_picture")
+    return decode_image(open_image(data, called, _BOUNDS, "bad_picture"), called, mode, "bad_picture")
 
 
-def _ids(scene: Scene) -> list[str]:
-    """Of the objects, in the order of `labels` and `poses`."""
+def _list_ids(scene: Scene) -> list[str]:
+    """List object ids, in the order of `labels` and `poses`."""
     return [str(item["object_id"]) for item in scene.meta["objects"]]
 
 
-def _labels(scene: Scene) -> list[str]:
+def _list_labels(scene: Scene) -> list[str]:
     return [sanitize_line(str(item.get("label", "")), 200) for item in scene.meta["objects"]]
 
 
-def _poses(scene: Scene) -> np.ndarray:
-    """Position [m] and quaternion wxyz of each object in the table frame, as exported. Shape (n, 7) float64."""
-    return np.array([_settled(scene, item) for item in scene.meta["objects"]], dtype=np.float64).reshape(-1, 7)
+def _list_poses(scene: Scene) -> np.ndarray:
+    """List exported position [m] and quaternion wxyz of each object in the table frame. Shape (n, 7) float64."""
+    return np.array([_read_settled_pose(scene, item) for item in scene.meta["objects"]], dtype=np.float64).reshape(
+        -1, 7
+    )
 
 
-def _settled(scene: Scene, item: Mapping[str, Any]) -> list[float]:
+def _read_settled_pose(scene: Scene, item: Mapping[str, Any]) -> list[float]:
     try:
         pose = item["poses"]["settled"]
-        numbers = [finite_number(value) for value in (*pose["position"], *pose["quaternion_wxyz"])]
+        numbers = [parse_finite(value) for value in (*pose["position"], *pose["quaternion_wxyz"])]
     except (KeyError, TypeError):
         numbers = []
     if len(numbers) != 7 or None in numbers:
@@ -60,8 +62,8 @@ def _settled(scene: Scene, item: Mapping[str, Any]) -> list[float]:
     return [number for number in numbers if number is not None]
 
 
-def _motions(scene: Scene) -> list[dict[str, Any]]:
-    """Every executed motion: its task, whether it succeeded, what was commanded and what happened."""
+def _list_motions(scene: Scene) -> list[dict[str, Any]]:
+    """List executed motions: task, success, commands and recorded states."""
     found = []
     for trajectory in scene.trajectories():
         if trajectory.row["arrays"] is not None:
@@ -73,24 +75,24 @@ def _motions(scene: Scene) -> list[dict[str, Any]]:
 
 
 PARTS: Mapping[str, Callable[[Scene], Any]] = {
-    "photograph": _photograph,
-    "masks": _masks,
-    "ids": _ids,
-    "labels": _labels,
-    "poses": _poses,
+    "photograph": _load_photograph,
+    "masks": _load_masks,
+    "ids": _list_ids,
+    "labels": _list_labels,
+    "poses": _list_poses,
     "meta": lambda scene: scene.meta,
     "xml": lambda scene: scene.xml,
     "files": lambda scene: scene.files(),
-    "motions": _motions,
+    "motions": _list_motions,
 }
 """Parts by name. `photograph` and `masks` are None where a scene was not made from a picture."""
 
 
 def check_parts(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names unchanged.
+    """Return the names unchanged.
 
     Raises:
-        ConfigError: for a name that is none.
+        ConfigError: for an unknown name.
     """
     for name in names:
         if name not in PARTS:

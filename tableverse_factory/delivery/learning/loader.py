@@ -1,4 +1,4 @@
-"""A stream of scenes for PyTorch's `DataLoader`: every worker of every rank gets its own share."""
+"""Scene streams for PyTorch's `DataLoader`, shared out to the workers of every rank."""
 
 import os
 from collections.abc import Iterator
@@ -12,22 +12,22 @@ from tableverse_factory.delivery.learning.stream import SceneStream
 
 
 class SceneDataset(IterableDataset):  # type: ignore[misc]
-    """A thin cover of a `SceneStream`.
+    """Thin `IterableDataset` over a `SceneStream`.
 
     Scenes differ in size: load them one by one (`batch_size=None`), or with `collate_fn=list`. Its state is that of its
-    process, as torchdata's `StatefulDataLoader` asks each worker for it.
+    process, as torchdata's `StatefulDataLoader` expects of each worker.
     """
 
     def __init__(
         self, stream: SceneStream, rank: int | None = None, ranks: int | None = None, even: bool = False
     ) -> None:
-        """Takes a rank's share.
+        """Take a rank's share.
 
         Args:
             stream: Of all scenes.
-            rank: Of this process; without both, those of `torch.distributed` as they are when a loader is iterated.
-            ranks: How many there are.
-            even: Leave out the last few scenes of each epoch, so that all ranks are given equally many.
+            rank: Of this process; by default that of `torch.distributed` when a loader is iterated.
+            ranks: Number of ranks.
+            even: Drop the last few scenes of each epoch, so that all ranks get equally many.
 
         Raises:
             ConfigError: if there is no such rank, or one of `rank` and `ranks` is given without the other.
@@ -44,34 +44,34 @@ class SceneDataset(IterableDataset):  # type: ignore[misc]
         return len(self._of_rank())
 
     def set_epoch(self, epoch: int) -> None:
-        """Before the loader is iterated: workers are told when they start."""
+        """Set the epoch, before the loader is iterated, as workers receive it when they start."""
         self._whole.set_epoch(epoch)
         if self._here is not None:
             self._here[1].set_epoch(epoch)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """This process's share.
+        """Iterate this process's share.
 
         Raises:
-            InputError: if a state was loaded that is none of this share, or is in the midst of another epoch.
-            ConfigError: in a worker that stays for a second epoch, and where the ranks cannot be known.
+            InputError: if a loaded state is not of this share, or is in the middle of another epoch.
+            ConfigError: in a persistent worker's second epoch, and where the ranks are unknown.
         """
         worker, share = get_worker_info(), self._of_rank()
         if worker is not None:
             if self._iterated() is not None:
-                return _refused()
+                return _refuse_persistent_worker()
             share = share.part(worker.id, worker.num_workers)
         if self._loaded is not None:
-            _go_on(share, self._loaded)
+            _resume(share, self._loaded)
             self._loaded = None
         self._here = (os.getpid(), share)
         return iter(share)
 
     def state_dict(self) -> dict[str, Any]:
-        """Of this process's share.
+        """Return the state of this process's share.
 
         Raises:
-            ConfigError: where nothing was iterated in this process: the workers of a loader are others.
+            ConfigError: where nothing was iterated in this process, as with a loader's workers.
         """
         if self._loaded is not None:
             return self._loaded
@@ -84,15 +84,15 @@ class SceneDataset(IterableDataset):  # type: ignore[misc]
         return share.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """For the next iteration of this process's share, in the state's own epoch (`set_epoch`); checked then."""
+        """Resume from a state at the next iteration, in the state's own epoch (`set_epoch`); checked then."""
         self._loaded = state
 
     def __getstate__(self) -> dict[str, Any]:
-        """For a spawned worker, which has no `torch.distributed` to ask."""
-        return {**self.__dict__, "_division": self._division or _group(), "_here": None}
+        """Resolve the rank for a spawned worker, which has no `torch.distributed`."""
+        return {**self.__dict__, "_division": self._division or _get_rank(), "_here": None}
 
     def _of_rank(self) -> SceneStream:
-        division = self._division or _group()
+        division = self._division or _get_rank()
         if division is None and (size := os.environ.get("WORLD_SIZE", "1")) != "1":
             raise ConfigError(f"WORLD_SIZE is {size}, but no process group is set up: do, or give rank and ranks")
         return self._whole.part(*(division or (0, 1)), self._even)
@@ -101,21 +101,21 @@ class SceneDataset(IterableDataset):  # type: ignore[misc]
         return self._here[1] if self._here is not None and self._here[0] == os.getpid() else None
 
 
-def _refused() -> Iterator[dict[str, Any]]:
-    """Raises at the first item: what is raised before it ends a worker that stays without a word."""
+def _refuse_persistent_worker() -> Iterator[dict[str, Any]]:
+    """Raise at the first item, as an earlier error would end a persistent worker silently."""
     yield from ()
     raise ConfigError("persistent_workers=True: workers that stay never hear of set_epoch; give False")
 
 
-def _group() -> tuple[int, int] | None:
-    """This process's rank in `torch.distributed`, and how many there are."""
+def _get_rank() -> tuple[int, int] | None:
+    """Return this process's rank in `torch.distributed`, and the number of ranks."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         return torch.distributed.get_rank(), torch.distributed.get_world_size()
     return None
 
 
-def _go_on(share: SceneStream, state: dict[str, Any]) -> None:
-    """Where the state was; one from the beginning or the end of another epoch changes nothing."""
+def _resume(share: SceneStream, state: dict[str, Any]) -> None:
+    """Resume a share; a state at the beginning or end of another epoch changes nothing."""
     epoch = share.state_dict()["epoch"]
     share.load_state_dict(state)
     if 0 < state["given"] < len(share) and state["epoch"] != epoch:

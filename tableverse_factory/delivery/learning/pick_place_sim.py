@@ -1,7 +1,7 @@
-"""A scene, a task and an arm in physics: told what to do one command at a time, and judged as proofs are.
+"""Interactive pick-and-place simulation of a scene, a task and an arm, one command at a time.
 
-What counts as success is what counts in trajectories/ (`proof.judge`): lifted, nothing else moved too far, let go, at
-rest, and the relation holds on the true meshes. Only that the fingers are told in six phases is not asked of a policy.
+Success is defined as in trajectories/ (`execution.success`): lifted, nothing else moved too far, released, at rest, and
+the relation holds on the true meshes. Only the six phases of the fingers are not required.
 """
 
 from collections.abc import Mapping
@@ -16,39 +16,38 @@ from schemas.trajectories import Numbers
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.learning.reward import progress, way_to_place
-from tableverse_factory.delivery.learning.variation import Variation, displaced
-from tableverse_factory.geometry.math.transforms import normalized_quaternion, quaternion_about_z
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
+from tableverse_factory.delivery.learning.variation import Variation, displace_objects
+from tableverse_factory.geometry.math.transforms import normalize_quaternion, quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.simulate.at_rest import HOLD_S, SPEED_LIMIT
 from tableverse_factory.robotics.execution.arrays import MAX_STEP_S, MIN_STEP_S
-from tableverse_factory.robotics.execution.goal import goal_of
-from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, Sample
-from tableverse_factory.robotics.execution.rollout import check_settings, timed
-from tableverse_factory.robotics.execution.success import FALL_M, MIN_LIFT_M, allowances
-from tableverse_factory.robotics.robots.base import bases
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.execution.goal import load_goal
+from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, StateSample
+from tableverse_factory.robotics.execution.rollout import align_timestep, check_simulation_settings
+from tableverse_factory.robotics.execution.success import FALL_M, MIN_LIFT_M, compute_displacement_limits
+from tableverse_factory.robotics.robots.base import find_bases
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 
-_SAME_M = 1e-4
-"""A relation is not computed again while the objects are as near to where they were."""
+_UNMOVED_M = 1e-4  # displacement below which a relation is not recomputed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Standing(Frozen):
-    """How things stand after a command.
+class SimState(Frozen):
+    """State after a command.
 
     Attributes:
-        sample: What was measured.
-        lifted: Whether the object was up and in the fingers at some time.
-        at_rest: Whether the object was at rest for `HOLD_S` until now.
+        sample: Measurements.
+        lifted: Whether the object was ever lifted by the fingers.
+        at_rest: Whether the object was at rest for the last `HOLD_S`.
         success: Whether the task is done.
         failure: `disturbed`, `fell` or `simulation_unstable` once it cannot succeed any more; else empty.
         progress: From 0 to 1 (`learning.reward`).
-        disturbed_m: Largest displacement of any other object until now [m].
+        disturbed_m: Largest displacement of any other object so far [m].
     """
 
-    sample: Sample
+    sample: StateSample
     lifted: bool
     at_rest: bool
     success: bool
@@ -57,13 +56,13 @@ class Standing(Frozen):
     disturbed_m: float
 
 
-class Cell:
-    """One arm at one scene with one task.
+class PickPlaceSim:
+    """Simulation of one arm, scene and task.
 
     Attributes:
         station: Scene and arm, compiled.
-        goal: What is to be true in the end.
-        instruction: The task in words; foreign text, made printable.
+        goal: Success criterion.
+        instruction: Foreign text of the task, made printable.
         step_s: Time between commands [s].
     """
 
@@ -76,36 +75,36 @@ class Cell:
         step_s: float = 0.02,
         max_disturbed_m: float = 0.02,
     ) -> None:
-        """Compiles the scene with its arm.
+        """Compile the scene with its arm.
 
         Args:
             scene: Of a dataset.
             task: Id of one of its tasks, or one of your own: `x_id`, `y_id` and `relation`.
-            robot: As in `robots.doors.arm_of`.
-            base: Where the arm stands, in the table frame; by default where the recorded trajectory of the task had it,
-                else the best place from which both objects are reached.
+            robot: As in `robots.registry.load_arm`.
+            base: Pose of the arm's base in the table frame; by default that of the task's recorded trajectory, else the
+                best one from which both objects are reached.
             step_s: Time between commands [s].
-            max_disturbed_m: How far any other object may be moved (`proof.judge`) [m].
+            max_disturbed_m: Allowed displacement of any other object (`execution.success`) [m].
 
         Raises:
-            InputError: `bad_task` for no task of this scene, `no_base` if no place reaches both objects; or if the
+            InputError: `bad_task` if the scene has no such task, `no_base` if no base reaches both objects; or if the
                 scene does not load.
-            ConfigError: if there is no such robot, or `max_disturbed_m` is no length.
+            ConfigError: if there is no such robot, or `max_disturbed_m` is negative.
         """
         if not MIN_STEP_S <= step_s <= MAX_STEP_S:
             raise InputError(f"step_s {step_s}: give {MIN_STEP_S} to {MAX_STEP_S} s", "bad_step")
         if not max_disturbed_m >= 0.0:
             raise ConfigError(f"max_disturbed_m {max_disturbed_m}: give a length from 0 m on")
-        files, row = scene.files(), _task_row(scene, task)
-        self.goal = goal_of(files, row, max_disturbed_m)
+        files, row = scene.files(), _find_task(scene, task)
+        self.goal = load_goal(files, row, max_disturbed_m)
         self.instruction = sanitize_line(str(row.get("instruction") or ""), 500)
         self.step_s = step_s
-        self.station = Station(files, arm_of(robot))
-        check_settings(self.station.model)
+        self.station = Station(files, load_arm(robot))
+        check_simulation_settings(self.station.model)
         if absent := [name for name in (self.goal.x_id, self.goal.y_id) if name not in self.station.object_bodies]:
             raise InputError(f"object {absent[0]!r} of scene {scene.scene_id} does not move", "bad_task")
-        self.station.place_base(base or self._recorded_base(scene, row) or self._best_base())
-        self._watch = ExecutionMonitor(self.station, self.goal.x_id)
+        self.station.place_base(base or self._find_recorded_base(scene, row) or self._find_best_base())
+        self._monitor = ExecutionMonitor(self.station, self.goal.x_id)
         self.reset(np.random.default_rng(0), Variation())
 
     @property
@@ -115,83 +114,85 @@ class Cell:
         return (*first, *(name for name in self.station.object_ids if name not in first))
 
     def poses(self) -> np.ndarray:
-        """Position [m] and quaternion wxyz of each of `object_ids` in the table frame. Shape (n, 7)."""
+        """Return position [m] and quaternion wxyz of each of `object_ids` in the table frame. Shape (n, 7)."""
         starts = np.array([self.station.object_qpos[name] for name in self.object_ids])
         return np.array(self._data.qpos[starts[:, None] + np.arange(7)])
 
     def opening(self) -> float:
-        """The distance between the fingertips as it is [m]."""
+        """Return the present distance between the fingertips [m]."""
         return self.station.opening(self._data)
 
-    def reset(self, rng: np.random.Generator, variation: Variation) -> Standing:
-        """Everything as exported but for what `variation` asks for; the arm at home with open fingers."""
+    def reset(self, rng: np.random.Generator, variation: Variation) -> SimState:
+        """Restore the exported scene, varied by `variation`, with the arm at home and open fingers."""
         self._data = self.station.data()
-        displaced(self.station, self._data, variation, rng)
+        displace_objects(self.station, self._data, variation, rng)
         mujoco.mj_forward(self.station.model, self._data)
-        self._allowed_m = allowances(self.goal, self._watch.others, self._watch.touching(self._data, self.goal.y_id))
-        self._watch.begin(self._data)
-        self._told = np.array([*self.station.arm.home, self.station.arm.max_opening_m])
+        self._allowed_m = compute_displacement_limits(
+            self.goal, self._monitor.others, self._monitor.find_touching(self._data, self.goal.y_id)
+        )
+        self._monitor.begin(self._data)
+        self._command = np.array([*self.station.arm.home, self.station.arm.max_opening_m])
         self._index, self._still_s, self._disturbed_m, self._lifted = 0, 0.0, 0.0, False
-        self._failure, self._judged = "", (np.full((2, 7), np.inf), False)
-        sample = self._watch.sample(self._data, 0, 0, self._told)
+        self._failure, self._relation_cache = "", (np.full((2, 7), np.inf), False)
+        sample = self._monitor.sample(self._data, 0, 0, self._command)
         self._boxes = [
-            _box(placed_mesh(mesh, _pose(row)))
+            _compute_box(place_mesh(mesh, _pose(row)))
             for mesh, row in zip((self.goal.x, self.goal.y), self.poses()[:2], strict=True)
         ]
         self._stood_m = float(sample.center[2])
-        return self._standing(sample)
+        return self._update_state(sample)
 
-    def step(self, command: Numbers) -> Standing:
-        """Simulates until the servos' targets, each on a straight line, have reached a command.
+    def step(self, command: Numbers) -> SimState:
+        """Simulate until the servos' targets have moved in straight lines to a command.
 
         Args:
-            command: Targets of the joints [rad], then the opening [m]; cut to what the arm can do. Shape (j + 1,).
+            command: Targets of the joints [rad], then the opening [m]; clipped to the arm's limits. Shape (j + 1,).
         """
         arm = self.station.arm
         target = np.clip(command, [*arm.lower, 0.0], [*arm.upper, arm.max_opening_m])
-        with timed(self.station.model, self.step_s) as steps:
+        with align_timestep(self.station.model, self.step_s) as steps:
             for share in np.arange(1, steps + 1) / steps:
-                self.station.control(self._data, self._told + share * (target - self._told))
+                self.station.control(self._data, self._command + share * (target - self._command))
                 mujoco.mj_step(self.station.model, self._data)
-            self._told, self._index = target, self._index + 1
-            sample = self._watch.sample(self._data, self._index, 0, target)
-        return self._standing(sample)
+            self._command, self._index = target, self._index + 1
+            sample = self._monitor.sample(self._data, self._index, 0, target)
+        return self._update_state(sample)
 
-    def _standing(self, sample: Sample) -> Standing:
+    def _update_state(self, sample: StateSample) -> SimState:
         rise = float(sample.center[2]) - self._stood_m
         self._lifted = self._lifted or (rise >= MIN_LIFT_M and sample.pads > 0)
         self._disturbed_m = max(self._disturbed_m, float(sample.moved_m.max(initial=0.0)))
         slow = bool(np.abs(sample.velocity).max() < SPEED_LIMIT)
         self._still_s = self._still_s + self.step_s if slow else 0.0
-        self._failure = self._failure or self._broken(sample)
+        self._failure = self._failure or self._check_simulation(sample)
         at_rest = self._still_s >= HOLD_S - 1e-9
         done = self._lifted and at_rest and not sample.pads and not self._failure and self._holds(sample)
-        return Standing(sample, self._lifted, at_rest, done, self._failure, self._progress(sample), self._disturbed_m)
+        return SimState(sample, self._lifted, at_rest, done, self._failure, self._progress(sample), self._disturbed_m)
 
-    def _progress(self, sample: Sample) -> float:
+    def _progress(self, sample: StateSample) -> float:
         (_, x_half), (y, y_half) = self._boxes
-        way_m = way_to_place(self.goal.relation, sample.center, y, x_half, y_half)
+        way_m = compute_goal_distance(self.goal.relation, sample.center, y, x_half, y_half)
         reach_m = float(np.linalg.norm(sample.tcp[:3] - sample.center))
-        return progress(self._lifted, sample.pads.bit_count(), reach_m, way_m)
+        return compute_progress(self._lifted, sample.pads.bit_count(), reach_m, way_m)
 
-    def _broken(self, sample: Sample) -> str:
+    def _check_simulation(self, sample: StateSample) -> str:
         if sample.warnings:
             return "simulation_unstable"
         if min(float(sample.center[2]), float(sample.heights_m.min(initial=0.0))) < -FALL_M:
             return "fell"
         return "disturbed" if (sample.moved_m > self._allowed_m).any() else ""
 
-    def _holds(self, sample: Sample) -> bool:
-        """Whether the relation holds on the true meshes; what has not moved since is not computed again."""
-        now = np.array([sample.pose, sample.others[self._watch.others.index(self.goal.y_id)]])
-        before, held = self._judged
-        if not np.abs(now - before).max() < _SAME_M:
+    def _holds(self, sample: StateSample) -> bool:
+        """Test whether the relation holds on the true meshes, cached while the objects stay."""
+        now = np.array([sample.pose, sample.others[self._monitor.others.index(self.goal.y_id)]])
+        before, held = self._relation_cache
+        if not np.abs(now - before).max() < _UNMOVED_M:
             held = self.goal.holds(*map(_pose, now))
-            self._judged = (now, held)
+            self._relation_cache = (now, held)
         return held
 
-    def _recorded_base(self, scene: Scene, row: Mapping[str, Any]) -> Pose | None:
-        """Where the task's own trajectory had the base of this arm."""
+    def _find_recorded_base(self, scene: Scene, row: Mapping[str, Any]) -> Pose | None:
+        """Find this arm's base in the task's own trajectory."""
         for tried in scene.trajectory_rows():
             same = tried["task_id"] == row.get("task_id") and tried["robot"] == self.station.arm.name
             if same and tried["base_yaw_rad"] is not None:
@@ -199,27 +200,27 @@ class Cell:
                 return Pose(position, quaternion_about_z(float(tried["base_yaw_rad"])))
         return None
 
-    def _best_base(self) -> Pose:
+    def _find_best_base(self) -> Pose:
         data = self.station.data()
         targets = data.xipos[[self.station.object_bodies[name] for name in (self.goal.x_id, self.goal.y_id)]]
-        found = bases(self.station, np.array(targets), most=1)
+        found = find_bases(self.station, np.array(targets), most=1)
         if not found:
             raise InputError(f"no place for {self.station.arm.name} reaches both objects: give a base", "no_base")
         return found[0]
 
 
 def _pose(numbers: np.ndarray) -> Pose:
-    return Pose(numbers[:3].copy(), normalized_quaternion(numbers[3:]))
+    return Pose(numbers[:3].copy(), normalize_quaternion(numbers[3:]))
 
 
-def _box(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
-    """Middle and half the size [m]."""
+def _compute_box(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
+    """Compute middle and half size [m]."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     return (low + high) / 2, (high - low) / 2
 
 
-def _task_row(scene: Scene, task: object) -> Mapping[str, Any]:
-    """A task of `meta.json` by its id, or the given one."""
+def _find_task(scene: Scene, task: object) -> Mapping[str, Any]:
+    """Find a task of `meta.json` by id, or return the given one."""
     if isinstance(task, Mapping):
         return task
     if not isinstance(task, str):

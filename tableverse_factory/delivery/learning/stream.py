@@ -1,7 +1,7 @@
-"""Scenes one after another, each once: shuffled by a seed, dealt out to workers and ranks, resumable at any item.
+"""Scene streams: each scene once, shuffled by a seed, divisible among workers and ranks, resumable at any item.
 
-An index of the scenes is read once, where the stream is made; an item then reads its own bytes of a shard and nothing
-else. Streams are copied into workers, forked or spawned: each process opens the dataset for itself.
+The index of scenes is read once, when the stream is made; an item then reads only its own bytes of a shard. Streams are
+copied into workers, forked or spawned: each process opens the dataset for itself.
 """
 
 import copy
@@ -22,16 +22,16 @@ from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.query_parser import check_columns, parse_filter
-from tableverse_factory.delivery.learning.epoch_order import Indices, order, part_of
+from tableverse_factory.delivery.learning.epoch_order import Indices, shuffle_epoch, take_part
 from tableverse_factory.delivery.learning.item_parts import PARTS, check_parts
 
-_PLACE = ("scene_id", "shard", "tar_offset", "tar_size")
-_STATE = ("epoch", "given", "part", "order")
+_INDEX_COLUMNS = ("scene_id", "shard", "tar_offset", "tar_size")
+_STATE_KEYS = ("epoch", "given", "part", "order")
 
 
 @dataclass(slots=True)
-class _Place:
-    """Of one iteration, which alone moves it on: how many scenes of which epoch it has given."""
+class _Position:
+    """Progress of one iteration: scenes given, of which epoch."""
 
     epoch: int
     given: int = 0
@@ -39,10 +39,10 @@ class _Place:
 
 
 class SceneStream:
-    """The scenes of a dataset as dictionaries: `scene_id`, the columns asked for, and the parts asked for.
+    """Scenes of a dataset as dictionaries: `scene_id`, the requested columns, and the requested parts.
 
-    Iterating begins anew each time, except right after `load_state_dict`; the state is that of the newest iteration.
-    The order depends on the dataset, `condition`, `shuffle`, `seed` and the epoch alone.
+    Every iteration starts anew, except right after `load_state_dict`; the state is that of the newest iteration. The
+    order depends only on the dataset, `condition`, `shuffle`, `seed` and the epoch.
     """
 
     def __init__(
@@ -55,40 +55,40 @@ class SceneStream:
         shuffle: int = 1024,
         seed: int = 0,
     ) -> None:
-        """Reads which scenes there are.
+        """Read the index of scenes.
 
         Args:
             dataset: As in `open_dataset`.
-            parts: Names of `learning.parts.PARTS`.
-            columns: Of scenes/, to come with each item.
-            condition: On the columns of scenes/, as in `tableverse query --where`; scenes without files never come.
-            shuffle: How many scenes are mixed (`learning.order`); 0 keeps the order of the table.
+            parts: Names of `learning.item_parts.PARTS`.
+            columns: Columns of scenes/ to add to each item.
+            condition: On the columns of scenes/, as in `tableverse query --where`; scenes without files are skipped.
+            shuffle: Size of the shuffle buffer (`learning.epoch_order`); 0 keeps the order of the table.
             seed: Of the shuffle.
 
         Raises:
-            InputError: if there is no dataset, or its table does not read.
-            ConfigError: for a part that is none, or a negative `shuffle` or `seed`.
-            QueryError: for a column that is none, or a condition that does not parse.
+            InputError: if there is no dataset, or its table cannot be read.
+            ConfigError: for an unknown part, or a negative `shuffle` or `seed`.
+            QueryError: for an unknown column, or a condition that does not parse.
         """
         if shuffle < 0 or seed < 0:
             raise ConfigError(f"shuffle {shuffle} and seed {seed}: give whole numbers from 0 on")
         self._path, self._parts = str(dataset), check_parts(tuple(parts))
         self._columns = tuple(check_columns(columns, SCENES))
-        self._shuffle, self._seed, self._place = shuffle, seed, _Place(0)
+        self._shuffle, self._seed, self._place = shuffle, seed, _Position(0)
         self._part = (0, 1, 1)  # index, of how many, and how many of them are to be equally long
         self._opened: tuple[int, Dataset] | None = None
         self._index = self._read_index(condition)
 
     def __len__(self) -> int:
-        return len(part_of(np.arange(len(self._index)), *self._part))
+        return len(take_part(np.arange(len(self._index)), *self._part))
 
     def part(self, index: int, of: int, even: bool = False) -> Self:
-        """A stream of its own with every `of`-th item of this one: for one of `of` ranks or workers.
+        """Return a separate stream of every `of`-th item, for one of `of` ranks or workers.
 
         Args:
-            index: Which, from 0.
-            of: How many there are.
-            even: Leave out the last few scenes of each epoch, so that all parts are equally long.
+            index: Part number, from 0.
+            of: Number of parts.
+            even: Drop the last few scenes of each epoch, so that all parts are equally long.
 
         Raises:
             ConfigError: if there is no such part, or a part is to be divided evenly.
@@ -100,23 +100,23 @@ class SceneStream:
             raise ConfigError("a part of a stream cannot be divided evenly: divide the whole")
         other = copy.copy(self)
         other._part = (mine + of_all * index, of_all * of, of if even else evened)
-        other._place = _Place(self._place.epoch)
+        other._place = _Position(self._place.epoch)
         return other
 
     def set_epoch(self, epoch: int) -> None:
-        """Which epoch the next iteration is of: another order, but the same scenes. Another one starts at its first."""
+        """Set the next iteration's epoch: another order of the same scenes, from its first."""
         if epoch < 0:
             raise ConfigError(f"epoch {epoch}: epochs are counted from 0")
         if epoch != self._place.epoch:
-            self._place = _Place(epoch)
+            self._place = _Position(epoch)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         if self._place.begun:
-            self._place = _Place(self._place.epoch)
+            self._place = _Position(self._place.epoch)
         self._place.begun = True
         return self._items(self._place)
 
-    def _items(self, place: _Place) -> Iterator[dict[str, Any]]:
+    def _items(self, place: _Position) -> Iterator[dict[str, Any]]:
         for number in self._ordered(place.epoch)[place.given :]:
             item = self._item(int(number))
             place.given += 1
@@ -124,26 +124,26 @@ class SceneStream:
         place.given = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Where this stream is: plain numbers and strings, as a checkpoint keeps them."""
+        """Return the position as plain numbers and strings, for checkpoints."""
         place = self._place
         return {"epoch": place.epoch, "given": place.given, "part": list(self._part), "order": self._digest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Makes the next iteration go on where another stream was.
+        """Resume the next iteration at another stream's position.
 
         Raises:
-            InputError: if the state is none, or of other scenes, another shuffle, seed or division.
+            InputError: if the state is invalid, or of other scenes, another shuffle, seed or division.
         """
         numbers = [state.get(key) if isinstance(state, dict) else None for key in ("epoch", "given")]
         if not all(isinstance(number, int) and number >= 0 for number in numbers):
-            raise InputError(f"no state of a stream: it has {', '.join(_STATE)}", "bad_state")
+            raise InputError(f"no state of a stream: it has {', '.join(_STATE_KEYS)}", "bad_state")
         if state.get("order") != self._digest or list(state.get("part", ())) != list(self._part):
             raise InputError(
                 "the state is of a stream of other scenes, with another shuffle or seed, or of another part: "
                 f"this is part {self._part[0]} of {self._part[1]}, give it the state of the same",
                 "bad_state",
             )
-        self._place = _Place(int(state["epoch"]), int(state["given"]))
+        self._place = _Position(int(state["epoch"]), int(state["given"]))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None, "_place": replace(self._place)}
@@ -152,7 +152,7 @@ class SceneStream:
         chosen = pc.field("tar_offset").is_valid() & pc.field("tar_size").is_valid()
         if condition:
             chosen &= parse_filter(condition, SCENES)
-        names = list(dict.fromkeys((*_PLACE, *self._columns)))
+        names = list(dict.fromkeys((*_INDEX_COLUMNS, *self._columns)))
         try:
             return self._dataset.scenes.to_table(columns=names, filter=chosen).combine_chunks()
         except (pa.ArrowException, OSError) as error:
@@ -160,11 +160,11 @@ class SceneStream:
 
     def _ordered(self, epoch: int) -> Indices:
         shards = self._index["shard"].to_numpy().astype(np.int64)
-        return part_of(order(shards, self._seed, epoch, self._shuffle), *self._part)
+        return take_part(shuffle_epoch(shards, self._seed, epoch, self._shuffle), *self._part)
 
     @property
     def _dataset(self) -> Dataset:
-        """Opened by this process: connections of a parent are not shared with its forks."""
+        """Dataset opened by this process, as forks must not share a parent's connections."""
         if self._opened is None or self._opened[0] != os.getpid():
             self._opened = (os.getpid(), open_dataset(self._path))
         return self._opened[1]
@@ -177,7 +177,7 @@ class SceneStream:
 
     @cached_property
     def _digest(self) -> str:
-        """Of what decides on the order."""
+        """Hash of everything that determines the order."""
         digest = hashlib.sha256(f"{self._shuffle} {self._seed}".encode())
         for scene_id, shard in zip(*(self._index[name].to_pylist() for name in ("scene_id", "shard")), strict=True):
             digest.update(f"\n{shard} {scene_id}".encode())

@@ -1,6 +1,6 @@
-"""Many scenes simulated at once, each in a model of its own, on threads: MuJoCo steps outside of Python's lock.
+"""Vectorized simulation of scenes, each in its own model, on threads, as MuJoCo steps without Python's lock.
 
-For many starts of one scene take `mujoco.rollout`, which wants models of equal sizes (docs/cookbook.md).
+For many starts of one scene use `mujoco.rollout`, which needs models of equal sizes (docs/cookbook.md).
 """
 
 import os
@@ -14,29 +14,29 @@ import mujoco
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.physics.mjcf.load import spec_of
-from tableverse_factory.physics.simulate.at_rest import quiet_data
-from tableverse_factory.robotics.robots.station import drop_visual_meshes
+from tableverse_factory.physics.mjcf.load import load_spec
+from tableverse_factory.physics.simulate.at_rest import make_quiet_data
+from tableverse_factory.robotics.robots.station import delete_visual_meshes
 
 Control = Callable[[int, mujoco.MjModel, mujoco.MjData], None]
 
 
-class ManyScenes:
-    """Models and data of some scenes, in their order, and threads that step them.
+class VectorSim:
+    """Models and data of scenes, in order, with threads that step them.
 
     Attributes:
-        scene_ids: Which.
+        scene_ids: In order.
         models: Compiled.
-        data: A state for each, as exported in the beginning.
+        data: A state per scene, initially as exported.
     """
 
     def __init__(self, scenes: Sequence[Scene], threads: int | None = None, visuals: bool = False) -> None:
-        """Compiles every scene.
+        """Compile every scene.
 
         Args:
-            scenes: Which; the same one may be there again.
-            threads: How many; as many as there are cores for this process by default.
-            visuals: Keep what is only seen, for pictures.
+            scenes: May contain a scene more than once.
+            threads: Number of threads; by default the cores available to this process.
+            visuals: Keep visual geoms, for pictures.
 
         Raises:
             InputError: if a scene does not load.
@@ -46,17 +46,17 @@ class ManyScenes:
         if not scenes or threads < 1:
             raise ConfigError(f"{len(scenes)} scenes on {threads} threads: give at least one of both")
         self.scene_ids = tuple(scene.scene_id for scene in scenes)
-        self.models = tuple(compiled(scene, visuals) for scene in scenes)
-        self.data = tuple(quiet_data(model) for model in self.models)
+        self.models = tuple(compile_scene(scene, visuals) for scene in scenes)
+        self.data = tuple(make_quiet_data(model) for model in self.models)
         self._pool = ThreadPoolExecutor(threads)
 
     def step(self, steps: int = 1, control: Control | None = None) -> None:
-        """Steps all of them; more steps at once cost less.
+        """Step all scenes; larger batches of steps cost less.
 
         Args:
             steps: Of each model's own timestep.
-            control: Called before, for each scene in a thread: its number, its model and its data, in which it may set
-                forces, controls or states. What it raises is raised once all other scenes have been stepped.
+            control: Called before, per scene in a thread, with its index, model and data, in which it may set forces,
+                controls or states. Its exceptions are raised once all scenes have been stepped.
         """
 
         def advance(number: int) -> None:
@@ -71,7 +71,7 @@ class ManyScenes:
             stepped.result()
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Stop the threads."""
         self._pool.shutdown()
 
     def __enter__(self) -> Self:
@@ -81,34 +81,30 @@ class ManyScenes:
         self.close()
 
 
-def scene_spec(scene: Scene, visuals: bool) -> mujoco.MjSpec:
-    """The specification of a scene, to edit and attach.
-
-    Args:
-        scene: Which.
-        visuals: Keep what is only seen.
+def load_scene_spec(scene: Scene, visuals: bool) -> mujoco.MjSpec:
+    """Load the specification of a scene, to edit and attach.
 
     Raises:
         InputError: if it does not load.
     """
     try:
-        spec = spec_of(scene.files())
+        spec = load_spec(scene.files())
     except InputError as error:
         raise InputError(f"scene {scene.scene_id}: {error}", error.reason) from None
     if not visuals:
-        drop_visual_meshes(spec)
+        delete_visual_meshes(spec)
         spec.compiler.discardvisual = True
     return spec
 
 
-def compiled(scene: Scene, visuals: bool) -> mujoco.MjModel:
-    """The model of a scene, with or without what is only seen.
+def compile_scene(scene: Scene, visuals: bool) -> mujoco.MjModel:
+    """Compile a scene, with or without visual geoms.
 
     Raises:
         InputError: if it does not load.
     """
     try:
-        return scene_spec(scene, visuals).compile()
+        return load_scene_spec(scene, visuals).compile()
     except ValueError as error:
         message = sanitize_line(str(error), 500)
         raise InputError(f"scene {scene.scene_id}: scene.xml does not load: {message}", "bad_mjcf") from error

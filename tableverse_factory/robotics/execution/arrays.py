@@ -1,7 +1,7 @@
-"""`trajectories/<task_id>.npz`: what a robot was told and what then happened, as plain numpy arrays.
+"""Recordings as `trajectories/<task_id>.npz`: robot commands and the resulting states, as plain numpy arrays.
 
 A zip of `.npy` files that `numpy.load` reads: stored without compression, with fixed dates and in a fixed order, so
-that equal recordings give equal bytes. Reading trusts nothing: a file from elsewhere is bounded and checked first.
+that equal recordings give equal bytes. Files of any origin are bounded and checked before use.
 """
 
 import io
@@ -24,22 +24,20 @@ FORMAT = "tableverse-trajectory-1"
 MAX_BYTES = 64 * 1024 * 1024
 MAX_DURATION_S = 120.0
 MIN_STEP_S, MAX_STEP_S = 0.004, 0.1
-"""As the configuration bounds `trajectories.step_s`: replaying a file of any origin takes bounded time."""
+"""As the configuration bounds `trajectories.step_s`: replaying any file takes bounded time."""
 
 MAX_SAMPLES = round(MAX_DURATION_S / MIN_STEP_S) + 1
 MAX_MOVED = 1000
 MAX_JOINTS = 64
 MAX_NAME_BYTES = 4096
-_MAX_NUMBER = 1e6
-"""No length, angle, speed or time in a file is larger: nonsense is refused before physics sees it."""
-
+_MAX_NUMBER = 1e6  # bound of every length, angle, speed and time, checked before physics
 _MAX_HEADER_BYTES = 1024
 _HEADER = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-zA-Z]\d)', 'fortran_order': (True|False), "
     rb"'shape': \(((?:\d{1,7},? ?){0,3})\), \} *\n",
     re.DOTALL,
 )
-"""As numpy writes it. Its own reader takes a header for Python and evaluates it."""
+"""As numpy writes it. numpy's own reader evaluates a header as Python."""
 
 _QUATERNION_TOLERANCE = 1e-3
 _TIME_TOLERANCE = 1e-3
@@ -90,27 +88,26 @@ _AS_READ = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording(Frozen):
-    """A motion as it was executed, sample by sample.
+    """Executed motion, sample by sample.
 
-    The state at a sample is the one in which the arm's targets have just reached that sample's command. A motion that
-    failed ends soon after the sample that decided.
+    At each sample the arm's targets have just reached that sample's command. A failed motion ends soon after the sample
+    that decided.
 
     Attributes:
         robot: Name or file of the arm, as in the configuration.
         base: The robot's base in the table frame; exact.
-        step_s: Time between samples [s].
-        max_disturbed_m: Bound that other objects had to keep [m].
+        max_disturbed_m: Allowed displacement of other objects [m].
         command: Targets of the joints [rad] and opening of the gripper [m], exact. Shape (t, j + 1).
-        phase: Index into `Phase`, ascending; what waits for rest at the end is of the last. Shape (t,).
+        phase: Index into `Phase`, ascending; the final wait for rest belongs to the last phase. Shape (t,).
         time_s: Since the start [s]. Shape (t,).
         qpos: Joints [rad] and fingers [m]. Shape (t, j + f).
         qvel: Their speeds. Shape (t, j + f).
         tcp: Position [m] and quaternion wxyz of the gripper frame in the table frame. Shape (t, 7).
         object_pose: The same of the carried object's own frame. Shape (t, 7).
         pads: Fingers that touch the object: 1 the first, 2 the second, 3 both. Shape (t,).
-        disturbed_m: Largest displacement of any other object until then [m]. Shape (t,).
-        moved_ids: The other objects that were ever seen to move, by more than 0.5 mm or 0.5°.
-        moved_poses: Theirs, as `object_pose`. Whatever is not among them stands as exported. Shape (t, m, 7).
+        disturbed_m: Largest displacement of any other object so far [m]. Shape (t,).
+        moved_ids: The other objects that ever moved by more than 0.5 mm or 0.5°.
+        moved_poses: Their poses, as `object_pose`; all others stand as exported. Shape (t, m, 7).
     """
 
     robot: str
@@ -133,15 +130,15 @@ class Recording(Frozen):
         return len(self.command)
 
     def poses_of(self, object_id: str) -> Float32[np.ndarray, "t 7"] | None:
-        """Where another object was, sample by sample; None where it stands as exported."""
+        """Return another object's pose at each sample, or None where it stands as exported."""
         if object_id not in self.moved_ids:
             return None
         poses: Float32[np.ndarray, "t 7"] = self.moved_poses[:, self.moved_ids.index(object_id)]
         return poses
 
 
-def arrays_bytes(recording: Recording) -> bytes:
-    """The file; equal recordings give equal bytes."""
+def encode_recording(recording: Recording) -> bytes:
+    """Encode the file; equal recordings give equal bytes."""
     arrays: dict[str, Any] = {name: getattr(recording, name) for name in _TYPES if hasattr(recording, name)}
     arrays["format"] = np.frombuffer(FORMAT.encode(), dtype=np.uint8)
     arrays["robot"] = np.frombuffer(recording.robot.encode(), dtype=np.uint8)
@@ -159,19 +156,15 @@ def arrays_bytes(recording: Recording) -> bytes:
     return file.getvalue()
 
 
-def read_arrays(data: bytes, name: str = "trajectory") -> Recording:
-    """The recording of a file of any origin.
-
-    Args:
-        data: The file.
-        name: How messages call it.
+def decode_recording(data: bytes, name: str = "trajectory") -> Recording:
+    """Decode and check a file of any origin; messages call it `name`.
 
     Raises:
-        InputError: `bad_arrays` with what is wrong: no such zip, an array that is missing, of another type or shape,
-            not finite, or beyond the bounds.
+        InputError: `bad_arrays` if it is no such zip, or an array is missing, of another type or shape, not finite, or
+            out of bounds.
     """
     try:
-        found = _members(data)
+        found = _read_members(data)
         length = len(found["command"])
         _check_shapes(found, length)
         _check_values(found)
@@ -180,14 +173,14 @@ def read_arrays(data: bytes, name: str = "trajectory") -> Recording:
             base=Pose(found["base"][:3], found["base"][3:]),
             step_s=float(found["step_s"]),
             max_disturbed_m=float(found["max_disturbed_m"]),
-            moved_ids=_moved_ids(found),
+            moved_ids=_read_moved_ids(found),
             **{key: found[key] for key in _AS_READ},
         )
     except (ValueError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{name}: no arrays of {FORMAT}: {sanitize_line(str(error), 300)}", "bad_arrays") from None
 
 
-def _members(data: bytes) -> dict[str, Any]:
+def _read_members(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_BYTES:
         raise ValueError(f"longer than {MAX_BYTES} bytes")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -198,10 +191,10 @@ def _members(data: bytes) -> dict[str, Any]:
             raise ValueError(f"{len(archive.infolist())} members instead of {len(_TYPES)}")
         if packed := [entry.filename for entry in entries.values() if entry.compress_type != zipfile.ZIP_STORED]:
             raise ValueError(f"{packed[0]} is compressed; write it without")
-        return {name: _array(name, archive.read(f"{name}.npy")) for name in _TYPES}
+        return {name: _parse_array(name, archive.read(f"{name}.npy")) for name in _TYPES}
 
 
-def _array(name: str, content: bytes) -> Any:
+def _parse_array(name: str, content: bytes) -> Any:
     match = _HEADER.match(content, 0, _MAX_HEADER_BYTES)
     if match is None or len(match[0]) != 10 + int.from_bytes(content[8:10], "little"):
         raise ValueError(f"{name}: its header is not that of a plain array, in .npy of version 1.0")
@@ -216,8 +209,8 @@ def _array(name: str, content: bytes) -> Any:
     return np.frombuffer(body, dtype=kind).reshape(shape)
 
 
-def _moved_ids(found: dict[str, Any]) -> tuple[str, ...]:
-    """One per line; each is safe as an id, and none stands there twice."""
+def _read_moved_ids(found: dict[str, Any]) -> tuple[str, ...]:
+    """Read one id per line, each safe as an id and distinct."""
     text = found["moved_ids"].tobytes().decode()
     names = tuple(check_id(name) for name in text.split("\n")) if text else ()
     if len(names) != found["moved_poses"].shape[1] or len(set(names)) != len(names):

@@ -1,4 +1,4 @@
-"""The trajectories of one scene against what their rows claim: each is replayed from its own arrays, and compared."""
+"""Audit of a scene's trajectories: each is replayed from its own arrays and compared with its row."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,29 +6,29 @@ from dataclasses import dataclass
 from schemas.config import TrajectoriesConfig
 from tableverse_factory.core.errors import TableverseError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.robotics.execution.arrays import read_arrays
-from tableverse_factory.robotics.execution.check_row import Row, row_mismatches
+from tableverse_factory.robotics.execution.arrays import decode_recording
+from tableverse_factory.robotics.execution.check_row import Row, find_row_mismatches
 from tableverse_factory.robotics.execution.execute import TOO_LONG
-from tableverse_factory.robotics.execution.replay import Difference, Replay, named_arm, replayed
+from tableverse_factory.robotics.execution.replay import Replay, ReplayDifference, load_named_arm, replay_recording
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import Station
 
 OBJECT_TOLERANCE_M = 0.005
 OBJECT_TOLERANCE_RAD = 0.1
 ARM_TOLERANCE_RAD = 0.01
-"""What another machine's arithmetic may change; on the machine that made the trajectory a replay is equal."""
+"""Tolerances for another machine's arithmetic; on the machine that made the trajectory a replay is equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryAudit:
-    """What was found of one trajectory that has arrays.
+    """Findings about one trajectory with arrays.
 
     Attributes:
-        success: What its row claims.
+        success: As its row claims.
         reproduced: Whether the replay ended in the same way, in success or not.
-        object_m: Largest distance of an object from where it was recorded [m].
-        arm_rad: Largest distance of a joint from where it was recorded [rad].
-        problems: One line each; empty when all is well.
+        object_m: Largest distance of an object from its recorded position [m].
+        arm_rad: Largest distance of a joint from its recorded position [rad].
+        problems: One line each; empty if none.
     """
 
     task_id: str
@@ -46,22 +46,21 @@ def audit_trajectories(
     tasks: Sequence[Row] | None = None,
     config: TrajectoriesConfig | None = None,
 ) -> tuple[TrajectoryAudit, ...]:
-    """Replays every trajectory of a scene that has arrays, or claims a success.
+    """Replay every trajectory of a scene that has arrays, or claims a success.
 
     Args:
         files: Of the scene by name.
         rows: Of trajectories/, of this scene.
-        arm: The robot of those that came from a file.
-        tasks: Rows of tasks/ of the scene; None where nobody knows what was asked.
-        config: What the trajectories were made with; None where nobody knows it: the bound on disturbances that the
-            arrays name is believed then.
+        arm: The robot of trajectories whose robot came from a file.
+        tasks: Rows of tasks/ of the scene; None if unknown.
+        config: Configuration of the build; without it the bound on disturbances is taken from the arrays.
     """
     stations: dict[str, Station] = {}
     claimed = [row for row in rows if row.get("arrays") is not None or row.get("success")]
-    return tuple(_audit(files, row, stations, arm, tasks, config) for row in claimed)
+    return tuple(_audit_trajectory(files, row, stations, arm, tasks, config) for row in claimed)
 
 
-def _audit(
+def _audit_trajectory(
     files: Mapping[str, bytes],
     row: Row,
     stations: dict[str, Station],
@@ -75,21 +74,25 @@ def _audit(
             task_id, success, False, None, None, (f"there is no {sanitize_line(name, 100)} to replay",)
         )
     try:
-        saved = read_arrays(files[name], name)
+        saved = decode_recording(files[name], name)
         if saved.robot not in stations:
             given = arm is not None and saved.robot.endswith(".xml")
-            stations[saved.robot] = Station(files, arm if arm is not None and given else named_arm(saved.robot))
+            stations[saved.robot] = Station(files, arm if arm is not None and given else load_named_arm(saved.robot))
         bound = None if config is None else config.max_disturbed_m
-        replay = replayed(files, row, saved, stations[saved.robot], bound)
+        replay = replay_recording(files, row, saved, stations[saved.robot], bound)
     except TableverseError as error:
         return TrajectoryAudit(task_id, success, False, None, None, (str(error),))
-    found = replay.difference()
+    found = replay.compute_difference()
     reproduced = replay.verdict.success == success
-    problems = (*_outcome(row, replay), *_states(replay, found), *row_mismatches(row, saved, tasks, config))
+    problems = (
+        *_compare_outcome(row, replay),
+        *_compare_states(replay, found),
+        *find_row_mismatches(row, saved, tasks, config),
+    )
     return TrajectoryAudit(task_id, success, reproduced, found.object_m, found.arm_rad, problems)
 
 
-def _outcome(row: Row, replay: Replay) -> Iterator[str]:
+def _compare_outcome(row: Row, replay: Replay) -> Iterator[str]:
     verdict = replay.verdict
     if row.get("success") and not verdict.success:
         yield f"a success by its row; replayed it fails in {verdict.failed_phase}: {verdict.reason}: {verdict.detail}"
@@ -103,8 +106,8 @@ def _outcome(row: Row, replay: Replay) -> Iterator[str]:
             yield f"{key}: {claimed:.4f} by its row, {found:.4f} replayed"
 
 
-def _states(replay: Replay, found: Difference) -> Iterator[str]:
-    if strangers := replay.strangers():
+def _compare_states(replay: Replay, found: ReplayDifference) -> Iterator[str]:
+    if strangers := replay.find_unknown_objects():
         yield f"{strangers[0]} is recorded as moved, and is no other object of the scene"
     if not found.object_m <= OBJECT_TOLERANCE_M:
         yield f"replayed an object is {1e3 * found.object_m:.1f} mm from where it was recorded"

@@ -1,4 +1,4 @@
-"""The proof of a motion: executed in physics, judged on the way, recorded."""
+"""Execution of a motion in physics, checked on the way and recorded."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,76 +11,62 @@ from schemas.geometry import Frozen, Pose
 from schemas.trajectories import Motion, Phase, Verdict
 from tableverse_factory.robotics.execution.arrays import MAX_DURATION_S, Recording
 from tableverse_factory.robotics.execution.goal import Goal
-from tableverse_factory.robotics.execution.monitor import Sample
-from tableverse_factory.robotics.execution.poses import angles
-from tableverse_factory.robotics.execution.rollout import Commands, Execution, commands_of
+from tableverse_factory.robotics.execution.monitor import StateSample
+from tableverse_factory.robotics.execution.poses import compute_angles
+from tableverse_factory.robotics.execution.rollout import Rollout, ServoCommands, build_commands
 from tableverse_factory.robotics.execution.success import SuccessChecker
 from tableverse_factory.robotics.robots.station import Station
 
-REST_S = 1.5
-"""The object has this long to come to rest after the last sample of a motion [s]."""
-
-
-TOO_LONG = "too_long"
-"""Code of a motion that is not executed: it has no end within what arrays may hold."""
-
-SHOWN_M = 0.0005
-SHOWN_RAD = np.radians(0.5)
-"""The poses of other objects are recorded where they ever leave their start by more than this."""
+MAX_SETTLE_S = 1.5  # time for the object to come to rest after the last sample of a motion [s]
+TOO_LONG = "too_long"  # reason code of a motion that exceeds what arrays may hold and is not executed
+MIN_RECORDED_MOTION_M = 0.0005
+MIN_RECORDED_TURN_RAD = np.radians(0.5)  # other objects are recorded if they ever leave their start by more than this
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Proof(Frozen):
-    """What a rollout gave.
-
-    Attributes:
-        verdict: Success, or what went wrong first.
-        recording: Up to the sample that decided.
-    """
+class RolloutResult(Frozen):
+    """Verdict of a rollout, and the recording up to the sample that decided."""
 
     verdict: Verdict
     recording: Recording
 
 
-def execute_and_check(station: Station, base: Pose, motion: Motion, goal: Goal) -> Proof:
-    """Executes a motion on the exported scene and judges what happens.
+def execute_and_check(station: Station, base: Pose, motion: Motion, goal: Goal) -> RolloutResult:
+    """Execute a motion on the exported scene, with the base at a pose in the table frame, and check the goal.
 
-    Deterministic: the same files, base, motion and goal give the same proof. It ends as soon as it has failed, and
-    else when the object has come to rest, at most `REST_S` after the motion. A motion that could not be recorded for
-    its length fails as `too_long` before it starts.
-
-    Args:
-        station: Scene and arm; its base is moved to `base`.
-        base: The robot's base in the table frame.
-        motion: Six phases of joint positions and openings.
-        goal: What is to be true in the end.
+    Deterministic. It ends at the first failure, or when the object has come to rest, at most `MAX_SETTLE_S` after the
+    motion. A motion too long to be recorded fails as `too_long` before it starts.
     """
-    commands = commands_of(motion)
-    if motion.duration_s + REST_S <= MAX_DURATION_S:
-        return execute(station, base, commands, goal, round(REST_S / motion.step_s))
-    detail = f"it takes {motion.duration_s:.1f} s, and at most {MAX_DURATION_S - REST_S:g} s are executed"
-    start = execute(station, base, Commands(motion.step_s, commands.targets[:1], commands.phases[:1]), goal, 0)
+    commands = build_commands(motion)
+    if motion.duration_s + MAX_SETTLE_S <= MAX_DURATION_S:
+        return execute_commands(station, base, commands, goal, round(MAX_SETTLE_S / motion.step_s))
+    detail = f"it takes {motion.duration_s:.1f} s, and at most {MAX_DURATION_S - MAX_SETTLE_S:g} s are executed"
+    start = execute_commands(
+        station, base, ServoCommands(motion.step_s, commands.targets[:1], commands.phases[:1]), goal, 0
+    )
     return replace(start, verdict=Verdict(False, Phase.PRE_GRASP.value, TOO_LONG, detail))
 
 
-def execute(station: Station, base: Pose, commands: Commands, goal: Goal, more: int) -> Proof:
-    """The same for commands, the last of which is repeated up to `more` times until the object is at rest."""
-    execution = Execution(station, base, commands, goal.x_id, goal.y_id)
-    judge, taken = SuccessChecker(goal, execution), list[Sample]()
+def execute_commands(station: Station, base: Pose, commands: ServoCommands, goal: Goal, more: int) -> RolloutResult:
+    """Execute commands, repeating the last up to `more` times until the object is at rest."""
+    execution = Rollout(station, base, commands, goal.x_id, goal.y_id)
+    checker, taken = SuccessChecker(goal, execution), list[StateSample]()
     with closing(execution.samples(more)) as samples:
         for sample in samples:
             taken.append(sample)
-            if not judge.look(sample) or (sample.index >= len(commands) - 1 and judge.at_rest):
+            if not checker.update(sample) or (sample.index >= len(commands) - 1 and checker.at_rest):
                 break
-    return Proof(judge.verdict(taken[-1]), _recorded(taken, execution, station.arm.name, base, goal.max_disturbed_m))
+    return RolloutResult(
+        checker.verdict(taken[-1]), _build_recording(taken, execution, station.arm.name, base, goal.max_disturbed_m)
+    )
 
 
-def _recorded(
-    samples: Sequence[Sample], execution: Execution, robot: str, base: Pose, max_disturbed_m: float
+def _build_recording(
+    samples: Sequence[StateSample], execution: Rollout, robot: str, base: Pose, max_disturbed_m: float
 ) -> Recording:
     moved = np.array([sample.moved_m.max(initial=0.0) for sample in samples])
     step_s, poses = execution.commands.step_s, np.array([sample.others for sample in samples])
-    shown = _seen_to_move(poses)
+    shown = _find_moved_objects(poses)
     return Recording(
         robot=robot,
         base=base,
@@ -100,7 +86,7 @@ def _recorded(
     )
 
 
-def _seen_to_move(poses: Float64[np.ndarray, "t n 7"]) -> Int64[np.ndarray, " m"]:
+def _find_moved_objects(poses: Float64[np.ndarray, "t n 7"]) -> Int64[np.ndarray, " m"]:
     away = np.linalg.norm(poses[..., :3] - poses[0, :, :3], axis=2).max(axis=0)
-    turned = angles(poses[..., 3:], poses[0, :, 3:]).max(axis=0)
-    return np.flatnonzero((away > SHOWN_M) | (turned > SHOWN_RAD))
+    turned = compute_angles(poses[..., 3:], poses[0, :, 3:]).max(axis=0)
+    return np.flatnonzero((away > MIN_RECORDED_MOTION_M) | (turned > MIN_RECORDED_TURN_RAD))

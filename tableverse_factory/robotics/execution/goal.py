@@ -1,4 +1,4 @@
-"""What a trajectory is to achieve, and the bounds that it has to keep on the way."""
+"""Goal of a trajectory, and the bounds that it has to keep."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,12 +8,12 @@ from schemas.curation import Relation
 from schemas.geometry import Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.geometry.relations.relations import body_of, holds
-from tableverse_factory.physics.mjcf.scene_objects import mesh_of
+from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.geometry.relations.relations import compute_body_features, relation_holds
+from tableverse_factory.physics.mjcf.scene_objects import load_mesh
 
 RESTING_RELATIONS = frozenset({Relation.ON, Relation.IN, Relation.INTO, Relation.INSIDE})
-"""In these the reference carries the object in the end."""
+"""Relations in which the reference carries the object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,12 +21,9 @@ class Goal(Frozen):
     """Object X in a relation to object Y.
 
     Attributes:
-        relation: One of the ten.
-        x_id: Of the object that is carried.
-        y_id: Of the reference.
         x: True mesh of X in its own frame, as exported [m].
         y: The same of Y.
-        max_disturbed_m: Largest displacement that any other object may suffer [m].
+        max_disturbed_m: Allowed displacement of any other object [m].
     """
 
     relation: Relation
@@ -37,21 +34,19 @@ class Goal(Frozen):
     max_disturbed_m: float
 
     def holds(self, x_pose: Pose, y_pose: Pose) -> bool:
-        """Whether the relation holds between the true bodies at these poses in the table frame."""
-        return holds(self.relation, body_of(placed_mesh(self.x, x_pose)), body_of(placed_mesh(self.y, y_pose)))
+        """Test whether the relation holds between the true bodies at these poses in the table frame."""
+        return relation_holds(
+            self.relation,
+            compute_body_features(place_mesh(self.x, x_pose)),
+            compute_body_features(place_mesh(self.y, y_pose)),
+        )
 
 
-def goal_of(files: Mapping[str, bytes], row: Mapping[str, Any], max_disturbed_m: float) -> Goal:
-    """The goal of a task, from the exported scene.
-
-    Args:
-        files: Of the scene by name; `assets/…` are read.
-        row: With `relation`, `x_id` and `y_id`: of tasks/ or of trajectories/.
-        max_disturbed_m: As in `Goal` [m].
+def load_goal(files: Mapping[str, bytes], row: Mapping[str, Any], max_disturbed_m: float) -> Goal:
+    """Load the goal of a row of tasks/ or trajectories/ from the files of its exported scene.
 
     Raises:
-        InputError: `bad_task` if the row names no relation, or one object twice; `bad_scene` if the scene does not hold
-            one of the objects.
+        InputError: `bad_task` for an unknown relation or twice the same object; `bad_scene` if an object is missing.
         GeometryError: if a mesh does not decode.
     """
     x_id, y_id, relation = (str(row.get(key)) for key in ("x_id", "y_id", "relation"))
@@ -61,4 +56,4 @@ def goal_of(files: Mapping[str, bytes], row: Mapping[str, Any], max_disturbed_m:
         )
     if x_id == y_id:
         raise InputError(f"{sanitize_line(x_id, 60)!r} cannot be brought into a relation to itself", "bad_task")
-    return Goal(Relation(relation), x_id, y_id, mesh_of(files, x_id), mesh_of(files, y_id), max_disturbed_m)
+    return Goal(Relation(relation), x_id, y_id, load_mesh(files, x_id), load_mesh(files, y_id), max_disturbed_m)

@@ -1,4 +1,4 @@
-"""What is measured of a station while a motion is executed: once per sample, in the same way for all who judge."""
+"""Measurements of a station during execution, once per sample."""
 
 from dataclasses import dataclass
 
@@ -12,27 +12,25 @@ from tableverse_factory.robotics.robots.station import Station
 
 
 @dataclass(slots=True, eq=False)
-class Sample:
-    """The state in which the targets have just reached a sample's command.
-
-    Not frozen: there are hundreds of them in a rollout, and none leaves it.
+class StateSample:
+    """State in which the targets have just reached a sample's command; mutable for speed.
 
     Attributes:
-        index: Of the sample; where the last command is repeated, it counts on.
+        index: Of the sample; it counts on while the last command is repeated.
         phase: Index into `Phase`.
         command: Targets of the joints and the opening. Shape (k,).
         qpos: Joints [rad] and fingers [m]. Shape (m,).
         qvel: Their speeds. Shape (m,).
         tcp: Gripper frame in the table frame: position, quaternion wxyz. Shape (7,).
         pose: The carried object's own frame in the table frame. Shape (7,).
-        others: The same of each other object, in the order of `Execution.others`. Shape (n, 7).
-        center: The carried object's centre of mass [m].
+        others: The same of each other object, in the order of `Rollout.others`. Shape (n, 7).
+        center: The carried object's center of mass [m].
         velocity: Of the object's frame [m/s], then its spin [rad/s]. Shape (6,).
         pads: Fingers that touch the object: 1 the first, 2 the second, 3 both.
-        moved_m: How far each other object is from where it stood. Shape (n,) [m].
-        heights_m: Of their centres of mass. Shape (n,) [m].
+        moved_m: Displacement of each other object. Shape (n,) [m].
+        heights_m: Of their centers of mass. Shape (n,) [m].
         arm_error_rad: Largest distance of a joint from its target.
-        warnings: Names of MuJoCo's warnings that make all of it worthless.
+        warnings: Names of MuJoCo warnings that invalidate the simulation.
     """
 
     index: int
@@ -53,19 +51,10 @@ class Sample:
 
 
 class ExecutionMonitor:
-    """Looks at one object that is carried, at all others, and at the arm.
-
-    Attributes:
-        others: Ids of the objects that are not carried, in the order of the model.
-    """
+    """Monitor of a carried object, all others (`others`, in the order of the model), and the arm."""
 
     def __init__(self, station: Station, x_id: str) -> None:
-        """Looks up where everything is; `begin` comes before the first sample.
-
-        Args:
-            station: Scene and arm.
-            x_id: One of its objects: what is carried.
-        """
+        """Look up addresses of the carried object `x_id` and the rest; call `begin` before the first sample."""
         self.others = tuple(name for name in station.object_ids if name != x_id)
         self._station, self._model = station, station.model
         self._body = station.object_bodies[x_id]
@@ -74,36 +63,29 @@ class ExecutionMonitor:
         self._qvel = np.concatenate([station.joint_dof, station.finger_dof])
         self._other_poses = np.array([station.object_qpos[name] for name in self.others], dtype=np.intp)[:, None]
         self._other_bodies = np.array([station.object_bodies[name] for name in self.others], dtype=np.intp)
-        self._finger_of, self._bodies = _finger_of_geom(station), np.array(station.model.geom_bodyid)
+        self._finger_of, self._bodies = _label_finger_geoms(station), np.array(station.model.geom_bodyid)
 
     def begin(self, data: mujoco.MjData) -> None:
-        """Takes the state of these data, whose positions are computed, for the one that others are moved from."""
+        """Store the reference state for displacements; positions in `data` must be computed."""
         self._start = (data.xipos[self._other_bodies].copy(), data.ximat[self._other_bodies].copy())
-        self._spread = self._spread_of_matter()
+        self._spread = self._compute_matter_spread()
 
-    def touching(self, data: mujoco.MjData, object_id: str) -> tuple[str, ...]:
-        """The objects, besides the carried one, that touch another one now."""
+    def find_touching(self, data: mujoco.MjData, object_id: str) -> tuple[str, ...]:
+        """Find the uncarried objects that touch another object now."""
         near = {frozenset(pair) for pair in self._bodies[data.contact.geom].tolist()}
         own = self._station.object_bodies[object_id]
         return tuple(name for name in self.others if frozenset((own, self._station.object_bodies[name])) in near)
 
-    def sample(self, data: mujoco.MjData, index: int, phase: int, command: Float64[np.ndarray, " k"]) -> Sample:
-        """The state as it is.
-
-        Args:
-            data: After a step; positions are computed anew.
-            index: Of the sample.
-            phase: Index into `Phase`.
-            command: What the servos were told. Shape (k,).
-        """
-        pads = self._pads(data)  # of the last step; what follows is where that step has led
+    def sample(self, data: mujoco.MjData, index: int, phase: int, command: Float64[np.ndarray, " k"]) -> StateSample:
+        """Measure the state after a step; positions are recomputed."""
+        pads = self._list_touching_fingers(data)  # of the last step; what follows is where that step has led
         mujoco.mj_kinematics(self._model, data)
         centers, axes = data.xipos[self._other_bodies], data.ximat[self._other_bodies]
         turned = ((axes - self._start[1]).reshape(-1, 3, 3) ** 2).sum(axis=1)
         moved = np.sqrt(((centers - self._start[0]) ** 2).sum(axis=1) + (turned * self._spread).sum(axis=1))
         quaternion = np.empty(4)
         mujoco.mju_mat2Quat(quaternion, data.site_xmat[self._station.tcp_site])
-        return Sample(
+        return StateSample(
             index=index,
             phase=phase,
             command=command,
@@ -118,30 +100,30 @@ class ExecutionMonitor:
             moved_m=moved,
             heights_m=centers[:, 2],
             arm_error_rad=float(np.abs(data.qpos[self._station.joint_qpos] - command[:-1]).max()),
-            warnings=_warnings(data),
+            warnings=_list_warnings(data),
         )
 
-    def _spread_of_matter(self) -> Float64[np.ndarray, "n 3"]:
-        """Mean square of the distance of each other body's matter from its centre, along its principal axes [m²]."""
+    def _compute_matter_spread(self) -> Float64[np.ndarray, "n 3"]:
+        """Compute the mean square distance of each other body's matter from its center, along principal axes [m²]."""
         inertia, mass = self._model.body_inertia[self._other_bodies], self._model.body_mass[self._other_bodies]
         spread: Float64[np.ndarray, "n 3"] = (inertia.sum(axis=1, keepdims=True) / 2 - inertia) / mass[:, None]
         return spread
 
-    def _pads(self, data: mujoco.MjData) -> int:
+    def _list_touching_fingers(self, data: mujoco.MjData) -> int:
         pairs = data.contact.geom
         fingers = self._finger_of[pairs]  # 0 where a geom is none of a finger
         mine = self._bodies[pairs[:, ::-1]] == self._body
         return int(np.bitwise_or.reduce(fingers[mine], initial=0))
 
 
-def _warnings(data: mujoco.MjData) -> tuple[str, ...]:
+def _list_warnings(data: mujoco.MjData) -> tuple[str, ...]:
     if not data.warning.number.any():
         return ()
     return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)
 
 
-def _finger_of_geom(station: Station) -> Int32[np.ndarray, " g"]:
-    """For each geom 1 or 2 where it grips and is of the first or second finger, else 0."""
+def _label_finger_geoms(station: Station) -> Int32[np.ndarray, " g"]:
+    """Label geoms that grip 1 or 2 for the first or second finger, others 0."""
     finger = np.zeros(station.model.ngeom, dtype=np.int32)
     bodies = station.model.geom_bodyid[station.finger_geoms]
     finger[station.finger_geoms] = np.where(bodies == bodies.min(), 1, 2)

@@ -1,4 +1,4 @@
-"""Would it still work if friction or mass were other than we think? The same motion in a scene that was changed."""
+"""Robustness to physical parameters: the same motion in a scene with other friction or mass."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -8,52 +8,52 @@ import numpy as np
 
 from schemas.geometry import Pose
 from schemas.trajectories import Motion
-from tableverse_factory.physics.simulate.at_rest import quiet_data
+from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 from tableverse_factory.robotics.execution.execute import execute_and_check
 from tableverse_factory.robotics.execution.goal import Goal
 from tableverse_factory.robotics.robots.station import Station
 
 
-def _friction(station: Station, body: int, factor: float) -> None:
-    """Of the carried object and of the fingers: sliding and torsional.
+def _scale_friction(station: Station, body: int, factor: float) -> None:
+    """Scale sliding and torsional friction of the carried object and the fingers.
 
-    Rolling friction stays, it keeps round things still; and so does all friction of what is not carried: what leans
-    may slide by itself on a smoother table, and that would say nothing of the motion.
+    Rolling friction stays, as it keeps round objects still; friction of other objects stays, as leaning ones could
+    slide by themselves, which says nothing of the motion.
     """
     model = station.model
     touched = np.concatenate([np.flatnonzero(model.geom_bodyid == body), station.finger_geoms])
     model.geom_friction[touched, :2] *= factor
 
 
-def _mass(station: Station, body: int, factor: float) -> None:
-    """Of the carried object, and its inertia with it."""
+def _scale_mass(station: Station, body: int, factor: float) -> None:
+    """Scale mass and inertia of the carried object."""
     station.model.body_mass[body] *= factor
     station.model.body_inertia[body] *= factor
-    mujoco.mj_setConst(station.model, quiet_data(station.model))
+    mujoco.mj_setConst(station.model, make_quiet_data(station.model))
 
 
-CHANGES: Mapping[str, tuple[Callable[[Station, int, float], None], float]] = {
-    "friction_halved": (_friction, 0.5),
-    "friction_doubled": (_friction, 2.0),
-    "mass_minus_30": (_mass, 0.7),
-    "mass_plus_30": (_mass, 1.3),
+PERTURBATIONS: Mapping[str, tuple[Callable[[Station, int, float], None], float]] = {
+    "friction_halved": (_scale_friction, 0.5),
+    "friction_doubled": (_scale_friction, 2.0),
+    "mass_minus_30": (_scale_mass, 0.7),
+    "mass_plus_30": (_scale_mass, 1.3),
 }
-"""Each name, as it stands in the column `survives`, with what it changes and by which factor."""
+"""Names, as in the column `survives`, with change and factor."""
 
 
-def changed(station: Station, name: str, object_id: str) -> Station:
-    """The station with one of `CHANGES`; the one that is given stays as it is."""
-    change, factor = CHANGES[name]
+def perturb_station(station: Station, name: str, object_id: str) -> Station:
+    """Return a copy of the station with one of `PERTURBATIONS`."""
+    change, factor = PERTURBATIONS[name]
     other = copy.copy(station)
     other.model = copy.copy(station.model)
     change(other, station.object_bodies[object_id], factor)
     return other
 
 
-def robust_to(station: Station, base: Pose, motion: Motion, goal: Goal) -> tuple[str, ...]:
-    """Names of the changes under which the motion succeeds as well, in the order of `CHANGES`."""
+def find_survived_perturbations(station: Station, base: Pose, motion: Motion, goal: Goal) -> tuple[str, ...]:
+    """List the perturbations under which the motion still succeeds, in the order of `PERTURBATIONS`."""
     return tuple(
         name
-        for name in CHANGES
-        if execute_and_check(changed(station, name, goal.x_id), base, motion, goal).verdict.success
+        for name in PERTURBATIONS
+        if execute_and_check(perturb_station(station, name, goal.x_id), base, motion, goal).verdict.success
     )

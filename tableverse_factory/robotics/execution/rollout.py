@@ -1,8 +1,8 @@
-"""A motion executed in MuJoCo: position control and nothing else; nothing is welded, nothing is moved by hand.
+"""Rollout of commands in MuJoCo by position control alone, without welds or teleported bodies.
 
-The scene starts as exported, the arm at the motion's first sample. From one sample to the next every servo's target
-goes in a straight line, as a real controller interpolates what it is sent; the gripper is commanded by its opening.
-After the last sample the targets stand still.
+The scene starts as exported, the arm at the motion's first sample. Between samples every servo's target moves in a
+straight line, as a real controller interpolates its input; the gripper is commanded by its opening. After the last
+sample the targets stand still.
 """
 
 from collections.abc import Generator, Iterator
@@ -17,25 +17,26 @@ from schemas.geometry import Frozen, Pose
 from schemas.trajectories import Motion, Phase
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.physics.simulate.mujoco_sleep import sleeping
-from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, Sample
+from tableverse_factory.physics.simulate.mujoco_sleep import allow_sleep
+from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, StateSample
 from tableverse_factory.robotics.robots.station import Station
 
 SLEEP_TOLERANCE = 1e-4
-"""Speed below which a thing may fall asleep. MuJoCo's own, 1e-3, freezes what has lost its support and begins to
-topple: its first ten steps are slower. With this one success and displacements were those of a rollout with everything
-awake, in all trajectories that were measured (docs/trajectories.md)."""
+"""Speed below which an object may sleep.
+
+MuJoCo's default, 1e-3, freezes objects that have just lost their support, whose first ten steps are slower. With this
+value success and displacements equaled those of rollouts with everything awake, in all trajectories that were measured
+(docs/trajectories.md).
+"""
 
 MIN_TIMESTEP_S = 1e-4
-MAX_ITERATIONS = 1000
-"""Of each of MuJoCo's solvers: a scene of any origin has to be simulated in bounded time."""
-
+MAX_ITERATIONS = 1000  # limit for each of MuJoCo's solvers, so that any scene is simulated in bounded time
 _SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Commands(Frozen):
-    """What the servos are told.
+class ServoCommands(Frozen):
+    """Commands of the servos.
 
     Attributes:
         step_s: Time between samples [s].
@@ -51,39 +52,27 @@ class Commands(Frozen):
         return len(self.targets)
 
     def last_of(self, phase: Phase) -> int:
-        """The sample with which a phase ends; -1 where there is none of it."""
+        """Return the sample with which a phase ends, or -1."""
         own = np.flatnonzero(self.phases == list(Phase).index(phase))
         return int(own[-1]) if len(own) else -1
 
 
-def commands_of(motion: Motion) -> Commands:
-    """A motion as commands."""
-    return Commands(motion.step_s, np.column_stack([motion.positions, motion.openings]), motion.phases)
+def build_commands(motion: Motion) -> ServoCommands:
+    """Convert a motion to commands."""
+    return ServoCommands(motion.step_s, np.column_stack([motion.positions, motion.openings]), motion.phases)
 
 
-class Execution:
-    """Commands on their way through a station.
+class Rollout:
+    """Commands in execution on a station; `others` are the uncarried objects, in the order of the model."""
 
-    Attributes:
-        commands: As given.
-        others: Ids of the objects that are not carried, in the order of the model.
-    """
-
-    def __init__(self, station: Station, base: Pose, commands: Commands, x_id: str, y_id: str) -> None:
-        """Puts the base where it belongs; nothing moves yet.
-
-        Args:
-            station: Scene and arm.
-            base: The robot's base in the table frame.
-            commands: For its joints and gripper.
-            x_id: Of the object that is carried.
-            y_id: Of the reference.
+    def __init__(self, station: Station, base: Pose, commands: ServoCommands, x_id: str, y_id: str) -> None:
+        """Place the base at a pose in the table frame; `x_id` is the carried object, `y_id` the reference.
 
         Raises:
-            InputError: `bad_arrays` if the scene has no such objects, or the commands are not for this arm;
-                `bad_scene` if the scene's own settings would make its simulation endless.
+            InputError: `bad_arrays` if the scene has no such objects, or the commands are not for this arm; `bad_scene`
+                as `check_simulation_settings`.
         """
-        check_settings(station.model)
+        check_simulation_settings(station.model)
         if absent := [name for name in (x_id, y_id) if name not in station.object_bodies]:
             raise InputError(f"the scene has no object {sanitize_line(absent[0], 100)!r}", "bad_arrays")
         if commands.targets.shape[1] != (joints := len(station.joint_qpos)) + 1:
@@ -91,20 +80,16 @@ class Execution:
             raise InputError(f"commands for {found} joints, but {station.arm.name} has {joints}", "bad_arrays")
         station.place_base(base)
         self.commands = commands
-        self._watch = ExecutionMonitor(station, x_id)
-        self.others = self._watch.others
+        self._monitor = ExecutionMonitor(station, x_id)
+        self.others = self._monitor.others
         self._station, self._model = station, station.model
 
-    def samples(self, more: int = 0) -> Generator[Sample]:
-        """Simulates, a sample at a time, as long as somebody asks for the next.
-
-        Args:
-            more: How often the last command is repeated after the end.
-        """
+    def samples(self, more: int = 0) -> Generator[StateSample]:
+        """Simulate lazily, a sample at a time, repeating the last command `more` times."""
         data = self._start()
-        self._watch.begin(data)
+        self._monitor.begin(data)
         yield self._sample(data, 0)
-        with timed(self._model, self.commands.step_s) as steps:
+        with align_timestep(self._model, self.commands.step_s) as steps:
             shares = np.arange(1, steps + 1)[:, None] / steps
             for index in range(1, len(self.commands) + more):
                 before, now = self._target(index - 1), self._target(index)
@@ -113,9 +98,9 @@ class Execution:
                     mujoco.mj_step(self._model, data)
                 yield self._sample(data, index)
 
-    def touching(self, object_id: str) -> tuple[str, ...]:
-        """The other objects that touch one as the scene stands."""
-        return self._watch.touching(self._start(), object_id)
+    def find_touching(self, object_id: str) -> tuple[str, ...]:
+        """Find the other objects that initially touch an object."""
+        return self._monitor.find_touching(self._start(), object_id)
 
     def _start(self) -> mujoco.MjData:
         data, first = self._station.data(), self.commands.targets[0]
@@ -128,29 +113,29 @@ class Execution:
         target: Float64[np.ndarray, " k"] = self.commands.targets[min(index, len(self.commands) - 1)]
         return target
 
-    def _sample(self, data: mujoco.MjData, index: int) -> Sample:
+    def _sample(self, data: mujoco.MjData, index: int) -> StateSample:
         phase = int(self.commands.phases[min(index, len(self.commands) - 1)])
-        return self._watch.sample(data, index, phase, self._target(index))
+        return self._monitor.sample(data, index, phase, self._target(index))
 
 
 @contextmanager
-def timed(model: mujoco.MjModel, step_s: float) -> Iterator[int]:
-    """Gives how many steps a sample takes; inside, the timestep is short enough for them to end on the sample.
+def align_timestep(model: mujoco.MjModel, step_s: float) -> Iterator[int]:
+    """Yield the number of steps per sample; inside, the timestep divides the sample's step.
 
-    What rests and is touched by nothing that moves sleeps: in a full scene that is most of the work.
+    Resting objects without moving contacts sleep, which saves most of the work in a full scene.
     """
     own = float(model.opt.timestep)
     steps = max(1, int(np.ceil(step_s / own - 1e-6)))
     model.opt.timestep = step_s / steps
     try:
-        with sleeping(model, SLEEP_TOLERANCE):
+        with allow_sleep(model, SLEEP_TOLERANCE):
             yield steps
     finally:
         model.opt.timestep = own
 
 
-def check_settings(model: mujoco.MjModel) -> None:
-    """Refuses a scene whose own settings would make its simulation endless.
+def check_simulation_settings(model: mujoco.MjModel) -> None:
+    """Refuse a scene whose own settings would make its simulation endless.
 
     Raises:
         InputError: `bad_scene`.

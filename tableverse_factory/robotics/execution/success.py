@@ -1,4 +1,4 @@
-"""Whether what happened is a success, and what went wrong if not: decided sample by sample, as soon as it is sure."""
+"""Success criteria of an executed motion, decided sample by sample as early as possible."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -8,42 +8,32 @@ from jaxtyping import Float64
 
 from schemas.geometry import Pose
 from schemas.trajectories import Phase, Verdict
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.physics.simulate.at_rest import HOLD_S, SPEED_LIMIT
 from tableverse_factory.robotics.execution.goal import RESTING_RELATIONS, Goal
-from tableverse_factory.robotics.execution.monitor import Sample
-from tableverse_factory.robotics.execution.rollout import Commands, Execution
+from tableverse_factory.robotics.execution.monitor import StateSample
+from tableverse_factory.robotics.execution.rollout import Rollout, ServoCommands
 
-MIN_LIFT_M = 0.03
-"""Lifted is what stands at least so much higher at the end of the post-grasp phase than it stood."""
+MIN_LIFT_M = 0.03  # minimum rise at the end of the post-grasp phase that counts as lifted
+CARRIER_FACTOR = 2.0
+"""Where Y carries X in the end, Y and objects that touch Y may move by this multiple of `max_disturbed_m`: a bowl rocks
+when something is put into it, and its contents make room.
+"""
 
-CARRIER_SHARE = 2.0
-"""Where Y carries X in the end, Y and what touches Y may move by this multiple of `max_disturbed_m`: a bowl rocks when
-something is put into it, and what lies in it makes room."""
-
-FALL_M = 0.01
-"""An object whose centre of mass is this far below the table top has fallen from it."""
-
-LOST_S = 0.06
-"""No finger touches the object for so long: it is dropped. A single step without contact is none."""
-
-LAG_RAD = 0.03
-"""Where the fingers close and open, and at the end, every joint stands within this of its target."""
-
-BLOCKED_RAD = 0.25
-"""Anywhere else: a servo follows fast motions late, by a small part of this."""
-
+FALL_M = 0.01  # an object whose center of mass is this far below the table top has fallen from it
+DROP_S = 0.06  # an object without finger contact for this long is dropped; single steps without contact are not counted
+LAG_RAD = 0.03  # maximum joint error where the fingers close and open, and at the end
+BLOCKED_RAD = 0.25  # maximum joint error elsewhere, far above the normal lag of the servos
 _PHASES = tuple(Phase)
-_HELD = (Phase.PRE_PLACE, Phase.PLACE)
-_STANDS = (Phase.GRASP, Phase.PLACE, Phase.POST_PLACE)
+_HELD_PHASES = (Phase.PRE_PLACE, Phase.PLACE)
+_STILL_PHASES = (Phase.GRASP, Phase.PLACE, Phase.POST_PLACE)
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
-    """What went wrong first.
+class RolloutFailure:
+    """First failure of a rollout.
 
     Attributes:
-        phase: In which.
         reason: Code: `simulation_unstable`, `servo_lag`, `not_grasped`, `slipped`, `dropped`, `disturbed`,
             `not_released`, `relation_missed` or `not_at_rest`.
         detail: One line with the values that decided.
@@ -54,32 +44,26 @@ class Failure:
     detail: str
 
 
-def allowances(goal: Goal, others: Sequence[str], touching: Sequence[str]) -> Float64[np.ndarray, " n"]:
-    """How far each other object may be moved [m].
-
-    Args:
-        goal: What is to be achieved.
-        others: Ids of all objects that are not carried.
-        touching: Ids of those that touch the reference in the beginning.
-    """
+def compute_displacement_limits(
+    goal: Goal, others: Sequence[str], touching: Sequence[str]
+) -> Float64[np.ndarray, " n"]:
+    """Compute the allowed displacement of each other object [m]; `touching` initially touch the reference."""
     wide = {goal.y_id, *touching} if goal.relation in RESTING_RELATIONS else set()
-    return np.array([goal.max_disturbed_m * (CARRIER_SHARE if name in wide else 1.0) for name in others])
+    return np.array([goal.max_disturbed_m * (CARRIER_FACTOR if name in wide else 1.0) for name in others])
 
 
 @dataclass(slots=True)
 class SuccessChecker:
-    """Looks at the samples of one execution, in their order, and remembers what it needs.
+    """Online checker of one rollout's samples, in order.
 
     Attributes:
-        goal: What is to be achieved.
-        execution: Whose samples are looked at.
-        failure: What went wrong first; None as long as nothing did.
-        at_rest: Whether the object was at rest for `HOLD_S` until now.
+        failure: First failure, if any.
+        at_rest: Whether the object was at rest for the last `HOLD_S`.
     """
 
     goal: Goal
-    execution: Execution
-    failure: Failure | None = None
+    execution: Rollout
+    failure: RolloutFailure | None = None
     at_rest: bool = False
     _allowed_m: np.ndarray = field(init=False)
     _ends: dict[Phase, int] = field(init=False)
@@ -91,11 +75,11 @@ class SuccessChecker:
 
     def __post_init__(self) -> None:
         self._ends = {phase: self.execution.commands.last_of(phase) for phase in Phase}
-        touching = self.execution.touching(self.goal.y_id)
-        self._allowed_m = allowances(self.goal, self.execution.others, touching)
+        touching = self.execution.find_touching(self.goal.y_id)
+        self._allowed_m = compute_displacement_limits(self.goal, self.execution.others, touching)
 
-    def look(self, sample: Sample) -> bool:
-        """Takes in the next sample; whether there is a reason to go on."""
+    def update(self, sample: StateSample) -> bool:
+        """Check the next sample; return whether to continue."""
         if sample.index == 0:
             self._stood_m = float(sample.center[2])
         step_s = self.execution.commands.step_s
@@ -104,31 +88,32 @@ class SuccessChecker:
         self._lost_s = 0.0 if sample.pads else self._lost_s + step_s
         self._still_s = self._still_s + step_s if np.abs(sample.velocity).max() < SPEED_LIMIT else 0.0
         self.at_rest = self._still_s >= HOLD_S - 1e-9
-        self.failure = self._broken(sample) or self._disturbed(sample) or self._lost(sample) or self._unmet(sample)
+        self.failure = (
+            self._check_simulation(sample)
+            or self._check_disturbance(sample)
+            or self._check_drop(sample)
+            or self._check_phase_end(sample)
+        )
         return self.failure is None
 
-    def verdict(self, last: Sample) -> Verdict:
-        """The end of it.
-
-        Args:
-            last: The last sample that was looked at.
-        """
-        failure = self.failure or self._missed(last)
+    def verdict(self, last: StateSample) -> Verdict:
+        """Return the final verdict after the last sample."""
+        failure = self.failure or self._check_final_state(last)
         figures = {"lifted_m": self._lifted_m, "disturbed_m": self._disturbed_m}
         if failure is None:
             return Verdict(True, "", "", "", **figures)
         return Verdict(False, failure.phase.value, failure.reason, failure.detail, **figures)
 
-    def _broken(self, sample: Sample) -> Failure | None:
+    def _check_simulation(self, sample: StateSample) -> RolloutFailure | None:
         if sample.warnings:
             detail = f"MuJoCo warned of {', '.join(sample.warnings)}"
-            return Failure(_PHASES[sample.phase], "simulation_unstable", detail)
+            return RolloutFailure(_PHASES[sample.phase], "simulation_unstable", detail)
         if sample.arm_error_rad > BLOCKED_RAD:
             detail = f"a joint is {sample.arm_error_rad:.3f} rad from its target on the way, more than {BLOCKED_RAD}"
-            return Failure(_PHASES[sample.phase], "servo_lag", detail)
+            return RolloutFailure(_PHASES[sample.phase], "servo_lag", detail)
         return None
 
-    def _disturbed(self, sample: Sample) -> Failure | None:
+    def _check_disturbance(self, sample: StateSample) -> RolloutFailure | None:
         if not (sample.moved_m > self._allowed_m).any() and sample.heights_m.min(initial=0.0) >= -FALL_M:
             return None
         fallen = np.flatnonzero(sample.heights_m < -FALL_M)
@@ -139,61 +124,65 @@ class SuccessChecker:
             k = int(beyond[np.argmax(sample.moved_m[beyond])])
             moved, allowed = 1e3 * sample.moved_m[k], 1e3 * self._allowed_m[k]
             detail = f"{self.execution.others[k]} was moved by {moved:.1f} mm, more than {allowed:.1f} mm"
-        return Failure(_PHASES[sample.phase], "disturbed", detail)
+        return RolloutFailure(_PHASES[sample.phase], "disturbed", detail)
 
-    def _lost(self, sample: Sample) -> Failure | None:
+    def _check_drop(self, sample: StateSample) -> RolloutFailure | None:
         phase = _PHASES[sample.phase]
-        if phase not in _HELD or self._lost_s < LOST_S - 1e-9 or _released(self.execution.commands, sample.index):
+        if (
+            phase not in _HELD_PHASES
+            or self._lost_s < DROP_S - 1e-9
+            or _is_release_commanded(self.execution.commands, sample.index)
+        ):
             return None
         rise = 1e3 * (float(sample.center[2]) - self._stood_m)
-        return Failure(phase, "dropped", f"no finger touched it for {self._lost_s:.2f} s; it was {rise:.0f} mm up")
+        return RolloutFailure(
+            phase, "dropped", f"no finger touched it for {self._lost_s:.2f} s; it was {rise:.0f} mm up"
+        )
 
-    def _unmet(self, sample: Sample) -> Failure | None:
-        """What has to be true where a phase ends."""
+    def _check_phase_end(self, sample: StateSample) -> RolloutFailure | None:
         phase = _PHASES[sample.phase]
         if sample.index != self._ends[phase]:
             return None
-        if phase in _STANDS and sample.arm_error_rad > LAG_RAD:
+        if phase in _STILL_PHASES and sample.arm_error_rad > LAG_RAD:
             detail = f"a joint stands {sample.arm_error_rad:.3f} rad from its target, more than {LAG_RAD}"
-            return Failure(phase, "servo_lag", detail)
+            return RolloutFailure(phase, "servo_lag", detail)
         if phase is Phase.GRASP and sample.pads != 3:
             touching = "one finger touches" if sample.pads else "no finger touches"
-            return Failure(phase, "not_grasped", f"{touching} it with the gripper closed")
+            return RolloutFailure(phase, "not_grasped", f"{touching} it with the gripper closed")
         rise = float(sample.center[2]) - self._stood_m
         if phase is Phase.POST_GRASP and (rise < MIN_LIFT_M or not sample.pads):
             detail = f"it rose by {1e3 * rise:.1f} mm of at least {1e3 * MIN_LIFT_M:.0f} mm"
-            return Failure(phase, "slipped", detail + ("" if sample.pads else ", and no finger touches it"))
+            return RolloutFailure(phase, "slipped", detail + ("" if sample.pads else ", and no finger touches it"))
         return None
 
-    def _missed(self, last: Sample) -> Failure | None:
-        """What has to be true in the end."""
+    def _check_final_state(self, last: StateSample) -> RolloutFailure | None:
         commands, goal = self.execution.commands, self.goal
         reference = last.others[self.execution.others.index(goal.y_id)]
         if (done := _PHASES[last.phase]) is not Phase.POST_PLACE or last.index < len(commands) - 1:
-            return Failure(done, "relation_missed", f"the motion ends in its phase {done.value}")
+            return RolloutFailure(done, "relation_missed", f"the motion ends in its phase {done.value}")
         if last.pads:
-            return Failure(Phase.POST_PLACE, "not_released", "a finger still touches it in the end")
+            return RolloutFailure(Phase.POST_PLACE, "not_released", "a finger still touches it in the end")
         if last.center[2] < -FALL_M:
-            return Failure(Phase.PLACE, "relation_missed", f"{goal.x_id} fell from the table")
+            return RolloutFailure(Phase.PLACE, "relation_missed", f"{goal.x_id} fell from the table")
         if not goal.holds(_pose(last.pose), _pose(reference)):
             x, y, z = 1e3 * last.center
             detail = (
                 f"{goal.x_id} is not {goal.relation.value} {goal.y_id}; its centre is at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
             )
-            return Failure(Phase.PLACE, "relation_missed", detail)
+            return RolloutFailure(Phase.PLACE, "relation_missed", detail)
         if not self.at_rest:
             fastest = float(np.abs(last.velocity).max())
             detail = f"it moves at {fastest:.3f} m/s or rad/s, and rest is below {SPEED_LIMIT} for {HOLD_S} s"
-            return Failure(Phase.POST_PLACE, "not_at_rest", detail)
+            return RolloutFailure(Phase.POST_PLACE, "not_at_rest", detail)
         return None
 
 
-def _released(commands: Commands, index: int) -> bool:
-    """Whether the fingers were told to open at the place, at this sample or before."""
+def _is_release_commanded(commands: ServoCommands, index: int) -> bool:
+    """Test whether the fingers were commanded to open at the place by this sample."""
     last = min(index, len(commands) - 1)
     start = max(commands.last_of(Phase.PRE_PLACE), 0)
     return bool((np.diff(commands.targets[start : last + 1, -1]) > 1e-6).any())
 
 
 def _pose(numbers: np.ndarray) -> Pose:
-    return Pose(numbers[:3].copy(), normalized_quaternion(numbers[3:]))
+    return Pose(numbers[:3].copy(), normalize_quaternion(numbers[3:]))

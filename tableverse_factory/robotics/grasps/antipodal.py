@@ -1,8 +1,8 @@
 """Antipodal grasps: pairs of contacts whose normals lie in the friction cone about the line between them.
 
 From points spread over the surface, rays go inwards within the friction cone (Nguyen 1988; Mahler et al. 2017 sample
-in the same way). Each ray gives up to two partners: where it first leaves the body (a wall, pinched) and where it
-leaves it for good (the whole body, enclosed). Each pair is approached from several sides and to several depths.
+in the same way). Each ray gives up to two partners: where it first leaves the body (a pinched wall) and where it last
+leaves it (the whole body, enclosed). Each pair is approached from several sides and to several depths.
 """
 
 from dataclasses import dataclass
@@ -12,49 +12,44 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from schemas.trajectories import Grasps, Numbers
-from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
-from tableverse_factory.geometry.relations.antipodal import FRICTION, first_hits, outward_sign, surface_points
-from tableverse_factory.robotics.grasps.clearance import TABLE_M
-from tableverse_factory.robotics.grasps.closing import Rotations, hold
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene
+from tableverse_factory.geometry.relations.antipodal import (
+    FRICTION,
+    cast_surface_rays,
+    compute_outward_sign,
+    sample_inward_normals,
+)
+from tableverse_factory.robotics.grasps.clearance import TABLE_CLEARANCE_M
+from tableverse_factory.robotics.grasps.closing import Rotations, close_pads
 from tableverse_factory.robotics.robots.arm import GripperShape
-from tableverse_factory.robotics.robots.gripper_clearance import FINGER_ROOM_M
+from tableverse_factory.robotics.robots.gripper_clearance import FINGER_CLEARANCE_M
 
-OPENING_MARGIN_M = 0.002
-"""What is gripped is at least this narrower than the opening: 0.078 m for a Panda's hand."""
-
+OPENING_MARGIN_M = 0.002  # A gripped object is at least this much narrower than the opening: 0.078 m for a Panda's hand
 ROLLS = np.radians([0.0, -20.0, 20.0, -40.0, 40.0, -60.0, 60.0, -80.0, 80.0])
-"""Turns of the approach about the closing axis, from the steepest descent that the axis allows [rad]."""
+"""Rotations of the approach about the closing axis, from the steepest descent that the axis allows [rad]."""
 
 DEPTHS_M = (0.0, -0.008)
-"""How far the TCP goes beyond the contacts: with the middle of the pads, or rather with the fingertips."""
+"""Travel of the TCP beyond the contacts: grips with the middle of the pads, or with the fingertips."""
 
-MAX_LIFTED_M = 0.012
-"""The gripper may stay back this far where its fingertips would touch the table."""
-
-MAX_PAIRS = 128
-"""Pairs of contacts that are looked at closely, spread over the body."""
-
+MAX_LIFTED_M = 0.012  # maximum retreat of the gripper where its fingertips would touch the table
+MAX_PAIRS = 128  # contact pairs that are examined closely, spread over the body
 LOOSE_FRICTION = 0.75
-"""Pads on slopes beyond the friction cone, up to this one, may still hold: tried when all else fails."""
+"""Slopes beyond the friction cone, up to this coefficient, may still hold: used when nothing better is found."""
 
-_WEIGHTS, _LOOSE = (0.25, 0.4, 0.35), 0.3
-"""Of slope, nearness of the centre of mass, and area, in the score; and what is left of a score on loose slopes."""
+_WEIGHTS, _LOOSE_FACTOR = (0.25, 0.4, 0.35), 0.3
+"""Weights of slope, nearness of the center of mass, and area in the score; and the score's factor on loose slopes."""
 
-_LEVER_M = 0.04
-"""At this distance the centre of mass counts half."""
-
+_HALF_SCORE_LEVER_M = 0.04  # at this distance from the center of mass nearness is one half
 _CELL_M, _PART_M, _KIND_M = 0.012, 0.06, 0.02
-"""Pairs in one cell are one; parts of a body are so large, and widths of one kind differ by so much."""
+"""Pairs in one cell count as one; parts of a body have this size; widths of one kind differ by less than this."""
 
-_BEYOND_M = 0.012
-"""Pads begin to close this far outside their contacts."""
-
+_CLOSING_START_M = 0.012  # pads begin to close this far outside their contacts
 _MIN_WIDTH_M = 0.001
 _SLACK_M = 0.0005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pairs(Frozen):
+class _ContactPairs(Frozen):
     """Antipodal pairs of contacts.
 
     Attributes:
@@ -70,15 +65,14 @@ class _Pairs(Frozen):
     alignment: Numbers
 
     def middle(self) -> Points:
-        """Of each pair [m]."""
         middle: Points = self.first + 0.5 * self.width[:, None] * self.axis
         return middle
 
-    def chosen(self, kept: np.ndarray) -> "_Pairs":
-        return _Pairs(self.first[kept], self.axis[kept], self.width[kept], self.alignment[kept])
+    def chosen(self, kept: np.ndarray) -> "_ContactPairs":
+        return _ContactPairs(self.first[kept], self.axis[kept], self.width[kept], self.alignment[kept])
 
 
-def sample(
+def sample_antipodal_grasps(
     mesh: TriangleMesh,
     felt: TriangleMesh,
     gripper: GripperShape,
@@ -87,59 +81,52 @@ def sample(
     config: TrajectoriesConfig,
     rng: np.random.Generator,
 ) -> Grasps:
-    """Grasps of one body by itself, best score first; whether the gripper has room is `grasps.clearance`'s question.
+    """Sample grasps of one isolated body in the table frame, best score first.
 
-    The score, 0 to 1, weighs how well the normals oppose each other, how near the grasp is to the centre of mass, and
-    how much of the pads finds something to press on from both sides. It does not know where the approach comes
-    from: that is the business of `grasps.arbitration`.
-
-    Args:
-        mesh: As it stands, table frame [m].
-        felt: What a simulation feels in its place: its convex pieces as one mesh [m].
-        gripper: Its fingers.
-        max_opening_m: Widest distance between them [m].
-        center: The body's centre of mass, table frame [m].
-        config: `candidates` says how many rays are sent.
-        rng: Turns rays away from the normals.
+    The score, 0 to 1, weighs how well the normals oppose each other, nearness to the center of mass, and the share of
+    the pads that presses on something from both sides. It ignores the approach direction (see `grasps.arbitration`).
+    `felt` are the convex pieces, which a simulation collides, as one mesh; `config.candidates` is the number of rays.
     """
-    caster = column_caster(mesh)
+    caster = make_raycasting_scene(mesh)
     opening = max_opening_m - OPENING_MARGIN_M
-    pairs = _contacts(mesh, caster, config.candidates, opening, rng)
-    pairs = _above_table(pairs, gripper)
-    pairs = _spread(pairs, _nearness(pairs.middle(), center))
-    return _approached(pairs, column_caster(felt), center, gripper, opening)
+    pairs = _find_contact_pairs(mesh, caster, config.candidates, opening, rng)
+    pairs = _keep_above_table(pairs, gripper)
+    pairs = _spread_pairs(pairs, _score_nearness(pairs.middle(), center))
+    return _generate_approaches(pairs, make_raycasting_scene(felt), center, gripper, opening)
 
 
-def _contacts(mesh: TriangleMesh, caster: Caster, count: int, opening: float, rng: np.random.Generator) -> _Pairs:
-    """Every pair that the rays find within the opening [m] and within the friction cone."""
-    sign = outward_sign(mesh)
-    points, inward = surface_points(mesh, count)
+def _find_contact_pairs(
+    mesh: TriangleMesh, caster: RaycastingScene, count: int, opening: float, rng: np.random.Generator
+) -> _ContactPairs:
+    """Find all pairs within the opening [m] and within the friction cone."""
+    sign = compute_outward_sign(mesh)
+    points, inward = sample_inward_normals(mesh, count)
     inward = sign * inward
-    ways = _within_cone(inward, rng)
-    edge, found = _rim(FRICTION), []
+    ways = _sample_cone_directions(inward, rng)
+    edge, found = _compute_cone_cosine(FRICTION), []
     for width, normals in (
-        first_hits(caster, points, ways, sign),
-        _last_exits(caster, points, ways, sign, opening),
+        cast_surface_rays(caster, points, ways, sign),
+        _cast_last_exits(caster, points, ways, sign, opening),
     ):
         slopes = np.minimum(np.einsum("ij,ij->i", inward, ways), np.einsum("ij,ij->i", normals, ways))
         good = (width >= _MIN_WIDTH_M) & (width <= opening) & (slopes >= edge)
         alignment = (slopes[good] - edge) / (1.0 - edge)
-        found.append(_Pairs(points[good], ways[good], width[good], alignment))
+        found.append(_ContactPairs(points[good], ways[good], width[good], alignment))
     wall, whole = found
     fields = ("first", "axis", "width", "alignment")
-    return _Pairs(*(np.concatenate([getattr(wall, name), getattr(whole, name)]) for name in fields))
+    return _ContactPairs(*(np.concatenate([getattr(wall, name), getattr(whole, name)]) for name in fields))
 
 
-def _within_cone(inward: Points, rng: np.random.Generator) -> Points:
-    """A direction in the friction cone about each normal: the normal, the most level one, or any, in turn.
+def _sample_cone_directions(inward: Points, rng: np.random.Generator) -> Points:
+    """Choose a direction in each normal's friction cone: the normal, the most level one, or a random one, in turn.
 
-    On a table fingers close level: without the second kind, what is thin and lies flat would hardly be found.
+    Level directions find thin objects that lie flat, which random directions would rarely hit.
     """
-    edge = _rim(FRICTION)
+    edge = _compute_cone_cosine(FRICTION)
     slope = 1.0 - rng.random(len(inward)) * (1.0 - edge)
     slope[::3] = 1.0
     turn = 2 * np.pi * rng.random(len(inward))
-    side, other = _across(inward)
+    side, other = _compute_tangents(inward)
     tilt = np.sqrt(1.0 - slope**2)[:, None]
     ways: Points = slope[:, None] * inward + tilt * (np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * other)
     flat = np.hypot(inward[:, 0], inward[:, 1])
@@ -148,19 +135,21 @@ def _within_cone(inward: Points, rng: np.random.Generator) -> Points:
     return ways
 
 
-def _rim(friction: float) -> float:
-    """Cosine between the axis of a friction cone and its surface."""
+def _compute_cone_cosine(friction: float) -> float:
+    """Compute the cosine between the axis of a friction cone and its surface."""
     return float(1.0 / np.sqrt(1.0 + friction**2))
 
 
-def _last_exits(caster: Caster, points: Points, ways: Points, sign: float, opening: float) -> tuple[Numbers, Points]:
-    """Widths and outward normals at the far side of all that lies within the opening, seen from beyond it."""
-    back, normals = first_hits(caster, points + opening * ways, -ways, sign)
+def _cast_last_exits(
+    caster: RaycastingScene, points: Points, ways: Points, sign: float, opening: float
+) -> tuple[Numbers, Points]:
+    """Cast rays back from beyond the opening; return widths and outward normals at the far side."""
+    back, normals = cast_surface_rays(caster, points + opening * ways, -ways, sign)
     return opening - back, normals
 
 
-def _across(axes: Points) -> tuple[Points, Points]:
-    """Two unit vectors across each axis; the first one level where the axis allows it."""
+def _compute_tangents(axes: Points) -> tuple[Points, Points]:
+    """Compute two unit vectors across each axis; the first is level where the axis allows it."""
     level = np.stack([-axes[:, 1], axes[:, 0], np.zeros(len(axes))], axis=1)
     upright = np.abs(axes[:, 2]) > 1.0 - 1e-9
     level[upright] = [1.0, 0.0, 0.0]
@@ -168,25 +157,25 @@ def _across(axes: Points) -> tuple[Points, Points]:
     return level, np.cross(axes, level)
 
 
-def _nearness(middle: Points, center: Vector3) -> Numbers:
-    """1 where the centre of mass hangs below the grasp, falling with the lever of its weight."""
+def _score_nearness(middle: Points, center: Vector3) -> Numbers:
+    """Score 1 where the center of mass hangs below the grasp, falling with the lever of its weight."""
     across = np.hypot(middle[:, 0] - center[0], middle[:, 1] - center[1])
     above = 0.5 * np.maximum(center[2] - middle[:, 2], 0.0)  # what is held below its centre wants to topple
-    nearness: Numbers = 1.0 / (1.0 + np.hypot(across, above) / _LEVER_M)
+    nearness: Numbers = 1.0 / (1.0 + np.hypot(across, above) / _HALF_SCORE_LEVER_M)
     return nearness
 
 
-def _above_table(pairs: _Pairs, gripper: GripperShape) -> _Pairs:
-    """Without those of which a finger, behind its contact, would be in the table whatever the approach."""
+def _keep_above_table(pairs: _ContactPairs, gripper: GripperShape) -> _ContactPairs:
+    """Drop pairs of which a finger would be in the table whatever the approach."""
     thickness = float((gripper.finger_centers + gripper.finger_half_sizes)[:, 1].max())
     lowest = pairs.middle()[:, 2] - np.abs(pairs.axis[:, 2]) * (0.5 * pairs.width + thickness)
-    return pairs.chosen(lowest >= TABLE_M - MAX_LIFTED_M * (1.0 - np.abs(pairs.axis[:, 2])))
+    return pairs.chosen(lowest >= TABLE_CLEARANCE_M - MAX_LIFTED_M * (1.0 - np.abs(pairs.axis[:, 2])))
 
 
-def _spread(pairs: _Pairs, nearness: Numbers) -> _Pairs:
-    """The best pair of each place and direction, and of those the best `MAX_PAIRS`, from all parts of the body in turn.
+def _spread_pairs(pairs: _ContactPairs, nearness: Numbers) -> _ContactPairs:
+    """Select the best pair per place and direction, then the best `MAX_PAIRS` from all parts of the body in turn.
 
-    Parts differ in where they are and in how wide: what is best by itself may be out of reach or out of room.
+    Parts differ in position and width, as the best pair alone may be out of reach or out of room.
     """
     order = np.argsort(-(pairs.alignment + nearness), kind="stable")
     axis = pairs.axis * np.where(pairs.axis @ [1.0, 1e-3, 1e-6] < 0.0, -1.0, 1.0)[:, None]  # closing is symmetric
@@ -203,35 +192,39 @@ def _spread(pairs: _Pairs, nearness: Numbers) -> _Pairs:
     return pairs.chosen(order[np.argsort(rank, kind="stable")][:MAX_PAIRS])
 
 
-def _approached(pairs: _Pairs, felt: Caster, center: Vector3, gripper: GripperShape, opening: float) -> Grasps:
-    """Every pair from every side and to every depth, as far as the gripper stays above the table and finds hold."""
-    level, steep = _across(pairs.axis)
+def _generate_approaches(
+    pairs: _ContactPairs, felt: RaycastingScene, center: Vector3, gripper: GripperShape, opening: float
+) -> Grasps:
+    """Approach every pair from every side and to every depth where the gripper clears the table and finds hold."""
+    level, steep = _compute_tangents(pairs.axis)
     steep = np.where(steep[:, 2:] > 0.0, -steep, steep)
     approach = np.concatenate([np.cos(roll) * steep + np.sin(roll) * level for roll in ROLLS])
     pair = np.tile(np.arange(len(pairs.width)), len(ROLLS))
     axis, middle = pairs.axis[pair], pairs.middle()[pair]
     rotation = np.stack([np.cross(axis, approach), axis, approach], axis=2)
-    kept, depth = _depths(gripper, rotation, middle, pairs.width[pair])
-    rotation, nearness = rotation[kept], _nearness(pairs.middle(), center)[pair[kept]]
+    kept, depth = _choose_depths(gripper, rotation, middle, pairs.width[pair])
+    rotation, nearness = rotation[kept], _score_nearness(pairs.middle(), center)[pair[kept]]
     position = middle[kept] + depth[:, None] * rotation[:, :, 2]
-    found = hold(rotation, position, pairs.width[pair[kept]] + 2 * _BEYOND_M, felt, gripper)
-    edge, loose = _rim(FRICTION), _rim(LOOSE_FRICTION)
+    found = close_pads(rotation, position, pairs.width[pair[kept]] + 2 * _CLOSING_START_M, felt, gripper)
+    edge, loose = _compute_cone_cosine(FRICTION), _compute_cone_cosine(LOOSE_FRICTION)
     good = (found.width >= _MIN_WIDTH_M) & (found.width <= opening) & (found.slope >= loose)
     firm = np.clip((found.slope - edge) / (1.0 - edge), 0.0, 1.0)
     scores = np.stack([firm, nearness, found.share], axis=1) @ np.array(_WEIGHTS)
-    scores *= np.where(found.slope >= edge, 1.0, _LOOSE)
+    scores *= np.where(found.slope >= edge, 1.0, _LOOSE_FACTOR)
     position = position + np.where(good, found.sideways, 0.0)[:, None] * rotation[:, :, 1]
     best = np.flatnonzero(good)
     best = best[np.argsort(-scores[best], kind="stable")]
     return Grasps(rotation[best], position[best], found.width[best], scores[best])
 
 
-def _depths(gripper: GripperShape, rotation: Rotations, middle: Points, width: Numbers) -> tuple[np.ndarray, Numbers]:
-    """The approaches that can be followed to some depth above the table, and the depths [m]."""
+def _choose_depths(
+    gripper: GripperShape, rotation: Rotations, middle: Points, width: Numbers
+) -> tuple[np.ndarray, Numbers]:
+    """Return the approaches that can be followed to some depth above the table, and the depths [m]."""
     kept, depths = [], []
     last = np.full(len(middle), np.inf)
     for wanted in DEPTHS_M:
-        back = _too_low(gripper, rotation, middle + wanted * rotation[:, :, 2], width)
+        back = _compute_retreat(gripper, rotation, middle + wanted * rotation[:, :, 2], width)
         depth = wanted - back
         good = (back <= MAX_LIFTED_M) & (depth < last - 1e-6)
         last = np.where(good, depth, last)
@@ -240,11 +233,13 @@ def _depths(gripper: GripperShape, rotation: Rotations, middle: Points, width: N
     return np.concatenate(kept), np.concatenate(depths)
 
 
-def _too_low(gripper: GripperShape, rotation: Rotations, position: Points, width: Numbers) -> Numbers:
-    """How far each gripper must go back along its approach for its open fingers to stay above the table [m]."""
+def _compute_retreat(gripper: GripperShape, rotation: Rotations, position: Points, width: Numbers) -> Numbers:
+    """Compute how far each gripper must retreat for its open fingers to stay above the table [m]."""
     down, approach = rotation[:, 2], rotation[:, 2, 2]
     deepest = (down @ gripper.finger_centers.T - np.abs(down) @ gripper.finger_half_sizes.T).min(axis=1)
     mirrored = (down * [1.0, -1.0, 1.0]) @ gripper.finger_centers.T - np.abs(down) @ gripper.finger_half_sizes.T
-    deepest = np.minimum(deepest, mirrored.min(axis=1)) - np.abs(down[:, 1]) * (0.5 * width + FINGER_ROOM_M)
-    back: Numbers = np.maximum(TABLE_M + _SLACK_M - position[:, 2] - deepest, 0.0) / np.maximum(-approach, 1e-3)
+    deepest = np.minimum(deepest, mirrored.min(axis=1)) - np.abs(down[:, 1]) * (0.5 * width + FINGER_CLEARANCE_M)
+    back: Numbers = np.maximum(TABLE_CLEARANCE_M + _SLACK_M - position[:, 2] - deepest, 0.0) / np.maximum(
+        -approach, 1e-3
+    )
     return back

@@ -1,7 +1,6 @@
-"""Room for the gripper: no box of it may touch the table, the body besides between the fingers, or anything else.
+"""Gripper clearance: its boxes may not touch the table, anything else, or the body except between the fingers.
 
-The open gripper is tested where it takes hold and along the straight way to there, as boxes that are longer towards
-where it comes from.
+The open gripper is tested at the grasp and along the straight approach, as boxes stretched backwards along it.
 """
 
 from collections.abc import Sequence
@@ -12,53 +11,42 @@ from jaxtyping import Bool, Float64
 from schemas.geometry import Points, TriangleMesh
 from schemas.trajectories import Grasps, Numbers
 from tableverse_factory.robotics.robots.arm import GripperShape
-from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, openings
+from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, compute_approach_openings
 
-TABLE_M = 0.001
-"""Least height of every part of the gripper above the table."""
-
-OWN_M = 0.0005
-OTHERS_M = 0.0015
-"""Gaps to the body itself and to everything else."""
-
-_STEPS = (16, 4, 1)
-"""Few points first: what is in the way is mostly large."""
+TABLE_CLEARANCE_M = 0.001  # minimum height of every part of the gripper above the table
+SELF_CLEARANCE_M = 0.0005
+OBSTACLE_CLEARANCE_M = 0.0015  # gaps to the body itself and to everything else
+_STRIDES = (16, 4, 1)  # coarse subsets of points first: most obstacles are large
 _CHUNK = 128
-
 Mask = Bool[np.ndarray, "n"]
 Boxes = tuple[Float64[np.ndarray, "n b 3"], Float64[np.ndarray, "b 3"]]
-"""Centres per grasp and half sizes of boxes along the axes of the gripper frame [m]."""
+"""Centers per grasp and half sizes of boxes along the axes of the gripper frame [m]."""
 
 
-def clear(
+def find_clear_grasps(
     grasps: Grasps, gripper: GripperShape, max_opening_m: float, own: Points, others: Sequence[TriangleMesh]
 ) -> Mask:
-    """Which grasps have room.
+    """Test which grasps in the table frame leave the gripper clear.
 
-    Args:
-        grasps: Table frame.
-        gripper: Its shape.
-        max_opening_m: Its widest opening [m].
-        own: Points of the surface of the body that is gripped, table frame, evenly spread in their order; those of
-            its convex pieces too, where a simulation feels them; none where that was asked before. Shape (p, 3) [m].
-        others: Convex pieces of everything else, table frame [m].
+    `own` are surface points of the gripped body and of its convex pieces, evenly spread in their order; empty where
+    that was tested before. `others` are convex pieces of everything else.
     """
-    opening = openings(grasps.widths, max_opening_m)
-    centers, half = _swept(gripper, opening)
-    kept = np.flatnonzero(_above_table(grasps, (centers, half)))
-    for step in _STEPS if len(own) else ():
-        kept = kept[~_holds_points(grasps.chosen(kept), (centers[kept], half), own[::step])]
-    grip_centers, grip_half = _between(gripper, opening)
+    opening = compute_approach_openings(grasps.widths, max_opening_m)
+    centers, half = _sweep_boxes(gripper, opening)
+    kept = np.flatnonzero(_is_above_table(grasps, (centers, half)))
+    for step in _STRIDES if len(own) else ():
+        kept = kept[~_contains_points(grasps.chosen(kept), (centers[kept], half), own[::step])]
+    grip_centers, grip_half = _build_grip_box(gripper, opening)
     centers, half = np.concatenate([centers, grip_centers], axis=1), np.concatenate([half, grip_half])
     for piece in others:
-        kept = kept[~_touches_piece(grasps.chosen(kept), (centers[kept], half + OTHERS_M), piece)]
+        kept = kept[~_collides_with_piece(grasps.chosen(kept), (centers[kept], half + OBSTACLE_CLEARANCE_M), piece)]
     free = np.zeros(len(grasps), dtype=bool)
     free[kept] = True
     return free
 
 
-def _swept(gripper: GripperShape, opening: Numbers) -> Boxes:
-    """The gripper's boxes at these openings and on their straight way to there."""
+def _sweep_boxes(gripper: GripperShape, opening: Numbers) -> Boxes:
+    """Stretch the gripper's boxes at these openings along the straight approach."""
     centers, half = gripper.boxes(0.0)
     fingers = len(gripper.finger_centers)
     placed = np.repeat(centers[None], len(opening), axis=0)
@@ -68,8 +56,8 @@ def _swept(gripper: GripperShape, opening: Numbers) -> Boxes:
     return placed - way, half + way
 
 
-def _between(gripper: GripperShape, opening: Numbers) -> Boxes:
-    """One box between the fingers, as wide as the widest opening of any: where nothing else may be when they close."""
+def _build_grip_box(gripper: GripperShape, opening: Numbers) -> Boxes:
+    """Build one box between the fingers, at the widest opening of any grasp, which nothing else may enter."""
     low = (gripper.finger_centers - gripper.finger_half_sizes).min(axis=0)
     high = (gripper.finger_centers + gripper.finger_half_sizes).max(axis=0)
     center, half = (low + high) / 2, (high - low) / 2
@@ -77,19 +65,19 @@ def _between(gripper: GripperShape, opening: Numbers) -> Boxes:
     return np.broadcast_to(center, (len(opening), 1, 3)), half[None]
 
 
-def _above_table(grasps: Grasps, boxes: Boxes) -> Mask:
-    """Whether the lowest corner of every box is above the table, and the gripper does not come from below."""
+def _is_above_table(grasps: Grasps, boxes: Boxes) -> Mask:
+    """Test whether the lowest corner of every box is above the table."""
     centers, half = boxes
     down = grasps.rotations[:, 2]
     middle = grasps.positions[:, 2, None] + np.einsum("nbk,nk->nb", centers, down)
-    free: Mask = (middle - np.abs(down) @ half.T >= TABLE_M).all(axis=1)
+    free: Mask = (middle - np.abs(down) @ half.T >= TABLE_CLEARANCE_M).all(axis=1)
     return free
 
 
-def _holds_points(grasps: Grasps, boxes: Boxes, points: Points) -> Mask:
-    """Whether any of the points lies in any of the boxes. In float32: 1e-8 m at a metre decides nothing here."""
+def _contains_points(grasps: Grasps, boxes: Boxes, points: Points) -> Mask:
+    """Test whether any point lies in any box. Uses float32: 1e-8 m at a meter is negligible here."""
     centers, half = (part.astype(np.float32) for part in boxes)
-    half = half + np.float32(OWN_M)
+    half = half + np.float32(SELF_CLEARANCE_M)
     rows = np.ascontiguousarray(points.T.astype(np.float32))
     turned = grasps.rotations.transpose(0, 2, 1).astype(np.float32)
     origin = np.einsum("nij,nj->ni", turned, grasps.positions.astype(np.float32))
@@ -103,8 +91,8 @@ def _holds_points(grasps: Grasps, boxes: Boxes, points: Points) -> Mask:
     return inside
 
 
-def _touches_piece(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> Mask:
-    """Whether a convex piece meets any box, by the axes of both; what passes only edge to edge counts as touching."""
+def _collides_with_piece(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> Mask:
+    """Test whether a convex piece meets any box; passing edge to edge counts as touching."""
     centers, half = boxes
     low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
@@ -113,12 +101,12 @@ def _touches_piece(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> Mask:
     near = (np.einsum("nbk,nbk->nb", outside, outside) <= radius**2).any(axis=1)
     touching = np.zeros(len(grasps), dtype=bool)
     index = np.flatnonzero(near)
-    touching[index] = _overlaps(grasps.chosen(index.astype(np.int32)), (centers[index], half), piece)
+    touching[index] = _overlaps_boxes(grasps.chosen(index.astype(np.int32)), (centers[index], half), piece)
     return touching
 
 
-def _overlaps(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> Mask:
-    """The separating axis test of every grasp's boxes and a piece, without the axes across two edges."""
+def _overlaps_boxes(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> Mask:
+    """Run the separating axis test of every grasp's boxes and a piece, without edge-edge axes."""
     centers, half = boxes
     corners = piece.vertices[piece.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

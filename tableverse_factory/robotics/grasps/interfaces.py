@@ -1,4 +1,4 @@
-"""The door behind which grasps are found, and what every answer goes through: room for the gripper."""
+"""Grasp models by name, and the clearance test that all proposed grasps pass."""
 
 from collections.abc import Iterable
 from typing import Protocol
@@ -9,90 +9,100 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Points, TriangleMesh
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, placed_mesh
-from tableverse_factory.geometry.relations.antipodal import surface_points
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, place_mesh
+from tableverse_factory.geometry.relations.antipodal import sample_inward_normals
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.scene_objects import SceneObject
-from tableverse_factory.physics.mjcf.shape import shape_of
-from tableverse_factory.robotics.grasps.antipodal import sample
-from tableverse_factory.robotics.grasps.clearance import clear
-from tableverse_factory.robotics.grasps.closing import closed
-from tableverse_factory.robotics.grasps.remote import ask
+from tableverse_factory.physics.mjcf.shape import make_body_shape
+from tableverse_factory.robotics.grasps.antipodal import sample_antipodal_grasps
+from tableverse_factory.robotics.grasps.clearance import find_clear_grasps
+from tableverse_factory.robotics.grasps.closing import close_grasps
+from tableverse_factory.robotics.grasps.remote import request_grasps
 from tableverse_factory.robotics.robots.arm import Arm
 
-_OWN_POINTS = 1000
+_MESH_POINTS = 1000
 _PIECE_POINTS = 500
 
 
 class GraspModel(Protocol):
-    """Says how a gripper could take hold of a thing if nothing else were there."""
+    """Proposes grasps of an isolated object."""
 
     def __call__(
-        self, thing: SceneObject, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
+        self,
+        target: SceneObject,
+        arm: Arm,
+        config: TrajectoriesConfig,
+        rng: np.random.Generator,
+        services: Services,
     ) -> Grasps:
-        """Grasps of the thing as it stands, table frame, with widths and scores.
+        """Propose grasps in the table frame, with widths and scores.
 
         Raises:
-            ModelError: if a model does not answer, or not what it should.
+            ModelError: if a model does not answer, or its answer is invalid.
         """
         ...
 
 
-def antipodal(
-    thing: SceneObject,
+def propose_antipodal(
+    target: SceneObject,
     arm: Arm,
     config: TrajectoriesConfig,
     rng: np.random.Generator,
     services: Services,  # noqa: ARG001
 ) -> Grasps:
-    """Pairs of contacts on the mesh (`grasps.antipodal`)."""
-    center = transform_points(thing.pose, shape_of(thing.mesh, thing.hulls, 1.0).moments.center[None])[0]
-    return sample(thing.standing, _felt(thing), arm.shape, arm.max_opening_m, center, config, rng)
+    """Sample pairs of contacts on the mesh (`grasps.antipodal`)."""
+    center = transform_points(target.pose, make_body_shape(target.mesh, target.hulls, 1.0).moments.center[None])[0]
+    return sample_antipodal_grasps(
+        target.standing, _merge_pieces(target), arm.shape, arm.max_opening_m, center, config, rng
+    )
 
 
-def graspgen(
-    thing: SceneObject,
+def propose_graspgen(
+    target: SceneObject,
     arm: Arm,
     config: TrajectoriesConfig,
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,
 ) -> Grasps:
-    """What a server says of the mesh (`grasps.remote`), closed on the pieces."""
-    return closed(ask(thing.standing, config, services), _felt(thing), arm.shape, arm.max_opening_m)
+    """Request grasps from a server (`grasps.remote`), closed on the pieces."""
+    return close_grasps(
+        request_grasps(target.standing, config, services),
+        _merge_pieces(target),
+        arm.shape,
+        arm.max_opening_m,
+    )
 
 
-GRASP_MODELS: dict[str, GraspModel] = {"antipodal": antipodal, "graspgen": graspgen}
+GRASP_MODELS: dict[str, GraspModel] = {"antipodal": propose_antipodal, "graspgen": propose_graspgen}
 
 
-def grasps_of(
-    thing: SceneObject,
+def propose_grasps(
+    target: SceneObject,
     others: Iterable[SceneObject],
     arm: Arm,
     config: TrajectoriesConfig,
     rng: np.random.Generator,
     services: Services,
 ) -> Grasps:
-    """Grasps of a thing that have room among others; which of them to try first is `grasps.arbitration`'s to say.
-
-    They are not arbitrated here: where none of a stage can be reached either, the next stage has its turn.
+    """Propose grasps of an object that leave the gripper clear of the others, not yet arbitrated.
 
     Raises:
         ModelError: see `GraspModel`.
     """
-    found = GRASP_MODELS[config.grasp_model](thing, arm, config, rng, services)
-    pieces = [placed_mesh(hull, other.pose) for other in others for hull in other.hulls]
-    room = clear(found, arm.shape, arm.max_opening_m, _own_points(thing), pieces)
+    found = GRASP_MODELS[config.grasp_model](target, arm, config, rng, services)
+    pieces = [place_mesh(hull, other.pose) for other in others for hull in other.hulls]
+    room = find_clear_grasps(found, arm.shape, arm.max_opening_m, _sample_surface(target), pieces)
     return found.chosen(np.flatnonzero(room).astype(np.int32))
 
 
-def _felt(thing: SceneObject) -> TriangleMesh:
-    """The convex pieces as they stand, as one mesh."""
-    return placed_mesh(concatenate_meshes(thing.hulls), thing.pose)
+def _merge_pieces(target: SceneObject) -> TriangleMesh:
+    """Merge the convex pieces, in the table frame, into one mesh."""
+    return place_mesh(concatenate_meshes(target.hulls), target.pose)
 
 
-def _own_points(thing: SceneObject) -> Points:
-    """Points of the surface, and of the pieces that a simulation feels in its place."""
-    pieces = [placed_mesh(hull, thing.pose) for hull in thing.hulls]
+def _sample_surface(target: SceneObject) -> Points:
+    """Sample points of the surface and of the convex pieces, which a simulation collides instead."""
+    pieces = [place_mesh(hull, target.pose) for hull in target.hulls]
     each = max(_PIECE_POINTS // max(len(pieces), 1), 16)
-    shares = [(thing.standing, _OWN_POINTS), *((piece, each) for piece in pieces)]
-    return np.concatenate([surface_points(mesh, count)[0] for mesh, count in shares])
+    shares = [(target.standing, _MESH_POINTS), *((piece, each) for piece in pieces)]
+    return np.concatenate([sample_inward_normals(mesh, count)[0] for mesh, count in shares])

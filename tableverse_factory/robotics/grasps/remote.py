@@ -1,4 +1,4 @@
-"""Grasps from a server that runs GraspGen or GraspGenX, in a small protocol of our own over HTTP.
+"""Client for a GraspGen or GraspGenX server, over a small JSON protocol.
 
 The request is a POST of JSON to `<grasp_url>/grasps`:
 
@@ -12,7 +12,6 @@ with the gripper's base in the frame of the points, by GraspGen's published conv
 """
 
 import json
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,39 +22,34 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Points, TriangleMesh, Vector3
 from schemas.trajectories import Grasps
 from tableverse_factory.core.errors import AnswerInvalidError
-from tableverse_factory.geometry.relations.antipodal import surface_points
-from tableverse_factory.models.remote.answers import AnswerCache, answer_key
+from tableverse_factory.geometry.relations.antipodal import sample_inward_normals
+from tableverse_factory.models.remote.answers import AnswerCache, compute_answer_key
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import ChatCompletion, HttpRequest, Message, Usage
+from tableverse_factory.models.remote.exchange import ChatCompletion, Message, Usage
 from tableverse_factory.models.remote.http import post_json
 from tableverse_factory.models.services import Services
 
 FORMAT = "tableverse-grasps-1"
 POINTS = 2048
-COUNT = 256
-"""Grasps that are asked for."""
-MAX_COUNT = 4096
-"""An answer with more is refused."""
-MAX_DISTANCE_M = 2.0
-"""Of a gripper's base from the centroid."""
-REPAIRED = 1e-2
-"""Rotations this far from orthonormal, in any entry of `R'R - 1`, are made so; others are refused."""
+COUNT = 256  # number of grasps requested
+MAX_COUNT = 4096  # maximum number of grasps accepted
+MAX_DISTANCE_M = 2.0  # maximum distance of a gripper's base from the centroid
+ROTATION_TOLERANCE = 1e-2
+"""Rotations within this of orthonormal, in every entry of `R'R - 1`, are orthonormalized; others are refused."""
 
 _GRIPPER_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Our gripper frame (y closing, z approach) in theirs (x closing, z approach)."""
 
 
-def ask(mesh: TriangleMesh, config: TrajectoriesConfig, services: Services) -> Grasps:
-    """What the server says of a body as it stands, table frame; widths are 0, for it says none.
-
-    An answer that can be read is kept on disk by what was asked: the same body in the same pose is asked about once.
+def request_grasps(mesh: TriangleMesh, config: TrajectoriesConfig, services: Services) -> Grasps:
+    """Request grasps of a body, table frame, with widths 0; valid answers are cached on disk by request.
 
     Raises:
-        ModelAccessError: if a person must act: the server refuses to be asked, or the disk to keep answers.
-        AnswerInvalidError: if its answer is none.
-        ModelError: if it does not answer.
+        ModelAccessError: if a person must act: the server refuses access, or the cache cannot be written.
+        AnswerInvalidError: if the answer is invalid.
+        ModelError: if the server does not answer.
     """
-    points, _ = surface_points(mesh, POINTS)
+    points, _ = sample_inward_normals(mesh, POINTS)
     centroid = points.mean(axis=0)
     question = {
         "format": FORMAT,
@@ -63,76 +57,78 @@ def ask(mesh: TriangleMesh, config: TrajectoriesConfig, services: Services) -> G
         "count": COUNT,
         "points": np.round(points - centroid, 6).tolist(),
     }
-    return _grasps(_answer(question, config, services), centroid, config.grasp_depth_m)
+    return _convert_grasps(_fetch_answer(question, config, services), centroid, config.grasp_depth_m)
 
 
-def _answer(question: Mapping[str, Any], config: TrajectoriesConfig, services: Services) -> Mapping[str, Any]:
-    """The JSON object of the server, or the one that is kept."""
+def _fetch_answer(question: Mapping[str, Any], config: TrajectoriesConfig, services: Services) -> Mapping[str, Any]:
+    """Return the server's JSON object, or the cached one."""
     endpoint = Endpoint("grasps", config.grasp_url, config.grasp_gripper, timeout_s=config.grasp_timeout_s)
     cache = AnswerCache(services.cache_dir)
-    key = answer_key(endpoint, (Message("user", json.dumps(question)),), {})
+    key = compute_answer_key(endpoint, (Message("user", json.dumps(question)),), {})
     kept = cache.get(key)
     if kept is not None:
         body: Mapping[str, Any] = json.loads(kept.text)
         return body
     cache.check()
-    deadline = time.monotonic() + endpoint.timeout_s
-    request = HttpRequest(f"{endpoint.base_url.rstrip('/')}/grasps", question)
-    body = post_json(endpoint, request, {}, deadline, lambda _: "")
-    _checked(body)
+    body = post_json(endpoint, "grasps", question)
+    _check_answer(body)
     cache.put(key, ChatCompletion(json.dumps({name: body[name] for name in ("grasps", "scores")}), Usage()))
     return body
 
 
-def _checked(body: Mapping[str, Any]) -> tuple[Float64[np.ndarray, "n 4 4"], Float64[np.ndarray, " n"]]:
-    """The grasps and scores of an answer, rotations made orthonormal.
+def _check_answer(body: Mapping[str, Any]) -> tuple[Float64[np.ndarray, "n 4 4"], Float64[np.ndarray, " n"]]:
+    """Return grasps and scores of an answer, with orthonormal rotations.
 
     Raises:
-        AnswerInvalidError: `grasps_invalid` saying what is wrong.
+        AnswerInvalidError: `grasps_invalid`.
     """
-    poses, scores = _numbers(body, "grasps"), _numbers(body, "scores")
+    poses, scores = _read_numbers(body, "grasps"), _read_numbers(body, "scores")
     if not poses.size:
         poses = poses.reshape(0, 4, 4)
     if scores.ndim != 1 or poses.shape != (len(scores), 4, 4):
-        raise _invalid(f"grasps of shape {poses.shape} and scores of shape {scores.shape}; give (n, 4, 4) and (n,)")
+        raise _invalid_answer(
+            f"grasps of shape {poses.shape} and scores of shape {scores.shape}; give (n, 4, 4) and (n,)"
+        )
     if len(scores) > MAX_COUNT:
-        raise _invalid(f"{len(scores)} grasps; at most {MAX_COUNT} are taken")
-    if np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > REPAIRED:
-        raise _invalid("a matrix whose last row is not 0 0 0 1: give them row by row, translations in the last column")
+        raise _invalid_answer(f"{len(scores)} grasps; at most {MAX_COUNT} are taken")
+    if np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > ROTATION_TOLERANCE:
+        raise _invalid_answer(
+            "a matrix whose last row is not 0 0 0 1: give them row by row, translations in the last column"
+        )
     if (farthest := np.abs(poses[:, :3, 3]).max(initial=0.0)) > MAX_DISTANCE_M:
-        raise _invalid(f"a gripper {farthest:.3g} m from the points; give metres, at most {MAX_DISTANCE_M:g}")
+        raise _invalid_answer(f"a gripper {farthest:.3g} m from the points; give metres, at most {MAX_DISTANCE_M:g}")
     rotations = poses[:, :3, :3]
     error = np.abs(np.einsum("nji,njk->nik", rotations, rotations) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-    wrong = np.flatnonzero((error > REPAIRED) | (np.linalg.det(rotations) <= 0.0))
+    wrong = np.flatnonzero((error > ROTATION_TOLERANCE) | (np.linalg.det(rotations) <= 0.0))
     if len(wrong):
-        raise _invalid(f"{len(wrong)} matrices whose rotation is none, the first is number {wrong[0]}")
+        raise _invalid_answer(f"{len(wrong)} matrices whose rotation is none, the first is number {wrong[0]}")
     left, _, right = np.linalg.svd(rotations)
     poses[:, :3, :3] = left @ right
     return poses, scores
 
 
-def _numbers(body: Mapping[str, Any], name: str) -> np.ndarray:
+def _read_numbers(body: Mapping[str, Any], name: str) -> np.ndarray:
     if name not in body:
-        raise _invalid(f"no {name!r}")
+        raise _invalid_answer(f"no {name!r}")
     try:
         values = np.array(body[name])
     except (ValueError, OverflowError) as error:
-        raise _invalid(f"{name!r} is ragged, or a number in it is too large") from error
+        raise _invalid_answer(f"{name!r} is ragged, or a number in it is too large") from error
     if values.size and values.dtype.kind not in "if":
-        raise _invalid(f"{name!r} holds what is no number")
+        raise _invalid_answer(f"{name!r} holds what is no number")
     values = values.astype(np.float64)
     if not np.isfinite(values).all():
-        raise _invalid(f"{name!r} holds NaN or infinity")
+        raise _invalid_answer(f"{name!r} holds NaN or infinity")
     return values
 
 
-def _invalid(what: str) -> AnswerInvalidError:
+def _invalid_answer(what: str) -> AnswerInvalidError:
     return AnswerInvalidError(f"the grasp server answers {what}", "grasps_invalid")
 
 
-def _grasps(body: Mapping[str, Any], centroid: Vector3, depth_m: float) -> Grasps:
-    """From the base frames of the server's gripper about the centroid to our own at the TCP, table frame."""
-    poses, scores = _checked(body)
+def _convert_grasps(body: Mapping[str, Any], centroid: Vector3, depth_m: float) -> Grasps:
+    """Convert base frames about the centroid to TCP frames in the table frame."""
+    poses, scores = _check_answer(body)
     rotations = poses[:, :3, :3] @ _GRIPPER_AXES
     positions: Points = poses[:, :3, 3] + centroid + depth_m * rotations[:, :, 2]
     return Grasps(rotations, positions, np.zeros(len(scores)), scores)

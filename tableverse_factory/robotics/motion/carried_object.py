@@ -6,7 +6,7 @@ from schemas.geometry import Frozen, Pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Carried(Frozen):
+class CarriedObject(Frozen):
     """An object between the fingers, which follows the TCP.
 
     Attributes:

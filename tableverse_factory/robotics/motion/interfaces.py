@@ -1,4 +1,4 @@
-"""The door to motion planners: a joint path between two configurations, or none."""
+"""Motion planner interface and planners by name."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -6,29 +6,27 @@ from typing import Protocol
 import numpy as np
 
 from schemas.trajectories import JointPath, JointVector
-from tableverse_factory.robotics.motion.curobo import Curobo
+from tableverse_factory.robotics.motion.curobo import CuroboPlanner
 from tableverse_factory.robotics.motion.rrt import RrtConnect
-from tableverse_factory.robotics.motion.world import Space, World
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 
 
 class Planner(Protocol):
-    """Finds joint paths. Deterministic in what it is given, and bounded by counts."""
+    """Deterministic joint path planner, bounded by counts."""
 
-    def path(self, start: JointVector, goal: JointVector, space: Space, rng: np.random.Generator) -> JointPath | None:
-        """Corners of a path from start to goal that is free in `space`, both ends included; None where none was found.
+    def plan_path(
+        self, start: JointVector, goal: JointVector, space: CollisionSpace, rng: np.random.Generator
+    ) -> JointPath | None:
+        """Plan corners of a path that is free in `space`, both ends included, or return None.
 
-        Args:
-            start: Shape (j,) [rad].
-            goal: Shape (j,) [rad].
-            space: What counts as free; the path is checked against it again, whoever made it.
-            rng: The only source of chance.
+        The path is checked against `space` again; `rng` is the only source of randomness.
         """
         ...
 
-    def fallbacks(self, world: World) -> tuple[str, ...]:
-        """What it settles for in this scene where it cannot see it as it is, in words; nothing as a rule."""
+    def list_fallbacks(self, world: CollisionWorld) -> tuple[str, ...]:
+        """List approximations the planner makes of this scene, in words."""
         ...
 
 
-PLANNERS: dict[str, Callable[[], Planner]] = {"rrt": RrtConnect, "curobo": Curobo}
-"""By the name in `trajectories.planner`."""
+PLANNERS: dict[str, Callable[[], Planner]] = {"rrt": RrtConnect, "curobo": CuroboPlanner}
+"""Planners by the name in `trajectories.planner`."""

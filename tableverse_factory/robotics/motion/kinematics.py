@@ -1,4 +1,4 @@
-"""Where the gripper is for joint angles, and joint angles for where the gripper shall be.
+"""Batched forward and inverse kinematics of serial arms.
 
 A chain is read off a compiled model and then evaluated with numpy alone, for many configurations at once: a batch of
 sixteen costs little more than one. The inverse is damped least squares (Levenberg-Marquardt with damping that shrinks
@@ -19,32 +19,28 @@ from tableverse_factory.geometry.math.transforms import matrix_from_pose
 Configurations = Float64[np.ndarray, "b j"]
 Rotations = Float64[np.ndarray, "b 3 3"]
 Positions = Float64[np.ndarray, "b 3"]
-
 POSITION_TOLERANCE_M = 1e-6
 ROTATION_TOLERANCE_RAD = 1e-5
 LIMIT_MARGIN_RAD = 0.02
-"""Solutions keep this far from the joint limits: a servo that overshoots does not run into its stop."""
+"""Distance of solutions from joint limits, so that a servo that overshoots does not run into its stop."""
 MAX_ITERATIONS = 40
 LINE_ITERATIONS = 8
 MAX_STEP_RAD = 0.6
 RESTARTS = 24
-DISTINCT_RAD = 0.25
-"""Two solutions are one where no joint differs by more."""
-MAX_JUMP_RAD = 0.25
-"""Along a line, a joint that moves more between two neighbouring poses has changed its branch."""
-_ROTATION_WEIGHT_M = 0.3
-"""A radian of error weighs as much as this many metres: about the reach over which it is felt."""
+DISTINCT_RAD = 0.25  # solutions whose joints all differ by less are duplicates
+MAX_JUMP_RAD = 0.25  # largest motion of a joint between neighboring poses of a line; a larger one is a change of branch
+_ROTATION_WEIGHT_M = 0.3  # A radian of error weighs as much as this many meters, about the lever over which it acts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chain(Frozen):
-    """A serial arm from its base to the TCP.
+class KinematicChain(Frozen):
+    """Serial arm from its base to the TCP.
 
     Attributes:
         offsets: From the frame after joint i-1 to the frame of joint i at rest. Shape (j, 4, 4) [m].
         axes: Axis of each joint in its own frame. Shape (j, 3).
         hinges: Whether a joint turns; the others slide. Shape (j,).
-        references: Value of each joint in which the model was drawn. Shape (j,) [rad or m].
+        references: Joint values of the model's reference configuration. Shape (j,) [rad or m].
         lower: Shape (j,) [rad or m].
         upper: Shape (j,) [rad or m].
         tip: From the frame after the last joint to the TCP. Shape (4, 4) [m].
@@ -61,12 +57,12 @@ class Chain(Frozen):
     turns: Float64[np.ndarray, "3 j 3 3"]
 
     def forward(self, q: Configurations) -> tuple[Rotations, Positions]:
-        """Orientation and position of the TCP. Shapes (b, 3, 3) and (b, 3) [m]."""
+        """Compute orientation and position of the TCP. Shapes (b, 3, 3) and (b, 3) [m]."""
         rotation, position, _, _ = self._frames(q)
         return rotation, position
 
     def pose_matrix(self, q: JointVector) -> Matrix4:
-        """The TCP in the base frame. Shape (4, 4)."""
+        """Compute the TCP in the base frame. Shape (4, 4)."""
         rotation, position = self.forward(q[None])
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation[0], position[0]
@@ -75,7 +71,7 @@ class Chain(Frozen):
     def _frames(
         self, q: Configurations
     ) -> tuple[Rotations, Positions, Float64[np.ndarray, "b j 3"], Float64[np.ndarray, "b j 3"]]:
-        """TCP, and each joint's axis and anchor in the base frame."""
+        """Compute the TCP, and each joint's axis and anchor in the base frame."""
         moved = q - self.references
         angle = np.where(self.hinges, moved, 0.0)[:, :, None, None]
         local = self.turns[0] + np.sin(angle) * self.turns[1] + (1 - np.cos(angle)) * self.turns[2]
@@ -95,16 +91,13 @@ class Chain(Frozen):
     def step(
         self, q: Configurations, target: Matrix4, pull: Configurations
     ) -> tuple[Configurations, Bool[np.ndarray, " b"]]:
-        """One damped step towards a pose, and which configurations are there already.
+        """Take one damped step towards a TCP pose in the base frame; also return which configurations have arrived.
 
-        Args:
-            q: Shape (b, j).
-            target: TCP in the base frame. Shape (4, 4).
-            pull: Where joints go as far as the pose leaves them free. Shape (b, j).
+        `pull` is where joints go as far as the pose leaves them free. Shapes (b, j), (4, 4) and (b, j).
         """
         rotation, position, axes, anchors = self._frames(q)
         off = target[:3, 3] - position
-        turn = _rotation_vectors(target[:3, :3] @ rotation.transpose(0, 2, 1))
+        turn = _compute_rotation_vectors(target[:3, :3] @ rotation.transpose(0, 2, 1))
         there = (np.abs(off).max(axis=1) < POSITION_TOLERANCE_M) & (np.abs(turn).max(axis=1) < ROTATION_TOLERANCE_RAD)
         error = np.concatenate([off, _ROTATION_WEIGHT_M * turn], axis=1)
         jacobian = self._jacobian(position, axes, anchors)
@@ -128,56 +121,50 @@ class Chain(Frozen):
         return jacobian
 
 
-def chain_of(
+def build_chain(
     model: mujoco.MjModel,
     joint_names: tuple[str, ...],
     base_body: int,
     tcp_site: int,
     limits: tuple[JointVector, JointVector],
-) -> Chain:
-    """The chain from a body to a site of a compiled model, through these joints alone.
+) -> KinematicChain:
+    """Build the chain from a body to a site of a compiled model, through the named hinges or slides.
 
-    Args:
-        model: Compiled.
-        joint_names: From the base outwards, hinges or slides.
-        base_body: Whose frame the chain starts in.
-        tcp_site: Where it ends.
-        limits: Lowest and highest values of the joints; `Arm` knows them, the model's ranges may be wider than what
-            actuators can be told. Both of shape (j,) [rad or m].
+    `limits` are the arm's, as the model's ranges may exceed the actuators' [rad or m].
 
     Raises:
         ValueError: if the joints do not lie, in this order, between the base and the site.
     """
     wanted = [model.joint(name).id for name in joint_names]
     offsets, found, pending = [], [], np.eye(4)
-    for body in _bodies_between(model, base_body, int(model.site_bodyid[tcp_site])):
-        pending = pending @ _matrix(model.body_pos[body], model.body_quat[body])
+    for body in _find_bodies_between(model, base_body, int(model.site_bodyid[tcp_site])):
+        pending = pending @ _build_matrix(model.body_pos[body], model.body_quat[body])
         first = model.body_jntadr[body]
         for joint in range(first, first + model.body_jntnum[body]):
             if joint in wanted:
-                anchor = _matrix(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
+                anchor = _build_matrix(model.jnt_pos[joint], np.array([1.0, 0.0, 0.0, 0.0]))
                 offsets.append(pending @ anchor)
                 pending = np.linalg.inv(anchor)
                 found.append(joint)
     if found != wanted:
         raise ValueError(f"the joints {joint_names} do not lead, in this order, from the arm's base to its TCP")
-    tip = pending @ _matrix(model.site_pos[tcp_site], model.site_quat[tcp_site])
-    return _chain(model, np.array(found), np.array(offsets), tip, limits)
+    tip = pending @ _build_matrix(model.site_pos[tcp_site], model.site_quat[tcp_site])
+    return _assemble_chain(model, np.array(found), np.array(offsets), tip, limits)
 
 
-def _chain(
+def _assemble_chain(
     model: mujoco.MjModel,
     joints: np.ndarray,
     offsets: np.ndarray,
     tip: Matrix4,
     limits: tuple[JointVector, JointVector],
-) -> Chain:
+) -> KinematicChain:
     axes = np.array(model.jnt_axis[joints], dtype=np.float64)
     skew = np.zeros((len(joints), 3, 3))
     skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -axes[:, 2], axes[:, 1], -axes[:, 0]
     skew = skew - skew.transpose(0, 2, 1)
     at_rest = offsets[:, :3, :3]
-    return Chain(
+    return KinematicChain(
         offsets=offsets,
         axes=axes,
         hinges=model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_HINGE,
@@ -189,20 +176,14 @@ def _chain(
     )
 
 
-def solutions(chain: Chain, tcp_in_base: Pose, near: JointVector, count: int) -> Configurations:
-    """Up to `count` distinct configurations whose TCP is at a pose, best first.
+def solve_ik(chain: KinematicChain, tcp_in_base: Pose, near: JointVector, count: int) -> Configurations:
+    """Find up to `count` distinct configurations within limits that reach a pose, best first. Shape (n, j) [rad].
 
-    Good is near to `near` and far from the limits. None within the limits: shape (0, j).
-
-    Args:
-        chain: The arm.
-        tcp_in_base: In the robot's base frame.
-        near: Preferred configuration, the first seed. Shape (j,) [rad].
-        count: How many at most.
+    Solutions are ranked by closeness to `near`, which is also the first seed, and by distance from the limits.
     """
     target = matrix_from_pose(tcp_in_base)
     lower, upper = chain.lower + LIMIT_MARGIN_RAD, chain.upper - LIMIT_MARGIN_RAD
-    q = np.concatenate([np.clip(near, lower, upper)[None], _restarts(lower, upper)])
+    q = np.concatenate([np.clip(near, lower, upper)[None], _generate_restarts(lower, upper)])
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     done: list[JointVector] = []
     for iteration in range(MAX_ITERATIONS):
@@ -217,21 +198,16 @@ def solutions(chain: Chain, tcp_in_base: Pose, near: JointVector, count: int) ->
     found = np.array(done)
     closeness = (((found - middle) / half) ** 4).sum(axis=1)
     ranked = found[np.argsort(((found - near) ** 2).sum(axis=1) + closeness, kind="stable")]
-    return _distinct(ranked)[:count]
+    return _drop_duplicates(ranked)[:count]
 
 
-def follow(
-    chain: Chain, start: Configurations, tcp_in_base: Sequence[Pose]
+def follow_poses(
+    chain: KinematicChain, start: Configurations, tcp_in_base: Sequence[Pose]
 ) -> tuple[Float64[np.ndarray, "n b j"], Int64[np.ndarray, " b"]]:
-    """Configurations along a row of close poses, each from the one before.
-
-    Args:
-        chain: The arm.
-        start: At the pose before the first. Shape (b, j) [rad].
-        tcp_in_base: Poses a few millimetres apart.
+    """Track a sequence of poses, a few millimeters apart, from configurations at the pose before the first.
 
     Returns:
-        The configurations, and how many of them each of the b reached within the limits and without a jump.
+        The configurations, and how many poses each of the b reached within the limits and without a jump.
     """
     lower, upper = chain.lower + LIMIT_MARGIN_RAD / 2, chain.upper - LIMIT_MARGIN_RAD / 2
     rows = np.empty((len(tcp_in_base), *start.shape))
@@ -254,8 +230,8 @@ def follow(
     return rows, reached
 
 
-def _restarts(lower: JointVector, upper: JointVector) -> Configurations:
-    """Points of an additive recurrence: as even as random points are not, and the same for ever."""
+def _generate_restarts(lower: JointVector, upper: JointVector) -> Configurations:
+    """Generate points of an additive recurrence: evenly spread and deterministic."""
     ratio = 2.0
     for _ in range(64):
         ratio = (1 + ratio) ** (1 / (len(lower) + 1))
@@ -265,7 +241,7 @@ def _restarts(lower: JointVector, upper: JointVector) -> Configurations:
     return spread
 
 
-def _distinct(ranked: Configurations) -> Configurations:
+def _drop_duplicates(ranked: Configurations) -> Configurations:
     kept = [ranked[0]]
     for q in ranked[1:]:
         if min(float(np.abs(q - other).max()) for other in kept) > DISTINCT_RAD:
@@ -273,8 +249,8 @@ def _distinct(ranked: Configurations) -> Configurations:
     return np.array(kept)
 
 
-def _rotation_vectors(rotations: Rotations) -> Positions:
-    """Axis times angle of each rotation matrix. Shape (b, 3) [rad]."""
+def _compute_rotation_vectors(rotations: Rotations) -> Positions:
+    """Compute axis times angle of each rotation matrix. Shape (b, 3) [rad]."""
     m = rotations
     twice = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1)
     sine = np.sqrt((twice**2).sum(axis=1)) / 2
@@ -283,7 +259,7 @@ def _rotation_vectors(rotations: Rotations) -> Positions:
     return np.where(sine[:, None] < 1e-9, twice / 2, vectors)
 
 
-def _bodies_between(model: mujoco.MjModel, base: int, last: int) -> list[int]:
+def _find_bodies_between(model: mujoco.MjModel, base: int, last: int) -> list[int]:
     row: list[int] = []
     while last not in (base, 0):
         row.append(last)
@@ -291,5 +267,5 @@ def _bodies_between(model: mujoco.MjModel, base: int, last: int) -> list[int]:
     return row[::-1]
 
 
-def _matrix(position: Vector3, quaternion_wxyz: np.ndarray) -> Matrix4:
+def _build_matrix(position: Vector3, quaternion_wxyz: np.ndarray) -> Matrix4:
     return matrix_from_pose(Pose(np.array(position, dtype=np.float64), np.array(quaternion_wxyz, dtype=np.float64)))

@@ -1,16 +1,16 @@
-"""One object taken at one pose of the TCP and let go at another: what may touch what in each phase.
+"""Pick-and-place task: allowed contacts in each phase between a grasp and a release.
 
-| phase | looked at | may touch |
+| phase | checked | may touch |
 |---|---|---|
 | pre-grasp | arm, open fingers | nothing, at the planning margin |
 | grasp (approach) | arm, open fingers | nothing: fingers that touch the object before they close would push it |
-| post-grasp (lift) | arm, holding fingers, the object | the object what it touches where it stands, no deeper |
+| post-grasp (lift) | arm, holding fingers, the object | the object its initial contacts, no deeper |
 | pre-place | the same | nothing, at the planning margin |
-| place (lowering) | the same | the object what it touches where it is let go, at 0 mm |
-| post-place | arm, open fingers; the object stands where it was let go | nothing |
+| place (lowering) | the same | the object its contacts at the release, at 0 mm |
+| post-place | arm, open fingers; the object where it was released | nothing |
 
-The fingers and the hand that hold it are not looked at against the carried object; the hand is against the same
-object in the approach, at the same relative pose.
+Contacts of the carried object with the holding fingers and hand are ignored; the hand is checked against the object in
+the approach, at the same relative pose.
 """
 
 from dataclasses import dataclass, replace
@@ -19,32 +19,26 @@ import numpy as np
 
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointVector
-from tableverse_factory.geometry.math.transforms import compose, inverse, translated
-from tableverse_factory.robotics.motion.carried_object import Carried
-from tableverse_factory.robotics.motion.world import EXACT_M, Pair, Space, World
-from tableverse_factory.robotics.robots.gripper_clearance import openings
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, translate_pose
+from tableverse_factory.robotics.motion.carried_object import CarriedObject
+from tableverse_factory.robotics.motion.world import CONTACT_TOLERANCE_M, CollisionSpace, CollisionWorld, Pair
+from tableverse_factory.robotics.robots.gripper_clearance import compute_approach_openings
 
-LINE_MARGIN_M = 0.0003
-"""On straight lines near things: what the blend and the servos' steps may stray without touching."""
-RESTING_GAP_M = 0.0006
-"""What is nearer than this to the carried object where it stands is touched by it [m]."""
+LINE_MARGIN_M = 0.0003  # clearance on straight lines near objects, for deviations of the blend and of the servos' steps
+RESTING_GAP_M = 0.0006  # objects nearer than this to the carried object count as its contacts [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Handling(Frozen):
-    """An object, the two poses of the TCP, and the collision spaces that follow from them.
+class PickPlace(Frozen):
+    """An object, two TCP poses in the table frame, and the collision spaces that follow from them.
 
     Attributes:
-        world: Robot and scene.
-        object_id: What is taken.
-        tcp_grasp: Where, in the table frame.
-        tcp_place: Where it is let go, in the table frame.
-        width_m: Distance between the fingers that hold it [m].
-        taken: Pairs of the object that may touch in the lift, and how deep at most [m].
-        released: The same in the lowering.
+        width_m: Distance between the fingers that hold the object [m].
+        taken: Pairs of the object that may touch in the lift, with their maximum depth [m].
+        released: The same for the lowering.
     """
 
-    world: World
+    world: CollisionWorld
     object_id: str
     tcp_grasp: Pose
     tcp_place: Pose
@@ -53,59 +47,59 @@ class Handling(Frozen):
     released: tuple[tuple[Pair, float], ...] = ()
 
     @property
-    def carried(self) -> Carried:
-        """The object as it hangs in the gripper."""
+    def carried(self) -> CarriedObject:
+        """The object as held in the gripper."""
         standing = self.world.object_pose(self.object_id)
-        return Carried(self.object_id, compose(inverse(self.tcp_grasp), standing))
+        return CarriedObject(self.object_id, compose_poses(invert_pose(self.tcp_grasp), standing))
 
     def openings(self) -> tuple[float, ...]:
-        """Distances between open fingers that are tried: just wider than the object, then as wide as can be [m]."""
+        """Return openings to try: just wider than the object, then the widest [m]."""
         widest = self.world.station.arm.max_opening_m
-        usual = float(openings(np.array([self.width_m]), widest)[0])
+        usual = float(compute_approach_openings(np.array([self.width_m]), widest)[0])
         return (usual, widest) if usual < widest else (widest,)
 
-    def reaching(self, opening_m: float, margin_m: float) -> Space:
-        """With open fingers, the scene as exported."""
+    def reaching_space(self, opening_m: float, margin_m: float) -> CollisionSpace:
+        """Return free space with open fingers and the scene as exported."""
         return self.world.space(opening_m, margin_m=margin_m)
 
-    def lifting(self, margin_m: float) -> Space:
-        """With the object in the gripper, which may touch what it touches where it stands."""
-        return self._holding(margin_m, self.taken)
+    def lifting_space(self, margin_m: float) -> CollisionSpace:
+        """Return free space with the object held, its initial contacts allowed."""
+        return self._holding_space(margin_m, self.taken)
 
-    def carrying(self, margin_m: float) -> Space:
-        """With the object in the gripper, which touches nothing."""
-        return self._holding(margin_m, ())
+    def carrying_space(self, margin_m: float) -> CollisionSpace:
+        """Return free space with the object held, no contact allowed."""
+        return self._holding_space(margin_m, ())
 
-    def lowering(self, margin_m: float) -> Space:
-        """With the object in the gripper, which may touch what it touches where it is let go."""
-        return self._holding(margin_m, self.released)
+    def lowering_space(self, margin_m: float) -> CollisionSpace:
+        """Return free space with the object held, its contacts at the release allowed."""
+        return self._holding_space(margin_m, self.released)
 
-    def leaving(self, opening_m: float, margin_m: float) -> Space:
-        """With open fingers, the object where it was let go."""
-        placed = compose(self.tcp_place, self.carried.object_to_tcp)
+    def leaving_space(self, opening_m: float, margin_m: float) -> CollisionSpace:
+        """Return free space with open fingers and the object where it was released."""
+        placed = compose_poses(self.tcp_place, self.carried.object_to_tcp)
         return self.world.space(opening_m, margin_m=margin_m, standing={self.object_id: placed})
 
-    def depth_at(self, q: JointVector) -> float:
-        """How deep the object is in something at a configuration, nothing being forgiven; at least 0 [m]."""
-        return max(0.0, -min(self._touched(q).values(), default=0.0))
+    def compute_depth_at(self, q: JointVector) -> float:
+        """Compute the object's deepest penetration at a configuration, allowing none; at least 0 [m]."""
+        return max(0.0, -min(self._find_contacts(q).values(), default=0.0))
 
-    def raised(self, height_m: float) -> "Handling":
-        """Let go this much higher."""
-        return replace(self, tcp_place=translated(self.tcp_place, np.array([0.0, 0.0, height_m])))
+    def raise_release(self, height_m: float) -> "PickPlace":
+        """Return the task with a higher release."""
+        return replace(self, tcp_place=translate_pose(self.tcp_place, np.array([0.0, 0.0, height_m])))
 
-    def taken_at(self, q: JointVector) -> "Handling":
-        """With leave to touch, while lifted, whatever it touches at a configuration of the grasp, as deep as there."""
-        pairs = {pair: min(depth, 0.0) for pair, depth in self._touched(q).items()}
+    def allow_grasp_contacts(self, q: JointVector) -> "PickPlace":
+        """Allow, while lifting, the object's contacts at a grasp configuration, as deep as there."""
+        pairs = {pair: min(depth, 0.0) for pair, depth in self._find_contacts(q).items()}
         return replace(self, taken=tuple(sorted(pairs.items())))
 
-    def released_at(self, q: JointVector) -> "Handling":
-        """With leave to touch, while lowered, whatever it touches at a configuration of the release, at 0 mm."""
-        pairs = {pair: 0.0 for pair, depth in self._touched(q).items() if depth >= -EXACT_M}
+    def allow_release_contacts(self, q: JointVector) -> "PickPlace":
+        """Allow, while lowering, the object's contacts at a release configuration, at 0 mm."""
+        pairs = {pair: 0.0 for pair, depth in self._find_contacts(q).items() if depth >= -CONTACT_TOLERANCE_M}
         return replace(self, released=tuple(sorted(pairs.items())))
 
-    def _holding(self, margin_m: float, resting: tuple[tuple[Pair, float], ...]) -> Space:
+    def _holding_space(self, margin_m: float, resting: tuple[tuple[Pair, float], ...]) -> CollisionSpace:
         return self.world.space(self.width_m, margin_m=margin_m, carried=self.carried, resting=dict(resting))
 
-    def _touched(self, q: JointVector) -> dict[Pair, float]:
-        space = self.carrying(RESTING_GAP_M)
-        return self.world.pairs_of(self.object_id, self.world.touching(space, q))
+    def _find_contacts(self, q: JointVector) -> dict[Pair, float]:
+        space = self.carrying_space(RESTING_GAP_M)
+        return self.world.select_object_pairs(self.object_id, self.world.find_contacts(space, q))

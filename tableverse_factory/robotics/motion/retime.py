@@ -1,4 +1,4 @@
-"""When to be where on a curve: as fast as velocity, acceleration and torque allow, from rest to rest (TOPP-RA).
+"""Time-optimal path parameterization under velocity, acceleration and torque limits (TOPP-RA).
 
 Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis" (T-RO 2018), in the
 authors' package `toppra`.
@@ -21,21 +21,20 @@ from toppra.interpolator import AbstractGeometricPath
 
 from schemas.geometry import Frozen
 from schemas.trajectories import JointPath, JointVector
-from tableverse_factory.robotics.motion.dynamics import Dynamics
+from tableverse_factory.robotics.motion.dynamics import ArmDynamics
 from tableverse_factory.robotics.robots.arm import Arm
 
 logging.getLogger("toppra").setLevel(logging.ERROR)
 
-TORQUE_SHARE = 0.9
-"""Of the drives' torque that a motion may plan with: the rest is for the servos to follow it."""
+TORQUE_SHARE = 0.9  # share of the drives' torque available to planning; the remainder is for tracking
 POINTS_PER_KNOT = 3
 MIN_POINTS = 60
-_SLACK = 0.98
+_LIMIT_SHARE = 0.98
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Timed(Frozen):
-    """A curve sampled at a constant step, at rest at both ends.
+class TimedCurve(Frozen):
+    """Curve sampled at a constant step, at rest at both ends.
 
     Attributes:
         positions: Shape (t, j) [rad].
@@ -48,8 +47,8 @@ class Timed(Frozen):
     places: Float64[np.ndarray, " t"]
 
 
-class _Curve(AbstractGeometricPath):  # type: ignore[misc]
-    """A spline as the package wants it."""
+class _SplinePath(AbstractGeometricPath):  # type: ignore[misc]
+    """Spline in toppra's path interface."""
 
     def __init__(self, curve: BSpline) -> None:
         self._parts = (curve, curve.derivative(1), curve.derivative(2))
@@ -68,18 +67,14 @@ class _Curve(AbstractGeometricPath):  # type: ignore[misc]
         return np.array([knots[0], knots[-1]])
 
 
-def retimed(curve: BSpline, arm: Arm, dynamics: Dynamics, speed: float, step_s: float) -> Timed | None:
-    """Samples of the fastest motion along a curve that holds all limits; None where there is none.
+def retime_curve(curve: BSpline, arm: Arm, dynamics: ArmDynamics, speed: float, step_s: float) -> TimedCurve | None:
+    """Sample the fastest motion along a twice differentiable curve [rad] that holds all limits; None if there is none.
 
-    Args:
-        curve: Joints over its parameter, twice differentiable [rad].
-        arm: Whose limits hold.
-        dynamics: With what the arm carries.
-        speed: Share of the arm's velocity and acceleration that is used.
-        step_s: Time between samples; the motion is stretched to a whole number of them [s].
+    `speed` is the usable share of the arm's velocity and acceleration. The motion is stretched to whole steps of
+    `step_s`.
     """
-    path, grid = _Curve(curve), _grid(curve)
-    velocity, acceleration = speed * _SLACK * arm.max_velocity, speed * _SLACK * arm.max_acceleration
+    path, grid = _SplinePath(curve), _choose_gridpoints(curve)
+    velocity, acceleration = speed * _LIMIT_SHARE * arm.max_velocity, speed * _LIMIT_SHARE * arm.max_acceleration
     torque = TORQUE_SHARE * arm.max_torque
     limits = [
         JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
@@ -87,17 +82,20 @@ def retimed(curve: BSpline, arm: Arm, dynamics: Dynamics, speed: float, step_s: 
             np.stack([-acceleration, acceleration], axis=1), discretization_scheme=DiscretizationType.Interpolation
         ),
         JointTorqueConstraint(
-            dynamics.torques, np.stack([-torque, torque], axis=1), np.zeros(len(torque)), DiscretizationType.Collocation
+            dynamics.compute_torques,
+            np.stack([-torque, torque], axis=1),
+            np.zeros(len(torque)),
+            DiscretizationType.Collocation,
         ),
     ]
     _, rates, _ = TOPPRA(limits, path, gridpoints=grid, solver_wrapper="seidel").compute_parameterization(0.0, 0.0)
     if rates is None or not np.isfinite(rates).all():
         return None
-    return _sampled(path, grid, np.asarray(rates), speed * arm.max_velocity, speed * arm.max_acceleration, step_s)
+    return _sample_motion(path, grid, np.asarray(rates), speed * arm.max_velocity, speed * arm.max_acceleration, step_s)
 
 
-def _grid(curve: BSpline) -> Float64[np.ndarray, " n"]:
-    """Where the limits are looked at: a few points in every piece of the curve, more at its ends, where it is slow."""
+def _choose_gridpoints(curve: BSpline) -> Float64[np.ndarray, " n"]:
+    """Choose where limits are checked: a few points per piece, more at the slow ends."""
     breaks = np.unique(curve.t)
     per_piece = max(POINTS_PER_KNOT, int(np.ceil(MIN_POINTS / (len(breaks) - 1))))
     inner = np.interp(np.arange((len(breaks) - 1) * per_piece + 1) / per_piece, np.arange(len(breaks)), breaks)
@@ -108,20 +106,22 @@ def _grid(curve: BSpline) -> Float64[np.ndarray, " n"]:
     )
 
 
-def _sampled(
-    path: _Curve,
+def _sample_motion(
+    path: _SplinePath,
     grid: Float64[np.ndarray, " n"],
     rates: Float64[np.ndarray, " n"],
     max_velocity: JointVector,
     max_acceleration: JointVector,
     step_s: float,
-) -> Timed | None:
-    """Samples of the motion that passes the grid at these rates, each piece at a constant rate of change."""
+) -> TimedCurve | None:
+    """Sample the motion that passes the grid at these rates, each piece at a constant rate of change."""
     mean = (rates[1:] + rates[:-1]) / 2
     if (mean <= 0.0).any():
         return None
     times = np.concatenate([[0.0], np.cumsum(np.diff(grid) / mean)])
-    count = int(np.ceil(times[-1] / step_s * _stretch(path, grid, rates, max_velocity, max_acceleration) - 1e-9))
+    count = int(
+        np.ceil(times[-1] / step_s * _compute_stretch(path, grid, rates, max_velocity, max_acceleration) - 1e-9)
+    )
     scale = times[-1] / (count * step_s)
     at = np.arange(count + 1) * step_s * scale
     piece = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(mean) - 1)
@@ -132,17 +132,17 @@ def _sampled(
     rate = rates[piece] + change[piece] * since
     velocities = path(places, 1) * (rate * scale)[:, None]
     velocities[[0, -1]] = 0.0
-    return Timed(path(places), velocities, places)
+    return TimedCurve(path(places), velocities, places)
 
 
-def _stretch(
-    path: _Curve,
+def _compute_stretch(
+    path: _SplinePath,
     grid: Float64[np.ndarray, " n"],
     rates: Float64[np.ndarray, " n"],
     max_velocity: JointVector,
     max_acceleration: JointVector,
 ) -> float:
-    """How much longer the motion has to take for what happens between the points of the grid; 1 where nothing does."""
+    """Compute the stretch needed for violations between the grid's points; 1 without any."""
     share = np.linspace(0.0, 1.0, 5)
     change = (rates[1:] ** 2 - rates[:-1] ** 2) / (2 * np.diff(grid))
     places = (grid[:-1, None] + np.diff(grid)[:, None] * share).ravel()

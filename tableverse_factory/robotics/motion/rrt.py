@@ -1,24 +1,22 @@
-"""Collision-free joint paths: RRT-Connect (Kuffner and LaValle 2000), then shortcuts.
+"""Collision-free joint paths by RRT-Connect (Kuffner and LaValle 2000) and shortcutting.
 
-Bounds are counts and never clocks, and all chance comes from the `rng` that is given: the same world and seed, the
-same path.
+Bounds are counts, not clocks, and `rng` is the only source of randomness: same world and seed, same path.
 """
 
 import numpy as np
 
 from schemas.trajectories import JointPath, JointVector
-from tableverse_factory.robotics.motion.world import Space, World
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 
 EDGE_STEP_RAD = 0.02
-"""Largest motion of any joint between two checks while planning; the finished motion is looked at more finely."""
-EXTENSION_RAD = 0.4
-"""Longest branch of a tree, as the largest motion of any joint."""
+"""Largest motion of any joint between two checks while planning; the finished motion is checked more finely."""
+EXTENSION_RAD = 0.4  # longest branch of a tree, as the largest motion of any joint
 MAX_BRANCHES = 1500
 SHORTCUTS = 40
 
 
 class _Tree:
-    """Configurations, each with the one it was reached from; the first is the root."""
+    """Configurations with their parents; the first is the root."""
 
     def __init__(self, root: JointVector) -> None:
         self.parents = [0]
@@ -48,38 +46,35 @@ class _Tree:
 
 
 class RrtConnect:
-    """The planner that runs anywhere."""
+    """CPU planner without dependencies."""
 
-    def path(self, start: JointVector, goal: JointVector, space: Space, rng: np.random.Generator) -> JointPath | None:
-        """Corners of a free path with both ends, or None where none was found within the bound.
-
-        Args:
-            start: Shape (j,) [rad].
-            goal: Shape (j,) [rad].
-            space: What counts as free.
-            rng: The only source of chance.
-        """
-        if not space.free(start) or not space.free(goal):
+    def plan_path(
+        self, start: JointVector, goal: JointVector, space: CollisionSpace, rng: np.random.Generator
+    ) -> JointPath | None:
+        """Plan corners of a free path, both ends included, or return None within the bound."""
+        if not space.is_free(start) or not space.is_free(goal):
             return None
-        if space.free_edge(start, goal, EDGE_STEP_RAD):
+        if space.is_edge_free(start, goal, EDGE_STEP_RAD):
             return np.array([start, goal])
-        found = _connect(start, goal, space, rng)
-        return None if found is None else shortened(found, space, rng)
+        found = _connect_trees(start, goal, space, rng)
+        return None if found is None else shorten_path(found, space, rng)
 
-    def fallbacks(self, world: World) -> tuple[str, ...]:  # noqa: ARG002
-        """Nothing: it asks the scene's own collision check."""
+    def list_fallbacks(self, world: CollisionWorld) -> tuple[str, ...]:  # noqa: ARG002
+        """Return none: collisions are checked on the scene itself."""
         return ()
 
 
-def _connect(start: JointVector, goal: JointVector, space: Space, rng: np.random.Generator) -> JointPath | None:
+def _connect_trees(
+    start: JointVector, goal: JointVector, space: CollisionSpace, rng: np.random.Generator
+) -> JointPath | None:
     chain = space.world.chain
     trees = (_Tree(start), _Tree(goal))
     growing = 0
     while sum(len(tree.parents) for tree in trees) < MAX_BRANCHES and growing < 4 * MAX_BRANCHES:
         tree, other = trees[growing % 2], trees[1 - growing % 2]
-        tip = _extend(tree, rng.uniform(chain.lower, chain.upper), space)
+        tip = _extend_tree(tree, rng.uniform(chain.lower, chain.upper), space)
         if tip is not None:
-            met = _reach(other, tree.at(tip), space)
+            met = _grow_to(other, tree.at(tip), space)
             if met is not None:
                 rows = (tree.to_root(tip)[::-1], other.to_root(met)[1:])
                 row = rows[0] + rows[1] if growing % 2 == 0 else rows[1][::-1] + rows[0][::-1]
@@ -88,30 +83,30 @@ def _connect(start: JointVector, goal: JointVector, space: Space, rng: np.random
     return None
 
 
-def _extend(tree: _Tree, towards: JointVector, space: Space) -> int | None:
-    """A new branch of bounded length towards a configuration; None where it is blocked."""
+def _extend_tree(tree: _Tree, towards: JointVector, space: CollisionSpace) -> int | None:
+    """Grow a branch of bounded length towards a configuration; None where it is blocked."""
     near = tree.nearest(towards)
     start = tree.at(near).copy()
     share = EXTENSION_RAD / max(float(np.abs(towards - start).max()), EXTENSION_RAD)
     goal = start + share * (towards - start)
-    if not space.free(goal) or not space.free_edge(start, goal, EDGE_STEP_RAD):
+    if not space.is_free(goal) or not space.is_edge_free(start, goal, EDGE_STEP_RAD):
         return None
     return tree.add(goal, near)
 
 
-def _reach(tree: _Tree, goal: JointVector, space: Space) -> int | None:
-    """Branches towards a configuration until it is reached; None where something is in the way."""
+def _grow_to(tree: _Tree, goal: JointVector, space: CollisionSpace) -> int | None:
+    """Grow branches until a configuration is reached; None where an obstacle is in the way."""
     while True:
-        tip = _extend(tree, goal, space)
+        tip = _extend_tree(tree, goal, space)
         if tip is None:
             return None
         if np.array_equal(tree.at(tip), goal):
             return tip
 
 
-def shortened(path: JointPath, space: Space, rng: np.random.Generator) -> JointPath:
-    """The same ends with fewer and nearer corners: straight lines between random points of the path, where free."""
-    corners = _without_detours(path, space)
+def shorten_path(path: JointPath, space: CollisionSpace, rng: np.random.Generator) -> JointPath:
+    """Shortcut a path by free straight lines between random points of it."""
+    corners = _skip_corners(path, space)
     for _ in range(SHORTCUTS):
         if len(corners) < 3:
             break
@@ -121,15 +116,15 @@ def shortened(path: JointPath, space: Space, rng: np.random.Generator) -> JointP
         first, last = np.searchsorted(marks, (low, high), side="right") - 1
         if first == last:
             continue
-        ends = [_at(corners, marks, value) for value in (low, high)]
+        ends = [_interpolate_path(corners, marks, value) for value in (low, high)]
         direct = float(np.abs(ends[1] - ends[0]).max())
-        if direct < 0.999 * (high - low) and space.free_edge(ends[0], ends[1], EDGE_STEP_RAD):
+        if direct < 0.999 * (high - low) and space.is_edge_free(ends[0], ends[1], EDGE_STEP_RAD):
             corners = np.array([*corners[: first + 1], *ends, *corners[last + 1 :]])
-    return _without_detours(corners, space)
+    return _skip_corners(corners, space)
 
 
-def _without_detours(path: JointPath, space: Space) -> JointPath:
-    """From each corner straight to the farthest one that can be seen from it."""
+def _skip_corners(path: JointPath, space: CollisionSpace) -> JointPath:
+    """Connect each corner to the farthest one in free straight view."""
     kept, at = [path[0]], 0
     while at < len(path) - 1:
         ahead = next(k for k in range(len(path) - 1, at, -1) if k == at + 1 or _sees(path[at], path[k], space))
@@ -138,11 +133,11 @@ def _without_detours(path: JointPath, space: Space) -> JointPath:
     return np.array(kept)
 
 
-def _sees(start: JointVector, goal: JointVector, space: Space) -> bool:
-    return space.free_edge(start, goal, EDGE_STEP_RAD)
+def _sees(start: JointVector, goal: JointVector, space: CollisionSpace) -> bool:
+    return space.is_edge_free(start, goal, EDGE_STEP_RAD)
 
 
-def _at(corners: JointPath, marks: np.ndarray, value: float) -> JointVector:
+def _interpolate_path(corners: JointPath, marks: np.ndarray, value: float) -> JointVector:
     index = min(int(np.searchsorted(marks, value, side="right")) - 1, len(corners) - 2)
     share = (value - marks[index]) / max(marks[index + 1] - marks[index], 1e-12)
     point: JointVector = corners[index] + share * (corners[index + 1] - corners[index])

@@ -1,10 +1,9 @@
-"""Robot and scene as one collision world: which configurations touch what, in each phase of a motion.
+"""Collision world of robot and scene: which configurations touch what, in each phase of a motion.
 
-The world is the station's own compiled model, copied: planner and simulator see the same shapes, the scene as its
-convex pieces. MuJoCo's broad and narrow phase do the work; masks see to it that only pairs with something that moves
-are looked at, so a check costs some ten microseconds. All stands in the table frame: the obstacles are where the
-simulator has them, and it is the goals of the inverse kinematics that are mapped into the robot's base frame
-(`World.in_base`); a planner that wants the obstacles there maps them itself (`motion.curobo`).
+The world is a copy of the station's compiled model, so planner and simulator share shapes, the scene as its convex
+pieces. MuJoCo's broad and narrow phase do the work; masks restrict it to pairs with a moving geom, so a check takes
+some ten microseconds. All poses are in the table frame; only goals of the inverse kinematics are mapped into the
+robot's base frame (`CollisionWorld.in_base`). Planners that need obstacles there map them themselves (`motion.curobo`).
 """
 
 import copy
@@ -17,67 +16,57 @@ import numpy as np
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointPath, JointVector
 from tableverse_factory.geometry.math.transforms import (
-    compose,
-    inverse,
+    compose_poses,
+    invert_pose,
     pose_from_matrix,
 )
 from tableverse_factory.physics.mjcf.spec import TABLE
-from tableverse_factory.robotics.motion.carried_object import Carried
-from tableverse_factory.robotics.motion.dynamics import Dynamics
-from tableverse_factory.robotics.motion.kinematics import chain_of
+from tableverse_factory.robotics.motion.carried_object import CarriedObject
+from tableverse_factory.robotics.motion.dynamics import ArmDynamics
+from tableverse_factory.robotics.motion.kinematics import build_chain
 from tableverse_factory.robotics.robots.station import Station
 
-Pair = tuple[int, int]
-"""Two geoms by their ids, ascending."""
-
-EXACT_M = 1e-5
-"""Below this depth a touch is the collision routine's own error [m]."""
-
+Pair = tuple[int, int]  # two geom ids, ascending
+CONTACT_TOLERANCE_M = 1e-5  # penetration below this is the collision routine's own error [m]
 _MOVING, _SELF, _HELD, _HELD_ROBOT = 1, 2, 4, 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Space:
-    """What counts as free in one phase of a motion. Made by `World.space`; the allowances are written there.
+class CollisionSpace:
+    """Free space in one phase of a motion, made by `CollisionWorld.space`.
 
     Attributes:
-        world: Which it is a view of.
+        world: The world it is a view of.
         opening_m: Distance between the fingers [m].
-        margin_m: Least distance from the arm, and from what it carries, to the scene [m].
-        carried: What is between the fingers; its pairs with the gripper are not looked at.
-        standing: Objects that stand elsewhere than in the exported scene, by id.
-        resting: Pairs of the carried object that may touch, and how deep at most: as where it was taken or is let go.
+        margin_m: Minimum distance of the arm and its payload from the scene [m].
+        carried: Object between the fingers; its pairs with the gripper are ignored.
+        standing: Poses of objects that are not where they were exported, by id.
+        resting: Pairs of the carried object that may touch, with their maximum depth.
     """
 
-    world: "World"
+    world: "CollisionWorld"
     opening_m: float
     margin_m: float = 0.0
-    carried: Carried | None = None
+    carried: CarriedObject | None = None
     standing: Mapping[str, Pose] = field(default_factory=dict)
     resting: Mapping[Pair, float] = field(default_factory=dict)
 
-    def free(self, q: JointVector) -> bool:
-        """Whether nothing is nearer than it may be at a configuration. Shape of `q`: (j,) [rad]."""
+    def is_free(self, q: JointVector) -> bool:
+        """Test whether all distances are respected at a configuration."""
         return self.world.is_free(self, q)
 
-    def free_edge(self, start: JointVector, goal: JointVector, step_rad: float) -> bool:
-        """Whether a straight line in joint space is free, its ends taken to be; looked at from coarse to fine.
-
-        Args:
-            start: Shape (j,) [rad].
-            goal: Shape (j,) [rad].
-            step_rad: Largest motion of any joint between two checks [rad].
-        """
+    def is_edge_free(self, start: JointVector, goal: JointVector, step_rad: float) -> bool:
+        """Test a line in joint space between free ends, coarse to fine, in joint steps of at most `step_rad`."""
         count = int(np.ceil(float(np.abs(goal - start).max()) / step_rad))
-        return all(self.free(start + (goal - start) * (k / count)) for k in _coarse_to_fine(count))
+        return all(self.is_free(start + (goal - start) * (k / count)) for k in _order_coarse_to_fine(count))
 
-    def first_hit(self, path: JointPath) -> int | None:
-        """Index of the first configuration of a row that is not free."""
-        return next((index for index, q in enumerate(path) if not self.free(q)), None)
+    def find_first_collision(self, path: JointPath) -> int | None:
+        """Return the index of the first configuration that is not free."""
+        return next((index for index, q in enumerate(path) if not self.is_free(q)), None)
 
 
-class World:
-    """A station at one base, to be asked for collisions.
+class CollisionWorld:
+    """Station at one base, for collision queries.
 
     Attributes:
         station: The scene and the arm.
@@ -85,11 +74,11 @@ class World:
         base: The arm's base in the table frame.
         dynamics: Of the arm alone.
         table_geom: Id of the slab, if there is one of that name.
-        unseen: Objects without any convex piece: no plan can avoid them, none is made.
+        unseen: Objects without any convex piece, which cannot be avoided: no motion is planned beside them.
     """
 
     def __init__(self, station: Station, base: Pose | None = None) -> None:
-        """Copies the station's model, with its base at `base`; by default where the station has it now."""
+        """Copy the station's model, with its base at `base`, by default its present one."""
         self.station = station
         self.base = station.base if base is None else base
         self._model: mujoco.MjModel = copy.copy(station.model)
@@ -98,27 +87,27 @@ class World:
         self._data = mujoco.MjData(self._model)
         self._exported = np.array(station.model.qpos0)
         limits = (station.arm.lower, station.arm.upper)
-        self.chain = chain_of(self._model, _joint_names(station), station.base_body, station.tcp_site, limits)
+        self.chain = build_chain(self._model, _list_joint_names(station), station.base_body, station.tcp_site, limits)
         self._joints = _as_slice(station.joint_qpos)
-        self._masks = _Masks.of(station)
+        self._masks = _CollisionMasks.of(station)
         solid = set(self._model.geom_bodyid[self._masks.solid].tolist())
         self.unseen = tuple(name for name, body in station.object_bodies.items() if body not in solid)
-        self.dynamics = Dynamics(station.arm)
+        self.dynamics = ArmDynamics(station.arm)
         table = mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_GEOM, TABLE)
         self.table_geom: int | None = table if table >= 0 else None
-        self._current: Space | None = None
+        self._current: CollisionSpace | None = None
         self._turn = np.empty((3, 4))
 
     def in_base(self, tcp: Pose) -> Pose:
-        """A pose of the table frame in the robot's base frame: T_base⁻¹ · T (paper, appendix D)."""
-        return compose(inverse(self.base), tcp)
+        """Map a pose of the table frame into the robot's base frame: T_base⁻¹ · T (paper, appendix D)."""
+        return compose_poses(invert_pose(self.base), tcp)
 
     def tcp(self, q: JointVector) -> Pose:
-        """The TCP in the table frame."""
-        return compose(self.base, pose_from_matrix(self.chain.pose_matrix(q)))
+        """Compute the TCP in the table frame."""
+        return compose_poses(self.base, pose_from_matrix(self.chain.pose_matrix(q)))
 
     def object_pose(self, object_id: str) -> Pose:
-        """Where an object stands in the exported scene."""
+        """Return an object's exported pose."""
         at = self.station.object_qpos[object_id]
         return Pose(self._exported[at : at + 3].copy(), self._exported[at + 3 : at + 7].copy())
 
@@ -127,35 +116,35 @@ class World:
         opening_m: float,
         *,
         margin_m: float = 0.0,
-        carried: Carried | None = None,
+        carried: CarriedObject | None = None,
         standing: Mapping[str, Pose] | None = None,
         resting: Mapping[Pair, float] | None = None,
-    ) -> Space:
-        """What is free with the fingers at this opening; the rest as `Space` says.
+    ) -> CollisionSpace:
+        """Make a collision space.
 
-        Always looked at: the arm with itself (at no margin), the arm with the scene, the carried object with the scene
-        and with the arm but for the gripper that holds it. An object that is not carried is an obstacle for all of the
-        arm, also the one to be grasped: open fingers that touch it would push it.
+        Always checked: the arm with itself (without margin), the arm with the scene, and the carried object with the
+        scene and with the arm except its gripper. An object that is not carried, also the one to be grasped, is an
+        obstacle for the whole arm: open fingers that touch it would push it.
         """
-        return Space(self, opening_m, margin_m, carried, standing or {}, resting or {})
+        return CollisionSpace(self, opening_m, margin_m, carried, standing or {}, resting or {})
 
-    def is_free(self, space: Space, q: JointVector) -> bool:
-        """Whether nothing is nearer than the space allows at a configuration."""
-        self._touch(space, q)
+    def is_free(self, space: CollisionSpace, q: JointVector) -> bool:
+        """Test whether all distances of a space are respected at a configuration."""
+        self._compute_contacts(space, q)
         data = self._data
         if data.ncon == 0:
             return True
         distances = data.contact.dist
         if space.margin_m == 0.0 and not space.resting:
-            return float(distances.min()) >= -EXACT_M
+            return float(distances.min()) >= -CONTACT_TOLERANCE_M
         return all(
-            distance >= self._least(space, first, second)
+            distance >= self._allowed_distance(space, first, second)
             for (first, second), distance in zip(data.contact.geom.tolist(), distances.tolist(), strict=True)
         )
 
-    def touching(self, space: Space, q: JointVector) -> dict[Pair, float]:
-        """Signed distance [m] of each pair within the margin at a configuration, the deepest of its contacts."""
-        self._touch(space, q)
+    def find_contacts(self, space: CollisionSpace, q: JointVector) -> dict[Pair, float]:
+        """Return the least signed distance [m] of each pair within the margin at a configuration."""
+        self._compute_contacts(space, q)
         found: dict[Pair, float] = {}
         for (first, second), distance in zip(
             self._data.contact.geom.tolist(), self._data.contact.dist.tolist(), strict=True
@@ -164,12 +153,12 @@ class World:
             found[pair] = min(distance, found.get(pair, np.inf))
         return found
 
-    def depth(self, space: Space, q: JointVector) -> float:
-        """How deep the deepest pair is at a configuration; 0 where nothing touches [m]."""
-        return max(0.0, -min(self.touching(space, q).values(), default=0.0))
+    def compute_depth(self, space: CollisionSpace, q: JointVector) -> float:
+        """Compute the deepest penetration at a configuration; 0 without contact [m]."""
+        return max(0.0, -min(self.find_contacts(space, q).values(), default=0.0))
 
-    def pairs_of(self, object_id: str, pairs: Mapping[Pair, float]) -> dict[Pair, float]:
-        """Those of an object with the scene, not with the arm."""
+    def select_object_pairs(self, object_id: str, pairs: Mapping[Pair, float]) -> dict[Pair, float]:
+        """Select pairs of an object with the scene, not with the arm."""
         body, owner, robot = self.station.object_bodies[object_id], self._model.geom_bodyid, self._masks.robot
         return {
             pair: distance
@@ -177,37 +166,36 @@ class World:
             if body in owner[list(pair)] and not robot[list(pair)].any()
         }
 
-    def blocked_by(self, space: Space, q: JointVector) -> str:
-        """What is too near, for people: the two bodies and their distance; empty where all is free."""
-        for (first, second), distance in sorted(self.touching(space, q).items(), key=lambda item: item[1]):
-            if distance < self._least(space, first, second):
+    def describe_collision(self, space: CollisionSpace, q: JointVector) -> str:
+        """Describe the worst violation by its two bodies and their distance; empty where all is free."""
+        for (first, second), distance in sorted(self.find_contacts(space, q).items(), key=lambda item: item[1]):
+            if distance < self._allowed_distance(space, first, second):
                 names = [self._model.body(self._model.geom_bodyid[geom]).name or "world" for geom in (first, second)]
                 return f"{names[0]} and {names[1]}: {1000 * distance:.1f} mm"
         return ""
 
-    def _least(self, space: Space, first: int, second: int) -> float:
-        """Smallest signed distance that a pair may have [m]."""
+    def _allowed_distance(self, space: CollisionSpace, first: int, second: int) -> float:
+        """Return the smallest signed distance that a pair may have [m]."""
         robot = self._masks.robot
         if robot[first] and robot[second]:
-            return -EXACT_M
+            return -CONTACT_TOLERANCE_M
         depth = space.resting.get((min(first, second), max(first, second)))
         if depth is not None:
-            return min(depth, 0.0) - EXACT_M
-        return space.margin_m if space.margin_m > 0.0 else -EXACT_M
+            return min(depth, 0.0) - CONTACT_TOLERANCE_M
+        return space.margin_m if space.margin_m > 0.0 else -CONTACT_TOLERANCE_M
 
-    def _touch(self, space: Space, q: JointVector) -> None:
-        """Contacts of everything that the space looks at."""
+    def _compute_contacts(self, space: CollisionSpace, q: JointVector) -> None:
         if space is not self._current:
-            self._enter(space)
+            self._switch_space(space)
         model, data = self._model, self._data
         data.qpos[self._joints] = q
         mujoco.mj_kinematics(model, data)
         if space.carried is not None:
-            self._carry(space.carried)
+            self._place_carried(space.carried)
             mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
 
-    def _carry(self, carried: Carried) -> None:
+    def _place_carried(self, carried: CarriedObject) -> None:
         data, site, turn = self._data, self.station.tcp_site, self._turn
         at, hang = self.station.object_qpos[carried.object_id], carried.object_to_tcp
         mujoco.mju_mat2Quat(turn[0], data.site_xmat[site])
@@ -216,8 +204,8 @@ class World:
         data.qpos[at : at + 3] = data.site_xpos[site] + turn[2, :3]
         data.qpos[at + 3 : at + 7] = turn[1]
 
-    def _enter(self, space: Space) -> None:
-        """Sets fingers, objects, masks and margins."""
+    def _switch_space(self, space: CollisionSpace) -> None:
+        """Set fingers, objects, masks and margins."""
         model, data, station = self._model, self._data, self.station
         data.qpos[:] = self._exported
         data.qpos[station.finger_qpos] = station.arm.finger_positions(space.opening_m)
@@ -230,8 +218,8 @@ class World:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Masks(Frozen):
-    """Which geoms belong to what. Each of shape (ngeom,)."""
+class _CollisionMasks(Frozen):
+    """Geom masks by role. Each of shape (ngeom,)."""
 
     solid: np.ndarray
     robot: np.ndarray
@@ -239,7 +227,7 @@ class _Masks(Frozen):
     gripper: np.ndarray
 
     @classmethod
-    def of(cls, station: Station) -> "_Masks":
+    def of(cls, station: Station) -> "_CollisionMasks":
         model = station.model
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
         body = model.geom_bodyid
@@ -249,7 +237,7 @@ class _Masks(Frozen):
         return cls(solid, robot & solid, moving & solid, np.isin(body, _below(model, hand)) & solid)
 
     def apply(self, model: mujoco.MjModel, held: int | None, margin_m: float) -> None:
-        """Writes the masks and margins into a model; geoms that touch nothing in the simulation touch nothing here."""
+        """Write masks and margins into a model; geoms without contacts in the simulation stay without here."""
         own = np.zeros(model.ngeom, dtype=bool) if held is None else self.solid & (model.geom_bodyid == held)
         scene = self.solid & ~self.robot & ~own
         contype = _MOVING * self.moving + _SELF * self.robot + (_HELD | _HELD_ROBOT) * own
@@ -263,8 +251,8 @@ class _Masks(Frozen):
             model.body_margin[body] = max(model.geom_margin[geoms], default=0.0)
 
 
-def _coarse_to_fine(count: int) -> list[int]:
-    """1 to count - 1: the middle first, then the quarters, and so on; a wall is found with few checks."""
+def _order_coarse_to_fine(count: int) -> list[int]:
+    """Order 1 to count - 1 as middle, quarters, and so on, so that walls are found with few checks."""
     order: list[int] = []
     seen = {0, count}
     stride = count
@@ -275,14 +263,14 @@ def _coarse_to_fine(count: int) -> list[int]:
     return order
 
 
-def _joint_names(station: Station) -> tuple[str, ...]:
+def _list_joint_names(station: Station) -> tuple[str, ...]:
     model = station.model
     by_address = {int(address): model.joint(joint).name for joint, address in enumerate(model.jnt_qposadr)}
     return tuple(by_address[int(address)] for address in station.joint_qpos)
 
 
 def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
-    """The same addresses as a slice where they are in a row: half the time of writing there."""
+    """Convert consecutive addresses to a slice, which halves the time of writing there."""
     first = int(indices[0])
     return slice(first, first + len(indices)) if (np.diff(indices) == 1).all() else indices
 

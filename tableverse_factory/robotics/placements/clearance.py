@@ -1,12 +1,12 @@
-"""Whether things keep clear of one another (paper, section 3.4).
+"""Clearance between placed objects (paper, section 3.4).
 
-The paper joins its two conditions, |Δx| ≥ b_x + b'_x + ε and |Δy| ≥ b_y + b'_y + ε, by *and*. Boxes are apart as soon
-as one of them holds; taken at its word, the rule would forbid everything straight to the left of something, for there
-Δy is 0. We ask for one of the two. Heights do not count, for what stands on the table has the whole column above it to
-itself, hands come from there; but an object that is put on or into another may reach out over something lower by ε.
+The paper joins its conditions |Δx| ≥ b_x + b'_x + ε and |Δy| ≥ b_y + b'_y + ε by *and*. Boxes are apart as soon as one
+of them holds; taken literally, the rule would forbid everything straight to the left of a reference, where Δy is 0. One
+of the two is required here. Heights do not count on the table, where hands come from above; an object that is put on or
+into another may reach over a lower one by ε.
 
-Boxes are wide around what lies aslant, and a crowded table then has no room at all. Where they leave too little, convex
-outlines seen from above have to be ε apart instead; such places come last and say so (`Placement.clear_by`).
+Boxes overestimate objects that stand at an angle and may leave no room on a crowded table. There, convex outlines seen
+from above have to be ε apart instead; such placements come last and are marked (`Placement.clear_by`).
 """
 
 from collections.abc import Sequence
@@ -14,21 +14,17 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from tableverse_factory.geometry.relations.relations import BodyFeatures, outline_gap
+from tableverse_factory.geometry.relations.relations import BodyFeatures, measure_outline_gap
 
 Corners = Float64[np.ndarray, "n 3"]
 
 
-def box_gaps(
+def compute_box_gaps(
     low: Corners, high: Corners, others: Sequence[BodyFeatures], over_lower: bool = False
 ) -> Float64[np.ndarray, "n m"]:
-    """Gap of each box to each body's box along the axis on which they are furthest apart; negative where they meet.
+    """Compute the gap of each box to each body's box along the axis of largest separation; negative where they overlap.
 
-    Args:
-        low: Lowest corners of the boxes. Shape (n, 3) [m].
-        high: Highest corners. Shape (n, 3) [m].
-        others: m bodies.
-        over_lower: Whether a box that lies above a body counts as apart from it by the height between.
+    With `over_lower`, a box above a body is separated from it by the height between. `low` and `high` are corners [m].
     """
     if not others:
         return np.zeros((len(low), 0))
@@ -40,19 +36,19 @@ def box_gaps(
     return gaps
 
 
-def least_gaps(
+def compute_least_gaps(
     low: Corners, high: Corners, others: Sequence[BodyFeatures], over_lower: bool = False
 ) -> Float64[np.ndarray, " n"]:
-    """Least gap of each box to any of the bodies [m]; infinite where there are none. Arguments as of `box_gaps`."""
-    gaps = box_gaps(low, high, others, over_lower)
+    """Compute the least gap of each box to any body [m], infinite without bodies; see `compute_box_gaps`."""
+    gaps = compute_box_gaps(low, high, others, over_lower)
     least: Float64[np.ndarray, " n"] = gaps.min(axis=1, initial=np.inf)
     return least
 
 
-def outlines_clear(
+def are_outlines_clear(
     body: BodyFeatures, others: Sequence[BodyFeatures], epsilon_m: float, over_lower: bool = False
 ) -> bool:
-    """Whether a body is `epsilon_m` from each other by its box or, seen from above, by its convex outline."""
-    gaps = box_gaps(body.low[None], body.high[None], others, over_lower)[0]
+    """Test whether a body is `epsilon_m` from every other by box or, seen from above, by convex outline."""
+    gaps = compute_box_gaps(body.low[None], body.high[None], others, over_lower)[0]
     near = [other for other, gap in zip(others, gaps, strict=True) if gap < epsilon_m]
-    return all(outline_gap(body, other) >= max(epsilon_m, 1e-6) for other in near)
+    return all(measure_outline_gap(body, other) >= max(epsilon_m, 1e-6) for other in near)

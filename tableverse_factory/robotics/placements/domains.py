@@ -1,4 +1,4 @@
-"""Where a relation lets an object be put down: the paper's domains Ω, from the reference's box (appendix D).
+"""Placement domains Ω of relations, as rectangles from the reference's box (paper, appendix D).
 
 The paper names six predicates; the ten relations of a task are mapped to them and to two more, `next to` and `outside`.
 Directions are those of `geometry.relations`: left is -x, right +x, in front -y, behind +y.
@@ -16,16 +16,14 @@ from tableverse_factory.geometry.relations.relations import NEXT_TO_GAP_M, BodyF
 
 Vector2 = Float64[np.ndarray, "2"]
 Points2 = Float64[np.ndarray, "n 2"]
+DOMAIN_DEPTH_M = 0.25
+"""Extent of a half-space beyond its margin, within common usage of `to the left of` and an arm's reach."""
 
-REACH_M = 0.25
-"""How far a half-space extends beyond its margin: further off nobody says `to the left of`, and arms end."""
-
-NEXT_TO_SPARE_M = 0.01
-"""What is put next to something comes nearer than the relation asks for, by this."""
+NEXT_TO_MARGIN_M = 0.01  # `next to` placements stay closer than the relation's limit by this
 
 
 class Predicate(StrEnum):
-    """What a domain is built for."""
+    """Domain shape."""
 
     TOP = "top"
     IN = "in"
@@ -62,56 +60,45 @@ _SIDES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacementRegion(Frozen):
-    """A rectangle in the table's plane, along its axes; it may be empty.
-
-    Attributes:
-        low: Least coordinates of the middle of the object's box [m].
-        high: Greatest [m].
-    """
+    """Rectangle of box middles along the table's axes [m]; it may be empty."""
 
     low: Vector2
     high: Vector2
 
     @property
     def area(self) -> float:
-        """Of the rectangle [m²]; 0 where it is empty."""
+        """Area [m²]; 0 where empty."""
         return float(np.prod(np.maximum(self.high - self.low, 0.0)))
 
-    def within(self, low: Vector2, high: Vector2) -> "PlacementRegion":
-        """What it shares with another rectangle."""
+    def intersect(self, low: Vector2, high: Vector2) -> "PlacementRegion":
+        """Intersect with another rectangle."""
         return PlacementRegion(np.maximum(self.low, low), np.minimum(self.high, high))
 
-    def holds(self, middles: Points2) -> Bool[np.ndarray, " n"]:
-        """Which of the points lie in it."""
+    def contains(self, middles: Points2) -> Bool[np.ndarray, " n"]:
+        """Test which points lie inside."""
         held: Bool[np.ndarray, " n"] = np.all((middles >= self.low) & (middles <= self.high), axis=1)
         return held
 
 
-def domain(
+def build_domain(
     predicate: Predicate, half_xy: Vector2, y: BodyFeatures, delta_margin_m: float
 ) -> tuple[PlacementRegion, ...]:
-    """Ω of a predicate, as rectangles for the middle of the box of the object that is put down.
+    """Build Ω of a predicate, as rectangles for the middle of the placed object's box.
 
-    On top of and in something, that is the face of the reference's box; the level follows from letting the object down.
-    Beside it, it is as wide as the reference and begins where the two boxes are `delta_margin_m` apart, so that the
-    object is beyond the margin as a whole, and not its middle alone. It ends `REACH_M` further. `next to` has all four
-    sides up to the gap that the relation allows, and begins no later than halfway to it. `outside` has all four.
-
-    Args:
-        predicate: Which.
-        half_xy: Half extents of the object's box as it will stand [m].
-        y: The reference as it stands.
-        delta_margin_m: Least gap along the axis [m].
+    `top` and `in` give the face of the reference's box; the level follows from lowering the object. A side is as wide
+    as the reference and begins where the two boxes are `delta_margin_m` apart, so the whole object is beyond the
+    margin; it ends `DOMAIN_DEPTH_M` further. `next to` has all four sides up to the relation's gap, and begins no later
+    than halfway to it. `outside` has all four. `half_xy` are half extents of the object's box as it will stand [m].
     """
     if predicate in (Predicate.TOP, Predicate.IN):
         return (PlacementRegion(y.low[:2], y.high[:2]),)
-    nearest, furthest = delta_margin_m, delta_margin_m + REACH_M
+    nearest, furthest = delta_margin_m, delta_margin_m + DOMAIN_DEPTH_M
     if predicate is Predicate.NEXT_TO:
-        nearest, furthest = min(nearest, NEXT_TO_GAP_M / 2), NEXT_TO_GAP_M - NEXT_TO_SPARE_M
-    return tuple(_beside(axis, sign, half_xy, y, nearest, furthest) for axis, sign in _SIDES[predicate])
+        nearest, furthest = min(nearest, NEXT_TO_GAP_M / 2), NEXT_TO_GAP_M - NEXT_TO_MARGIN_M
+    return tuple(_build_side_region(axis, sign, half_xy, y, nearest, furthest) for axis, sign in _SIDES[predicate])
 
 
-def _beside(
+def _build_side_region(
     axis: int, sign: float, half_xy: Vector2, y: BodyFeatures, nearest: float, furthest: float
 ) -> PlacementRegion:
     low, high = y.low[:2].copy(), y.high[:2].copy()
@@ -121,8 +108,8 @@ def _beside(
     return PlacementRegion(low, high)
 
 
-def sampled(regions: tuple[PlacementRegion, ...], count: int, rng: np.random.Generator) -> Points2:
-    """Points of the regions, uniform over their area; none where all are empty. Shape (count, 2) or (0, 2)."""
+def sample_regions(regions: tuple[PlacementRegion, ...], count: int, rng: np.random.Generator) -> Points2:
+    """Sample points uniformly over the regions' area; none where all are empty. Shape (count, 2) or (0, 2)."""
     areas = np.array([region.area for region in regions])
     if not areas.sum() > 0.0:
         return np.zeros((0, 2))

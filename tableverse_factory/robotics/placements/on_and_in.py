@@ -1,4 +1,4 @@
-"""Places on or in the reference: let down from above until the object touches, by height maps."""
+"""Placements on or in the reference: lowered from above on height maps until the object touches."""
 
 from collections import Counter
 
@@ -6,191 +6,186 @@ import numpy as np
 from scipy import ndimage
 
 from tableverse_factory.geometry.mesh.height_maps import CellMask, Heights
-from tableverse_factory.geometry.relations.relations import BodyFeatures, holds, is_inside
-from tableverse_factory.geometry.relations.stable_placement import CONTACT_M, dropped, stands, tabletop
-from tableverse_factory.robotics.placements.clearance import least_gaps, outlines_clear
+from tableverse_factory.geometry.relations.relations import BodyFeatures, is_inside, relation_holds
+from tableverse_factory.geometry.relations.stable_placement import CONTACT_M, drop_body, is_stable, make_support_surface
+from tableverse_factory.robotics.placements.clearance import are_outlines_clear, compute_least_gaps
 from tableverse_factory.robotics.placements.domains import Predicate
-from tableverse_factory.robotics.placements.orientations import Turn
-from tableverse_factory.robotics.placements.pieces import Pieces
+from tableverse_factory.robotics.placements.orientations import Orientation
+from tableverse_factory.robotics.placements.pieces import ConvexPieces
 from tableverse_factory.robotics.placements.request import (
-    ENOUGH,
-    LOOKS,
-    RELEASE_M,
-    SAMPLES,
+    CHECKS_PER_PLACEMENT,
+    ENOUGH_CLEAR,
+    RELEASE_HEIGHT_M,
+    SAMPLES_PER_PLACEMENT,
+    CandidatePlacement,
     NoPlacement,
-    Place,
     PlacementRequest,
 )
-from tableverse_factory.robotics.placements.samples import Samples, joined
+from tableverse_factory.robotics.placements.samples import PlacementSamples, concatenate_samples
 
-FINGERS_M = 0.02
-"""How far fingers reach down beside what they hold, from its top, at least."""
-
-HAND_ROOM_M = 0.05
-"""Where a vessel is wider than the object by this, fingers may come in with it."""
-
-WALL_CLEARANCE_M = 0.001
-"""The convex pieces of what is let go in a vessel are so far from its own."""
-
-MAX_RISE_M = 0.012
-"""Where the pieces are only clear so much higher than the meshes, the object does not fit for a simulator."""
-
-WALL_GAP_M = 0.006
-"""What keeps so far from the wall goes in easily."""
-
-_CORE = 0.6
-"""Share of its width with which an object feels for the ground."""
-
-_LEVEL_M = 0.03
-"""To lie so much higher in a vessel is as bad as to lie at its wall."""
-
-_DEEP_M = 0.05
-"""Further from the edge than this a place is no better."""
+FINGER_REACH_M = 0.02  # minimum reach of fingers beside a held object, from its top
+HAND_ROOM_M = 0.05  # fingers may enter a vessel that is wider than the object by this on either side
+WALL_CLEARANCE_M = 0.001  # gap between the convex pieces of an object released in a vessel and the vessel's
+MAX_RISE_M = 0.012  # if pieces only clear this much higher than the meshes, a simulated object does not fit
+WALL_GAP_M = 0.006  # gap to the wall that makes an insertion easy
+_CORE_SHARE = 0.6  # share of the object's width that is used to find the ground
+_LEVEL_SCALE_M = 0.03  # height in a vessel that costs as much as lying at its wall
+_MAX_DEPTH_M = 0.05  # distance from the edge beyond which a placement is no better
 
 
-def upon(
-    request: PlacementRequest, turns: tuple[Turn, ...], rng: np.random.Generator, *, on_end: bool = False
-) -> tuple[Place, ...] | NoPlacement:
-    """Places on or in the reference, best first; at most as many as are wanted.
+def find_places_on_or_in(
+    request: PlacementRequest, turns: tuple[Orientation, ...], rng: np.random.Generator, *, on_end: bool = False
+) -> tuple[CandidatePlacement, ...] | NoPlacement:
+    """Find up to `request.wanted` placements on or in the reference, best first.
 
-    Args:
-        request: What is asked for.
-        turns: Ways to hold the object.
-        rng: The only source of chance.
-        on_end: Whether it is stood on its end, and must not topple out again.
+    With `on_end` the object is stood on its end and must not topple out again.
     """
     y = request.y.body
     if request.predicate is Predicate.TOP:
         if not y.flat.any():
             return NoPlacement("no_stable_top", f"{request.y.object_id} has no level patch that carries anything")
-        return _Reference(request, turns, y.flat, on_end=False).places(rng)
+        return _ReferenceSurface(request, turns, y.flat, on_end=False).find_places(rng)
     if y.cavity is None:
         return NoPlacement("no_container", f"{request.y.object_id} has no room that opens upwards")
-    return _Reference(request, turns, y.cavity.cells, on_end=on_end).places(rng)
+    return _ReferenceSurface(request, turns, y.cavity.cells, on_end=on_end).find_places(rng)
 
 
-class _Reference:
-    """The reference with what stands near it."""
+class _ReferenceSurface:
+    """The reference with nearby objects."""
 
-    def __init__(self, request: PlacementRequest, turns: tuple[Turn, ...], room: CellMask, *, on_end: bool) -> None:
+    def __init__(
+        self, request: PlacementRequest, turns: tuple[Orientation, ...], room: CellMask, *, on_end: bool
+    ) -> None:
         self._on_end = on_end
         self._request, self._turns, self._y = request, turns, request.y.body
         self._into = request.predicate is Predicate.IN
         size = max(float(np.linalg.norm((turn.body.high - turn.body.low)[:2])) for turn in turns)
-        things = [o for o in request.others if _box_gap(o.body, self._y) < size]
+        things = [o for o in request.others if _compute_box_gap(o.body, self._y) < size]
         near = tuple(o.body for o in things)
-        self._pieces = Pieces(request.x, (request.y, *things))
+        self._pieces = ConvexPieces(request.x, (request.y, *things))
         # Contents lie where the object is to go: it is let down onto them, by the map; boxes would keep it out.
         self._beside = tuple(o for o in near if not (self._into and self._is_content(o)))
-        self._scene = tabletop((self._y, *near), request.table, request.cell, size + 2 * request.cell)
+        self._scene = make_support_surface((self._y, *near), request.table, request.cell, size + 2 * request.cell)
         self._heights = self._scene.without(None)
         self._ground = self._heights[self._scene.window_of(self._y.heights)]
         free = room if self._into else room & (self._ground <= self._y.heights.top + CONTACT_M)
         self._depth: Heights = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * request.cell
 
-    def places(self, rng: np.random.Generator) -> tuple[Place, ...] | NoPlacement:
-        """Where the object stands, or lies well within the rim, clear of what is beside, and the relation holds."""
+    def find_places(self, rng: np.random.Generator) -> tuple[CandidatePlacement, ...] | NoPlacement:
+        """Find where the object stands, or lies within the rim, clear of neighbors, and the relation holds."""
         wanted = self._request.wanted
-        count = -(-SAMPLES * wanted // len(self._turns))
-        samples = joined([self._sampled(turn, index, count, rng) for index, turn in enumerate(self._turns)])
-        found: list[tuple[bool, Place]] = []
+        count = -(-SAMPLES_PER_PLACEMENT * wanted // len(self._turns))
+        samples = concatenate_samples(
+            [self._sample_heading(turn, index, count, rng) for index, turn in enumerate(self._turns)]
+        )
+        found: list[tuple[bool, CandidatePlacement]] = []
         lost: Counter[str] = Counter()
-        for index in samples.order(self._request.avoided())[: LOOKS * wanted]:
-            if len(found) == wanted or (len(found) >= ENOUGH and not samples.clear[index]):
+        for index in samples.rank(self._request.find_avoided_xy())[: CHECKS_PER_PLACEMENT * wanted]:
+            if len(found) == wanted or (len(found) >= ENOUGH_CLEAR and not samples.clear[index]):
                 break
-            place = self._let_down(self._turns[samples.heading[index]], samples.cells[index], lost)
+            place = self._lower_object(self._turns[samples.heading[index]], samples.cells[index], lost)
             found += [] if place is None else [place]
         told = ", ".join(f"{many} {why}" for why, many in lost.items()) or "none over it"
         easy_first = sorted(found, key=lambda entry: entry[0])
         return tuple(place for _, place in easy_first) or NoPlacement("no_room", f"of {len(samples.costs)} {told}")
 
-    def _sampled(self, turn: Turn, heading: int, count: int, rng: np.random.Generator) -> Samples:
-        """Samples with what counts over the room: the centre of what stands, the middle of what goes in.
+    def _sample_heading(
+        self, turn: Orientation, heading: int, count: int, rng: np.random.Generator
+    ) -> PlacementSamples:
+        """Sample placements whose deciding point is over the room: the center if it stands, the middle if it goes in.
 
-        The deepest spot is always among them: a small room in a large box may be missed.
+        The deepest cell is always included, as random samples may miss a small room in a large box.
         """
         request, body, shape = self._request, turn.body, np.array(self._depth.shape)
         middle = (body.low + body.high)[:2] / 2
         counts = middle if self._into else body.center[:2]
         start = np.floor(counts / request.cell).astype(np.int64) - np.array(self._y.heights.corner)
         deepest = np.array(np.unravel_index(int(np.argmax(self._depth)), self._depth.shape))
-        cells = np.concatenate([(deepest - start)[None], request.cells(turn, count, rng)[0]])
+        cells = np.concatenate([(deepest - start)[None], request.sample_cells(turn, count, rng)[0]])
         there = ((start + cells >= 0) & (start + cells < shape)).all(axis=1)
         cells = cells[there]
         index = tuple((start + cells).T)
         kept = self._depth[index] > 0.0
-        level = self._level(body)[index][kept]
+        level = self._estimate_level(body)[index][kept]
         offset = np.column_stack([cells[kept] * request.cell, level - body.low[2]])
-        gap = least_gaps(body.low + offset, body.high + offset, self._beside, over_lower=True)
-        costs = 1.0 - np.minimum(self._depth[index][kept], _DEEP_M) / _DEEP_M + 0.5 * turn.angle / np.pi
+        gap = compute_least_gaps(body.low + offset, body.high + offset, self._beside, over_lower=True)
+        costs = 1.0 - np.minimum(self._depth[index][kept], _MAX_DEPTH_M) / _MAX_DEPTH_M + 0.5 * turn.angle / np.pi
         costs += (
-            (level - level.min(initial=np.inf)) / _LEVEL_M if self._into else 1.0 - np.clip(gap, 0, _DEEP_M) / _DEEP_M
+            (level - level.min(initial=np.inf)) / _LEVEL_SCALE_M
+            if self._into
+            else 1.0 - np.clip(gap, 0, _MAX_DEPTH_M) / _MAX_DEPTH_M
         )
         heading_of = np.full(len(level), heading)
-        return Samples(heading_of, cells[kept], middle + offset[:, :2], costs, gap >= request.epsilon_m)
+        return PlacementSamples(heading_of, cells[kept], middle + offset[:, :2], costs, gap >= request.epsilon_m)
 
-    def _level(self, body: BodyFeatures) -> Heights:
-        """About how high the lowest point of a body would come to lie, over each cell of the reference."""
+    def _estimate_level(self, body: BodyFeatures) -> Heights:
+        """Estimate the height of a body's lowest point over each cell of the reference."""
         if not self._into:
             return self._y.heights.top
         half = (body.high - body.low)[:2] / 2
-        size = np.maximum(np.rint(_CORE * half / self._request.cell).astype(int), 0) * 2 + 1
+        size = np.maximum(np.rint(_CORE_SHARE * half / self._request.cell).astype(int), 0) * 2 + 1
         level: Heights = ndimage.maximum_filter(self._ground, size=tuple(size), mode="nearest")
         return level
 
-    def _let_down(self, turn: Turn, cells: np.ndarray, lost: Counter[str]) -> tuple[bool, Place] | None:
-        """The place, and whether it is a tight one; None where it is none."""
+    def _lower_object(
+        self, turn: Orientation, cells: np.ndarray, lost: Counter[str]
+    ) -> tuple[bool, CandidatePlacement] | None:
+        """Lower the object at a sample; return the placement and whether it is tight, or None if rejected."""
         request = self._request
         by_cells = (int(cells[0]), int(cells[1]))
-        landed = dropped(request.relation, turn.body, by_cells, self._y, self._scene, self._heights)
+        landed = drop_body(request.relation, turn.body, by_cells, self._y, self._scene, self._heights)
         if landed is None:
             lost["where it would not fit or stand"] += 1
             return None
-        if not holds(request.relation, landed, self._y):
+        if not relation_holds(request.relation, landed, self._y):
             lost["where the relation would not hold"] += 1
             return None
-        if self._on_end and not self._stays(landed):
+        if self._on_end and not self._is_stable(landed):
             lost["where it would topple out"] += 1
             return None
-        clear = bool(least_gaps(landed.low[None], landed.high[None], self._beside, True)[0] >= request.epsilon_m)
-        if not clear and not outlines_clear(landed, self._beside, request.epsilon_m, over_lower=True):
+        clear = bool(
+            compute_least_gaps(landed.low[None], landed.high[None], self._beside, True)[0] >= request.epsilon_m
+        )
+        if not clear and not are_outlines_clear(landed, self._beside, request.epsilon_m, over_lower=True):
             lost[f"within {1e3 * request.epsilon_m:g} mm of something"] += 1
             return None
         offset = np.append(cells * request.cell, landed.low[2] - turn.body.low[2])
-        clearance = WALL_CLEARANCE_M if self._into else RELEASE_M
-        rise = self._pieces.rise(turn, offset, clearance)
+        clearance = WALL_CLEARANCE_M if self._into else RELEASE_HEIGHT_M
+        rise = self._pieces.find_clear_height(turn, offset, clearance)
         if rise > MAX_RISE_M:
             lost["where its convex pieces do not fit"] += 1
             return None
         clear_by = "boxes" if clear else "outlines"
         if self._into:
-            return self._wall_gap(landed) < WALL_GAP_M, Place(turn, offset, self._drops(landed, rise), clear_by)
+            return self._compute_wall_gap(landed) < WALL_GAP_M, CandidatePlacement(
+                turn, offset, self._list_drop_heights(landed, rise), clear_by
+            )
         # It will stand on pieces, which may lie higher than the mesh: in a plate, on a lid with a groove.
         higher = max(rise - clearance, 0.0)
-        if not holds(request.relation, landed.moved((0, 0), higher), self._y):
+        if not relation_holds(request.relation, landed.moved((0, 0), higher), self._y):
             lost["where its convex pieces stand too high"] += 1
             return None
-        return False, Place(turn, offset + np.array([0.0, 0.0, higher]), (clearance,), clear_by)
+        return False, CandidatePlacement(turn, offset + np.array([0.0, 0.0, higher]), (clearance,), clear_by)
 
-    def _stays(self, landed: BodyFeatures) -> bool:
-        """Whether the centre of what is stood on its end lies below the rim, or it stands on the floor by itself."""
+    def _is_stable(self, landed: BodyFeatures) -> bool:
+        """Test whether an object on its end has its center below the rim, or stands on the floor by itself."""
         cavity = self._y.cavity
         ground = self._heights[self._scene.window_of(landed.heights)]
         below = cavity is not None and float(landed.center[2]) < cavity.rim_z
-        return below or stands(landed, landed.heights.bottom <= ground + CONTACT_M)
+        return below or is_stable(landed, landed.heights.bottom <= ground + CONTACT_M)
 
-    def _wall_gap(self, landed: BodyFeatures) -> float:
-        """Least way from the object's columns below the rim to the wall, by whole cells [m]."""
+    def _compute_wall_gap(self, landed: BodyFeatures) -> float:
+        """Compute the least distance from the object below the rim to the wall, in whole cells [m]."""
         cavity = self._y.cavity
         if cavity is None:
             return 0.0
-        below = landed.heights.bottom < cavity.rim_z - RELEASE_M
+        below = landed.heights.bottom < cavity.rim_z - RELEASE_HEIGHT_M
         return float(landed.heights.window(self._y.heights, self._depth, 0.0)[below].min(initial=np.inf))
 
-    def _drops(self, landed: BodyFeatures, least: float) -> tuple[float, ...]:
-        """Down in the vessel, or with its top so high that fingers stay above the rim: first what suits its width."""
+    def _list_drop_heights(self, landed: BodyFeatures, least: float) -> tuple[float, ...]:
+        """List release heights: low in the vessel, or with fingers above the rim, in the order that suits its width."""
         cavity = self._y.cavity
-        above = cavity.rim_z + FINGERS_M - float(landed.high[2]) if cavity is not None else 0.0
+        above = cavity.rim_z + FINGER_REACH_M - float(landed.high[2]) if cavity is not None else 0.0
         if above <= least:
             return (least,)
         width = 2 * float(self._depth.max())
@@ -198,13 +193,13 @@ class _Reference:
         return (least, above) if wide else (above, least)
 
     def _is_content(self, other: BodyFeatures) -> bool:
-        """Whether a body lies in the vessel, or leans in it with its middle over the room."""
+        """Test whether a body lies in the vessel, or leans in it with its middle over the room."""
         index = np.floor(other.center[:2] / self._request.cell).astype(np.int64) - np.array(self._y.heights.corner)
         room = self._y.cavity.cells if self._y.cavity is not None else np.zeros((0, 0), dtype=bool)
         over = bool(((index >= 0) & (index < room.shape)).all()) and bool(room[tuple(index)])
-        return over or (_box_gap(other, self._y) < 0.0 and is_inside(other, self._y))
+        return over or (_compute_box_gap(other, self._y) < 0.0 and is_inside(other, self._y))
 
 
-def _box_gap(a: BodyFeatures, b: BodyFeatures) -> float:
-    """Gap between boxes seen from above, along the axis on which they are furthest apart [m]."""
+def _compute_box_gap(a: BodyFeatures, b: BodyFeatures) -> float:
+    """Compute the gap between boxes seen from above, along the axis of largest separation [m]."""
     return float(np.maximum(a.low - b.high, b.low - a.high)[:2].max())

@@ -1,4 +1,4 @@
-"""What is asked for, and the answers to it."""
+"""Placement requests and their results."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ import numpy as np
 from schemas.curation import Relation
 from schemas.geometry import Frozen, Pose, Vector3
 from schemas.trajectories import Placement
-from tableverse_factory.geometry.math.transforms import compose, rotation_matrix
-from tableverse_factory.geometry.relations.relations import BodyFeatures, holds
+from tableverse_factory.geometry.math.transforms import compose_poses, rotation_matrix
+from tableverse_factory.geometry.relations.relations import BodyFeatures, relation_holds
 from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.robotics.placements.domains import (
@@ -18,32 +18,24 @@ from tableverse_factory.robotics.placements.domains import (
     Points2,
     Predicate,
     Vector2,
-    domain,
-    sampled,
+    build_domain,
+    sample_regions,
 )
-from tableverse_factory.robotics.placements.orientations import Turn
+from tableverse_factory.robotics.placements.orientations import Orientation
 
-RELEASE_M = 0.002
-"""An object is let go this high above what it will stand on: pressed down, it would push back at the arm."""
-
-SAMPLES = 100
-"""Samples for each place that is wanted (`TrajectoriesConfig.placements`)."""
-
-
-LOOKS = 6
-"""Samples that are judged on shapes for each place that is wanted, at most: this is what takes time."""
-
-ENOUGH = 6
-"""With so many places between boxes none is looked for between outlines."""
+RELEASE_HEIGHT_M = 0.002  # release height above the support: a pressed-down object would push back at the arm
+SAMPLES_PER_PLACEMENT = 100  # samples per requested placement (`TrajectoriesConfig.placements`)
+CHECKS_PER_PLACEMENT = 6  # maximum number of samples per requested placement checked on true shapes, the expensive part
+ENOUGH_CLEAR = 6  # with this many placements clear by boxes, outlines are not tried
 
 
 @dataclass(frozen=True, slots=True)
 class NoPlacement:
-    """That there is no place.
+    """Reason why there is no placement.
 
     Attributes:
         reason: `no_container`, `no_stable_top`, `does_not_stand` or `no_room`.
-        detail: One line for people, with what was tried.
+        detail: One line for people, with the tally of rejections.
     """
 
     reason: str
@@ -51,41 +43,38 @@ class NoPlacement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place(Frozen):
-    """Where the object would come to rest.
+class CandidatePlacement(Frozen):
+    """Place where the object would come to rest.
 
     Attributes:
-        turn: Its heading.
-        offset: From the turned object to the object at rest [m].
-        drops: Heights from which it may be let go, the better first [m].
+        turn: Its orientation.
+        offset: From the rotated object to the object at rest [m].
+        drops: Release heights, best first [m].
         clear_by: As in `Placement`.
     """
 
-    turn: Turn
+    turn: Orientation
     offset: Vector3
     drops: tuple[float, ...]
     clear_by: str
 
-    def placements(self, standing: Pose) -> Iterator[Placement]:
-        """As poses of the object's own frame, which now stands at `standing`."""
+    def to_placements(self, standing: Pose) -> Iterator[Placement]:
+        """Convert to poses of the object's own frame, which now stands at `standing`."""
         for drop in self.drops:
             moved = Pose(self.offset + np.array([0.0, 0.0, drop]), self.turn.quaternion_wxyz)
-            yield Placement(compose(moved, standing), drop, self.clear_by)
+            yield Placement(compose_poses(moved, standing), drop, self.clear_by)
 
 
 @dataclass(frozen=True, slots=True)
 class PlacementRequest:
-    """A relation between two things of a scene.
+    """Relation to achieve between two objects of a scene.
 
     Attributes:
-        relation: That is to hold.
-        x: What is put down.
-        y: The reference.
-        others: What else stands there.
-        table: What all stand on.
-        epsilon_m: Least gap to other boxes [m].
-        delta_margin_m: Least gap along the axis of a side [m].
-        wanted: How many places.
+        x: Object to place.
+        y: Reference.
+        epsilon_m: Minimum gap to other boxes [m].
+        delta_margin_m: Minimum gap along the axis of a side [m].
+        wanted: Number of placements.
     """
 
     relation: Relation
@@ -99,49 +88,46 @@ class PlacementRequest:
 
     @property
     def predicate(self) -> Predicate:
-        """The domain that the relation is mapped to."""
+        """Domain shape of the relation."""
         return PREDICATES[self.relation]
 
     @property
     def cell(self) -> float:
-        """Spacing of the height maps, by which objects are moved [m]."""
+        """Cell size of the height maps, by which objects are moved [m]."""
         return self.x.body.heights.cell
 
     @property
     def bodies(self) -> tuple[BodyFeatures, ...]:
-        """The others as they stand."""
+        """Shapes of the other objects as they stand."""
         return tuple(other.body for other in self.others)
 
     @property
     def lowest(self) -> float:
-        """Height of the lowest point of the object as it stands, of its mesh or of its pieces [m]."""
+        """Height of the lowest point of the object's mesh and pieces as it stands [m]."""
         low = rotation_matrix(self.x.pose.quaternion_wxyz)[2]
         pieces = min(float((hull.vertices @ low).min()) for hull in self.x.hulls) + float(self.x.pose.position[2])
         return min(pieces, float(self.x.body.low[2]))
 
-    def avoided(self) -> Vector2 | None:
-        """The middle of the object as it stands, where the relation holds already: it is to be moved."""
+    def find_avoided_xy(self) -> Vector2 | None:
+        """Return the object's present middle if the relation holds there already, as the object has to move."""
         body = self.x.body
         middle: Vector2 = (body.low + body.high)[:2] / 2
-        return middle if holds(self.relation, body, self.y.body) else None
+        return middle if relation_holds(self.relation, body, self.y.body) else None
 
-    def regions(self, turn: Turn) -> tuple[PlacementRegion, ...]:
-        """The domain, for the middle of the turned object's box."""
+    def regions(self, turn: Orientation) -> tuple[PlacementRegion, ...]:
+        """Build the domain for the middle of the rotated object's box."""
         half = (turn.body.high - turn.body.low)[:2] / 2
-        return domain(self.predicate, half, self.y.body, self.delta_margin_m)
+        return build_domain(self.predicate, half, self.y.body, self.delta_margin_m)
 
-    def cells(self, turn: Turn, count: int, rng: np.random.Generator) -> tuple[np.ndarray, Points2]:
-        """Samples of the domain above the table: by how many cells to move, each once, and the middles of the boxes.
-
-        Shapes (n, 2), n at most `count`.
-        """
+    def sample_cells(self, turn: Orientation, count: int, rng: np.random.Generator) -> tuple[np.ndarray, Points2]:
+        """Sample at most `count` distinct cell offsets in the domain above the table, and the boxes' middles."""
         regions, middle = self.regions(turn), (turn.body.low + turn.body.high)[:2] / 2
         reach = float(np.linalg.norm(self.table.half_size_xy))
-        near = tuple(r.within(self.table.center_xy - reach, self.table.center_xy + reach) for r in regions)
-        found = np.rint((sampled(near, count, rng) - middle) / self.cell).astype(np.int64)
+        near = tuple(r.intersect(self.table.center_xy - reach, self.table.center_xy + reach) for r in regions)
+        found = np.rint((sample_regions(near, count, rng) - middle) / self.cell).astype(np.int64)
         cells = np.unique(found, axis=0).reshape(-1, 2)
         middles: Points2 = middle + cells * self.cell
         inside = np.zeros(len(cells), dtype=bool)
         for region in regions:
-            inside |= region.holds(middles)
+            inside |= region.contains(middles)
         return cells[inside], middles[inside]

@@ -1,4 +1,4 @@
-"""An arm with a parallel gripper: its MJCF, what its joints may do, and the shape of its gripper."""
+"""Arm with a parallel gripper: its MJCF template, joint limits and gripper shape."""
 
 from dataclasses import dataclass
 
@@ -12,15 +12,15 @@ from schemas.trajectories import JointVector
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GripperShape(Frozen):
-    """The gripper as boxes along the axes of the gripper frame: origin at the TCP, z approach, y closing axis.
+    """Gripper as boxes along the axes of the gripper frame: origin at the TCP, z approach, y closing axis.
 
     Attributes:
-        hand_centers: Of the boxes that do not move with the fingers. Shape (h, 3) [m].
+        hand_centers: Boxes that do not move with the fingers. Shape (h, 3) [m].
         hand_half_sizes: Shape (h, 3) [m].
-        finger_centers: Of the boxes of the finger on the +y side where it is closed; the other finger is its mirror
-            image in y = 0. Shape (f, 3) [m].
+        finger_centers: Boxes of the closed finger on the +y side; the other finger mirrors it in y = 0. Shape (f, 3)
+            [m].
         finger_half_sizes: Shape (f, 3) [m].
-        pad_half_size_xz: Of the flat that grips, around the TCP, along x and z of the gripper frame. Shape (2,) [m].
+        pad_half_size_xz: Gripping flat around the TCP, along x and z of the gripper frame. Shape (2,) [m].
     """
 
     hand_centers: Points
@@ -30,7 +30,7 @@ class GripperShape(Frozen):
     pad_half_size_xz: Float64[np.ndarray, "2"]
 
     def boxes(self, opening_m: float) -> tuple[Points, Points]:
-        """Centres and half sizes of all boxes with the fingers this far apart. Both of shape (h + 2 f, 3) [m]."""
+        """Return centers and half sizes of all boxes at an opening. Both of shape (h + 2 f, 3) [m]."""
         shift = np.array([0.0, opening_m / 2, 0.0])
         left = self.finger_centers + shift
         centers = np.concatenate([self.hand_centers, left, left * [1.0, -1.0, 1.0]])
@@ -39,31 +39,30 @@ class GripperShape(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm(Frozen):
-    """An arm on its own, not yet in any scene. Its root body stands at the origin, upright.
+    """Arm on its own, not yet in a scene. Its root body stands upright at the origin.
 
     Attributes:
-        name: As it was asked for (`doors.arm_of`), and as it stands in rows and arrays.
-        template: Its MJCF, unattached; `spec` gives copies of it.
-        base_body: Name of the one body of the world that carries all.
-        joint_names: Of the arm's hinges, from the base to the hand.
-        actuator_names: Position servo of each of these joints.
-        gripper_actuator: Its control is affine in the opening (`gripper_control`).
+        name: As given to `load_arm` and stored in rows and arrays.
+        template: Unattached MJCF; `spec` returns copies.
+        base_body: The one child of the world body.
+        joint_names: The arm's hinges, from the base to the hand.
+        actuator_names: Position servo of each joint.
+        gripper_actuator: Actuator whose control is affine in the opening.
         gripper_control: Control with closed and with open fingers; (0, max_opening_m) where control is the opening.
         tcp_site: Site between the fingertips: z approach, y closing axis.
         finger_joints: Slides or hinges of the fingers.
         finger_open: Positions of `finger_joints` with open fingers. Shape (k,) [m or rad].
-        finger_closed: The same with closed ones. Shape (k,).
-        finger_geoms: Geoms that may touch what is gripped.
+        finger_closed: Positions with closed fingers. Shape (k,).
+        finger_geoms: Geoms that may touch the gripped object.
         home: Shape (j,) [rad].
-        lower: Limits of the joints. Shape (j,) [rad].
+        lower: Joint limits. Shape (j,) [rad].
         upper: Shape (j,) [rad].
         max_velocity: Shape (j,) [rad/s].
         max_acceleration: Shape (j,) [rad/s²].
         max_torque: Shape (j,) [N m].
         max_opening_m: Widest distance between the fingertips [m].
-        max_opening_speed: Of the distance between the fingertips [m/s].
-        base_radius_m: Of a circle around the base's z axis that its foot stands in [m].
-        shape: Of the gripper.
+        max_opening_speed: Rate of change of that distance [m/s].
+        base_radius_m: Radius of the circle around the base's z axis that contains its foot [m].
     """
 
     name: str
@@ -90,16 +89,16 @@ class Arm(Frozen):
     shape: GripperShape
 
     def spec(self) -> mujoco.MjSpec:
-        """The arm as a specification of its own, to edit and attach."""
+        """Return a copy of the MJCF to edit and attach."""
         return self.template.copy()
 
     def finger_positions(self, opening_m: float) -> JointVector:
-        """Positions of `finger_joints` at this opening. Shape (k,)."""
+        """Return positions of `finger_joints` at an opening. Shape (k,)."""
         share = opening_m / self.max_opening_m
         positions: JointVector = self.finger_closed + share * (self.finger_open - self.finger_closed)
         return positions
 
     def gripper_command(self, opening_m: float) -> float:
-        """The gripper actuator's control for this opening."""
+        """Return the gripper actuator's control for an opening."""
         closed, opened = self.gripper_control
         return closed + opening_m / self.max_opening_m * (opened - closed)

@@ -1,8 +1,8 @@
-"""An arm from an MJCF file: what it must hold is checked, what it does not say is measured.
+"""Arm from an MJCF file: required parts are checked, missing figures are measured.
 
-The file describes one arm on one body of the world, hinges with limits up to a site `tcp`, a position actuator for
-each, and two sliding fingers with one actuator more (docs/trajectories.md, "Your own arm"). It reads nothing outside
-its own folder.
+The file describes one arm on one body of the world: hinges with limits up to a site `tcp`, a position actuator each,
+and two sliding fingers with one more actuator (docs/trajectories.md, "Your own arm"). Nothing outside its folder is
+read.
 """
 
 from pathlib import Path
@@ -15,41 +15,41 @@ from schemas.trajectories import JointVector
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.physics.mjcf.file_check import check_files
-from tableverse_factory.physics.simulate.at_rest import quiet_data
-from tableverse_factory.physics.simulate.model_solids import geom_shape
+from tableverse_factory.physics.simulate.at_rest import make_quiet_data
+from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.robotics.robots.gripper import measured_gripper
+from tableverse_factory.robotics.robots.gripper import measure_gripper
 
 TCP_SITE = "tcp"
 HOME_KEY = "home"
 MAX_VELOCITY, MAX_ACCELERATION, MAX_OPENING_SPEED = 1.5, 5.0, 0.1
-"""For files without a `numeric` that says so; gentle [rad/s], [rad/s²], [m/s]."""
+"""Gentle defaults for files without a `numeric` of that name [rad/s], [rad/s²], [m/s]."""
 
-_LEAST_BASE_RADIUS_M = 0.08
-_FOOT_M = 0.15
+_MIN_BASE_RADIUS_M = 0.08
+_FOOT_HEIGHT_M = 0.15
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 
 
-def arm_from_file(path: Path, name: str, tcp: tuple[str, Vector3] | None = None) -> Arm:
-    """The arm of an MJCF file.
+def load_arm_file(path: Path, name: str, tcp: tuple[str, Vector3] | None = None) -> Arm:
+    """Load an arm from an MJCF file.
 
     Args:
-        path: The file; all that it names must lie in its folder.
-        name: By which rows and arrays call the arm.
-        tcp: Body and position in it at which a site `tcp` is added, for a known file that has none [m].
+        path: The file; everything it references must lie in its folder.
+        name: Name of the arm in rows and arrays.
+        tcp: Body and position in its frame [m] at which to add a site `tcp`, for a known file that has none.
 
     Raises:
-        InputError: `bad_mjcf` if MuJoCo does not load it or it names files elsewhere, `bad_robot` if something of an
-            arm is missing: says what, and what would be right.
+        InputError: `bad_mjcf` if MuJoCo does not load it or it references files elsewhere, `bad_robot` if it lacks a
+            required part of an arm.
     """
-    spec, model = _loaded(path, tcp)
+    spec, model = _load_spec(path, tcp)
     try:
-        return _arm(spec, model, name)
+        return _build_arm(spec, model, name)
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
 
 
-def _loaded(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+def _load_spec(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     if not path.is_file():
         raise InputError(f"{sanitize_line(str(path), 200)!r} is no file: give the MJCF of an arm", "bad_robot")
     try:
@@ -69,40 +69,40 @@ def _loaded(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSpec,
         ) from None
 
 
-def _arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
+def _build_arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, TCP_SITE)
     if site < 0:
         raise _lacking(f"there is no site {TCP_SITE!r}: add one between the fingertips, z out of the hand, y across")
-    bodies = _bodies_to(model, int(model.site_bodyid[site]))
-    joints = [j for body in bodies for j in _joints_of(model, body)]
+    bodies = _find_bodies_to(model, int(model.site_bodyid[site]))
+    joints = [j for body in bodies for j in _list_joints(model, body)]
     _check_chain(model, bodies[0], joints)
-    servos = [_servo(model, joint) for joint in joints]
-    gripper_actuator = _gripper_actuator(model, servos)
-    home = _home(model)
-    lower, upper = _limits(model, joints, servos)
+    servos = [_find_servo(model, joint) for joint in joints]
+    gripper_actuator = _find_gripper_actuator(model, servos)
+    home = _read_home(model)
+    lower, upper = _compute_limits(model, joints, servos)
     addresses = model.jnt_qposadr[joints]
     if ((home[addresses] < lower) | (home[addresses] > upper)).any():
         raise _lacking(f"the keyframe {HOME_KEY!r} is outside the joints' limits: {home[addresses].round(4).tolist()}")
-    gripper = measured_gripper(model, site, joints, gripper_actuator, home)
-    _prepare(spec, model, joints[0], home)
+    gripper = measure_gripper(model, site, joints, gripper_actuator, home)
+    _prepare_for_attachment(spec, model, joints[0], home)
     return Arm(
         name=name,
         template=spec,
-        base_body=_named(model.body(bodies[0]), "body of the base"),
-        joint_names=tuple(_named(model.joint(joint), "joint") for joint in joints),
-        actuator_names=tuple(_named(model.actuator(servo), "actuator") for servo in servos),
-        gripper_actuator=_named(model.actuator(gripper_actuator), "actuator of the gripper"),
+        base_body=_require_name(model.body(bodies[0]), "body of the base"),
+        joint_names=tuple(_require_name(model.joint(joint), "joint") for joint in joints),
+        actuator_names=tuple(_require_name(model.actuator(servo), "actuator") for servo in servos),
+        gripper_actuator=_require_name(model.actuator(gripper_actuator), "actuator of the gripper"),
         tcp_site=TCP_SITE,
         home=np.array(home[addresses]),
         lower=lower,
         upper=upper,
-        max_velocity=_numeric(model, "max_velocity", len(joints), MAX_VELOCITY),
-        max_acceleration=_numeric(model, "max_acceleration", len(joints), MAX_ACCELERATION),
-        max_torque=np.array([_torque(model, j, a) for j, a in zip(joints, servos, strict=True)]),
-        max_opening_speed=float(_numeric(model, "max_opening_speed", 1, MAX_OPENING_SPEED)[0]),
-        base_radius_m=_base_radius(model, bodies[0]),
+        max_velocity=_read_numeric(model, "max_velocity", len(joints), MAX_VELOCITY),
+        max_acceleration=_read_numeric(model, "max_acceleration", len(joints), MAX_ACCELERATION),
+        max_torque=np.array([_read_max_torque(model, j, a) for j, a in zip(joints, servos, strict=True)]),
+        max_opening_speed=float(_read_numeric(model, "max_opening_speed", 1, MAX_OPENING_SPEED)[0]),
+        base_radius_m=_measure_base_radius(model, bodies[0]),
         gripper_control=gripper.control,
-        finger_joints=tuple(_named(model.joint(joint), "joint of a finger") for joint in gripper.joints),
+        finger_joints=tuple(_require_name(model.joint(joint), "joint of a finger") for joint in gripper.joints),
         finger_open=gripper.opened,
         finger_closed=gripper.closed,
         finger_geoms=tuple(model.geom(geom).name for geom in gripper.geoms),
@@ -111,8 +111,8 @@ def _arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     )
 
 
-def _prepare(spec: mujoco.MjSpec, model: mujoco.MjModel, first_joint: int, home: JointVector) -> None:
-    """Makes the file's arm one that can be attached: balanced, without keyframes, and free of itself at home."""
+def _prepare_for_attachment(spec: mujoco.MjSpec, model: mujoco.MjModel, first_joint: int, home: JointVector) -> None:
+    """Compensate gravity, drop keyframes, and exclude contacts between the base and the first link."""
     for key in spec.keys:
         spec.delete(key)
     for body in spec.bodies:
@@ -124,7 +124,7 @@ def _prepare(spec: mujoco.MjSpec, model: mujoco.MjModel, first_joint: int, home:
         if not any({exclude.bodyname1, exclude.bodyname2} == names for exclude in spec.excludes):
             spec.add_exclude(bodyname1=min(names), bodyname2=max(names))
     alone = spec.compile()
-    data = quiet_data(alone)
+    data = make_quiet_data(alone)
     data.qpos[:] = home
     mujoco.mj_fwdPosition(alone, data)
     pairs = [[alone.body(int(body)).name for body in alone.geom_bodyid[contact.geom]] for contact in data.contact]
@@ -134,8 +134,8 @@ def _prepare(spec: mujoco.MjSpec, model: mujoco.MjModel, first_joint: int, home:
         )
 
 
-def _bodies_to(model: mujoco.MjModel, body: int) -> list[int]:
-    """From the child of the world to this body."""
+def _find_bodies_to(model: mujoco.MjModel, body: int) -> list[int]:
+    """List bodies from the child of the world to this body."""
     bodies: list[int] = []
     while body > 0:
         bodies.insert(0, body)
@@ -145,7 +145,7 @@ def _bodies_to(model: mujoco.MjModel, body: int) -> list[int]:
     return bodies
 
 
-def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
+def _list_joints(model: mujoco.MjModel, body: int) -> list[int]:
     return list(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
 
 
@@ -161,8 +161,8 @@ def _check_chain(model: mujoco.MjModel, base: int, joints: list[int]) -> None:
             raise _lacking(f"the joint {model.joint(joint).name!r} must be a hinge with a range")
 
 
-def _servo(model: mujoco.MjModel, joint: int) -> int:
-    """The position actuator of a joint."""
+def _find_servo(model: mujoco.MjModel, joint: int) -> int:
+    """Find the position actuator of a joint."""
     of_joint = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_trnid[:, 0] == joint)
     found = np.flatnonzero(of_joint)
     called = model.joint(joint).name
@@ -179,7 +179,7 @@ def _servo(model: mujoco.MjModel, joint: int) -> int:
     return servo
 
 
-def _gripper_actuator(model: mujoco.MjModel, servos: list[int]) -> int:
+def _find_gripper_actuator(model: mujoco.MjModel, servos: list[int]) -> int:
     others = [actuator for actuator in range(model.nu) if actuator not in servos]
     if len(others) != 1:
         raise _lacking(f"there are {len(others)} actuators besides the joints': give one, which opens the gripper")
@@ -188,24 +188,23 @@ def _gripper_actuator(model: mujoco.MjModel, servos: list[int]) -> int:
     return others[0]
 
 
-def _home(model: mujoco.MjModel) -> JointVector:
-    """All positions in the keyframe."""
+def _read_home(model: mujoco.MjModel) -> JointVector:
+    """Read all positions of the home keyframe."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, HOME_KEY)
     if key < 0:
         raise _lacking(f"there is no keyframe {HOME_KEY!r}: add one with the arm where it waits")
     return np.array(model.key_qpos[key])
 
 
-def _limits(model: mujoco.MjModel, joints: list[int], servos: list[int]) -> tuple[JointVector, JointVector]:
-    """Of the joints, and of what their actuators can be told [rad]."""
+def _compute_limits(model: mujoco.MjModel, joints: list[int], servos: list[int]) -> tuple[JointVector, JointVector]:
+    """Intersect joint ranges with actuator control ranges [rad]."""
     lower, upper = np.array(model.jnt_range[joints]).T
     limited = model.actuator_ctrllimited[servos] != 0
     told = np.array(model.actuator_ctrlrange[servos]).T
     return np.where(limited, np.maximum(lower, told[0]), lower), np.where(limited, np.minimum(upper, told[1]), upper)
 
 
-def _torque(model: mujoco.MjModel, joint: int, servo: int) -> float:
-    """What the actuator gives at most [N m]."""
+def _read_max_torque(model: mujoco.MjModel, joint: int, servo: int) -> float:
     if model.actuator_forcelimited[servo]:
         return float(np.abs(model.actuator_forcerange[servo]).min())
     if model.jnt_actfrclimited[joint]:
@@ -213,8 +212,8 @@ def _torque(model: mujoco.MjModel, joint: int, servo: int) -> float:
     raise _lacking(f"the actuator of the joint {model.joint(joint).name!r} needs a forcerange [N m]")
 
 
-def _numeric(model: mujoco.MjModel, name: str, count: int, default: float) -> JointVector:
-    """The file's `numeric` of this name, one positive number per joint or one for all."""
+def _read_numeric(model: mujoco.MjModel, name: str, count: int, default: float) -> JointVector:
+    """Read a `numeric`: one positive number per joint, or one for all."""
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
     if index < 0:
         return np.full(count, default)
@@ -225,22 +224,21 @@ def _numeric(model: mujoco.MjModel, name: str, count: int, default: float) -> Jo
     return np.broadcast_to(values, (count,)).copy()
 
 
-def _base_radius(model: mujoco.MjModel, base: int) -> float:
-    """Of the circle around z that the base's lowest part stands in, by the geoms that touch [m]."""
+def _measure_base_radius(model: mujoco.MjModel, base: int) -> float:
+    """Measure the circle around z that contains the colliding geoms near the foot [m]."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    radius = _LEAST_BASE_RADIUS_M
+    radius = _MIN_BASE_RADIUS_M
     for geom in np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0):
-        shape = geom_shape(model, int(geom))
+        shape = make_geom_mesh(model, int(geom))
         if shape is not None and model.geom_contype[geom] and model.body_rootid[model.geom_bodyid[geom]] == base:
             points = shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-            low = points[points[:, 2] < _FOOT_M]
+            low = points[points[:, 2] < _FOOT_HEIGHT_M]
             radius = max(radius, float(np.hypot(low[:, 0], low[:, 1]).max(initial=0.0)))
     return radius
 
 
-def _named(item: mujoco.MjModel, what: str) -> str:
-    """Its name, which it must have."""
+def _require_name(item: mujoco.MjModel, what: str) -> str:
     name: str = item.name
     if not name:
         raise _lacking(f"a {what} has no name: give it one")

@@ -1,4 +1,4 @@
-"""A parallel gripper measured on its model: how its control moves the fingers, and the boxes around its geoms."""
+"""Parallel gripper measured on its model: how its control moves the fingers, and boxes around its geoms."""
 
 from dataclasses import dataclass
 
@@ -8,22 +8,17 @@ import numpy as np
 from schemas.geometry import Frozen, Points
 from schemas.trajectories import JointVector
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.physics.simulate.at_rest import quiet_data
-from tableverse_factory.physics.simulate.model_solids import geom_shape
+from tableverse_factory.physics.simulate.at_rest import make_quiet_data
+from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import GripperShape
 
 SETTLE_S = 3.0
-STILL_M_S = 1e-3
-"""A finger that is faster after `SETTLE_S` does not come to rest under its own actuator."""
-
-APART_M = 0.005
-"""Closed fingertips are at most this far apart, so that travel is opening."""
-
+REST_SPEED_M_S = 1e-3  # fingers that are faster after `SETTLE_S` do not come to rest under their actuator
+MAX_CLOSED_GAP_M = 0.005  # maximum gap between closed fingertips, so that travel equals opening
 _STEP_S = 0.002
-_UNEVEN_M = 0.001
-_LEAST_OPENING_M = 0.01
-_DIGITS = 7
-"""Of what the simulation came to rest at; the rest is its tolerance."""
+_MAX_SKEW_M = 0.001
+_MIN_OPENING_M = 0.01
+_DIGITS = 7  # decimals kept of simulated rest positions; the rest is within the simulation's tolerance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +26,11 @@ class Gripper(Frozen):
     """Two fingers that slide towards each other.
 
     Attributes:
-        joints: Ids of their slides.
-        geoms: Ids of their geoms that touch.
-        control: Of the actuator, with closed and with open fingers.
-        closed: Positions of the joints with closed fingers. Shape (k,) [m].
-        opened: Positions of the joints with open fingers. Shape (k,) [m].
+        joints: Ids of the finger slides.
+        geoms: Ids of the colliding finger geoms.
+        control: Actuator control with closed and with open fingers.
+        closed: Joint positions with closed fingers. Shape (k,) [m].
+        opened: Joint positions with open fingers. Shape (k,) [m].
         max_opening_m: Distance between the open fingertips [m].
         shape: Boxes around the geoms, in the gripper frame.
     """
@@ -49,32 +44,28 @@ class Gripper(Frozen):
     shape: GripperShape
 
 
-def measured_gripper(
+def measure_gripper(
     model: mujoco.MjModel, site: int, arm_joints: list[int], actuator: int, home: JointVector
 ) -> Gripper:
-    """Drives the actuator to both ends of its range, without gravity and contact, and looks where the fingers go.
+    """Drive the gripper's actuator to both ends of its range, without gravity and contact, and measure the fingers.
 
-    Args:
-        model: Of the arm alone.
-        site: Id of the TCP.
-        arm_joints: Ids of the joints that are not the gripper's.
-        actuator: Id of the gripper's.
-        home: All positions to start from. Shape (nq,).
+    `site` is the TCP's id; `home` holds all positions to start from. Shape (nq,).
 
     Raises:
         InputError: `bad_robot` if there are not two fingers that slide along the TCP's y and meet.
     """
     joints = [joint for joint in range(model.njnt) if joint not in arm_joints]
     if len(joints) != 2 or (model.jnt_type[joints] != mujoco.mjtJoint.mjJNT_SLIDE).any():
-        raise _lacking(f"the gripper has {len(joints)} joints: only two fingers that slide are known here")
+        raise robot_error(f"the gripper has {len(joints)} joints: only two fingers that slide are known here")
     bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
     ends = [
-        (float(end), _driven(model, joints, actuator, float(end), home)) for end in model.actuator_ctrlrange[actuator]
+        (float(end), _drive_fingers(model, joints, actuator, float(end), home))
+        for end in model.actuator_ctrlrange[actuator]
     ]
-    (shut, closed), (wide, opened) = sorted(ends, key=lambda end: _width(end[1].xpos[bodies]))
-    travel = _in_tcp(opened, site, opened.xpos[bodies]) - _in_tcp(closed, site, closed.xpos[bodies])
+    (shut, closed), (wide, opened) = sorted(ends, key=lambda end: _compute_distance(end[1].xpos[bodies]))
+    travel = _to_gripper_frame(opened, site, opened.xpos[bodies]) - _to_gripper_frame(closed, site, closed.xpos[bodies])
     _check_travel(travel)
-    fingers = [_geoms_of(model, body) for body in bodies]
+    fingers = [_find_contact_geoms(model, body) for body in bodies]
     _check_meet(model, closed, fingers)
     left = 0 if travel[0, 1] > 0.0 else 1
     return Gripper(
@@ -84,19 +75,19 @@ def measured_gripper(
         closed=np.round(closed.qpos[model.jnt_qposadr[joints]], _DIGITS),
         opened=np.round(opened.qpos[model.jnt_qposadr[joints]], _DIGITS),
         max_opening_m=round(float(np.abs(travel[:, 1]).sum()), _DIGITS),
-        shape=_shape(model, closed, site, fingers[left], bodies[left]),
+        shape=_measure_shape(model, closed, site, fingers[left], bodies[left]),
     )
 
 
-def _driven(
+def _drive_fingers(
     model: mujoco.MjModel, joints: list[int], actuator: int, control: float, home: JointVector
 ) -> mujoco.MjData:
-    """Where the fingers come to rest; the arm is put back home before positions are read."""
+    """Simulate until the fingers rest, then put the arm back home before positions are read."""
     flags = int(model.opt.disableflags)
     model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_CONTACT) | int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     # As in a scene, whatever the file says: its own step might be a nanosecond.
     model.opt.timestep, model.opt.integrator = _STEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    data = quiet_data(model)
+    data = make_quiet_data(model)
     data.qpos[:] = home
     for other in range(model.nu):
         joint = int(model.actuator_trnid[other, 0])
@@ -104,8 +95,10 @@ def _driven(
     mujoco.mj_step(model, data, nstep=round(SETTLE_S / _STEP_S))
     model.opt.disableflags = flags
     speed = float(np.abs(data.qvel[model.jnt_dofadr[joints]]).max())
-    if not speed < STILL_M_S:
-        raise _lacking(f"the fingers still move at {speed:.3g} m/s after {SETTLE_S:g} s under the gripper's actuator")
+    if not speed < REST_SPEED_M_S:
+        raise robot_error(
+            f"the fingers still move at {speed:.3g} m/s after {SETTLE_S:g} s under the gripper's actuator"
+        )
     fingers = np.array(data.qpos[model.jnt_qposadr[joints]])
     data.qpos[:] = home
     data.qpos[model.jnt_qposadr[joints]] = fingers
@@ -115,26 +108,26 @@ def _driven(
 
 def _check_travel(travel: Points) -> None:
     along, total = np.abs(travel[:, 1]), np.linalg.norm(travel, axis=1)
-    if along.sum() < _LEAST_OPENING_M:
-        raise _lacking(
+    if along.sum() < _MIN_OPENING_M:
+        raise robot_error(
             f"the gripper's actuator moves the fingers by {along.round(4).tolist()} m along the TCP's y axis"
         )
-    if (total - along).max() > _UNEVEN_M or abs(travel[:, 1].sum()) > _UNEVEN_M:
-        raise _lacking(
+    if (total - along).max() > _MAX_SKEW_M or abs(travel[:, 1].sum()) > _MAX_SKEW_M:
+        raise robot_error(
             f"the fingers move by {travel.round(4).tolist()} m in the TCP's frame: they must slide evenly along its y"
         )
 
 
 def _check_meet(model: mujoco.MjModel, closed: mujoco.MjData, fingers: list[list[int]]) -> None:
     if not (fingers[0] and fingers[1]):
-        raise _lacking("a finger has no geom that touches anything")
+        raise robot_error("a finger has no geom that touches anything")
     gap = min(mujoco.mj_geomDistance(model, closed, a, b, 1.0, None) for a in fingers[0] for b in fingers[1])
-    if gap > APART_M:
-        raise _lacking(f"closed, the fingers are {gap:.4f} m apart: they must meet, within {APART_M:g} m")
+    if gap > MAX_CLOSED_GAP_M:
+        raise robot_error(f"closed, the fingers are {gap:.4f} m apart: they must meet, within {MAX_CLOSED_GAP_M:g} m")
 
 
-def _geoms_of(model: mujoco.MjModel, body: int) -> list[int]:
-    """Geoms that touch, of a body and of what is fixed to it."""
+def _find_contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    """Find colliding geoms of a body and of everything fixed to it."""
     return [
         geom
         for geom in range(model.ngeom)
@@ -143,14 +136,18 @@ def _geoms_of(model: mujoco.MjModel, body: int) -> list[int]:
     ]
 
 
-def _shape(model: mujoco.MjModel, closed: mujoco.MjData, site: int, finger: list[int], body: int) -> GripperShape:
-    """Boxes around the hand that carries the fingers and around one of them."""
-    hand = _geoms_of(model, int(model.body_parentid[body]))
-    hand_boxes = [_box(model, closed, site, geom) for geom in hand]
-    finger_boxes = [_box(model, closed, site, geom) for geom in finger]
-    around = [(center, half) for center, half in finger_boxes if (np.abs(center) <= half + APART_M)[[0, 2]].all()]
+def _measure_shape(
+    model: mujoco.MjModel, closed: mujoco.MjData, site: int, finger: list[int], body: int
+) -> GripperShape:
+    """Fit boxes around the hand that carries the fingers and around one finger."""
+    hand = _find_contact_geoms(model, int(model.body_parentid[body]))
+    hand_boxes = [_measure_box(model, closed, site, geom) for geom in hand]
+    finger_boxes = [_measure_box(model, closed, site, geom) for geom in finger]
+    around = [
+        (center, half) for center, half in finger_boxes if (np.abs(center) <= half + MAX_CLOSED_GAP_M)[[0, 2]].all()
+    ]
     if not around:
-        raise _lacking("no geom of the fingers lies at the site 'tcp': put it between the fingertips")
+        raise robot_error("no geom of the fingers lies at the site 'tcp': put it between the fingertips")
     pad = min(around, key=lambda box: float(np.prod(box[1])))
     none = np.zeros((0, 3))
     return GripperShape(
@@ -162,25 +159,28 @@ def _shape(model: mujoco.MjModel, closed: mujoco.MjData, site: int, finger: list
     )
 
 
-def _box(model: mujoco.MjModel, data: mujoco.MjData, site: int, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half size of the box around a geom, along the axes of the gripper frame [m]."""
-    shape = geom_shape(model, geom)
+def _measure_box(model: mujoco.MjModel, data: mujoco.MjData, site: int, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Compute center and half size of the box around a geom, along the gripper frame's axes [m]."""
+    shape = make_geom_mesh(model, geom)
     if shape is None:
-        raise _lacking(f"the geom {model.geom(geom).name!r} of the gripper is of a kind that has no shape of its own")
-    points = _in_tcp(data, site, shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+        raise robot_error(
+            f"the geom {model.geom(geom).name!r} of the gripper is of a kind that has no shape of its own"
+        )
+    points = _to_gripper_frame(data, site, shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, (high - low) / 2
 
 
-def _in_tcp(data: mujoco.MjData, site: int, points: Points) -> Points:
-    """Points of the world in the gripper frame. Shape (n, 3) [m]."""
+def _to_gripper_frame(data: mujoco.MjData, site: int, points: Points) -> Points:
+    """Transform world points into the gripper frame. Shape (n, 3) [m]."""
     inside: Points = (points - data.site_xpos[site]) @ data.site_xmat[site].reshape(3, 3)
     return inside
 
 
-def _width(places: Points) -> float:
+def _compute_distance(places: Points) -> float:
     return float(np.linalg.norm(places[0] - places[1]))
 
 
-def _lacking(message: str) -> InputError:
+def robot_error(message: str) -> InputError:
+    """Build the error for an MJCF that is not a usable arm."""
     return InputError(message, "bad_robot")

@@ -1,9 +1,9 @@
-"""A Panda-like arm of seven joints with a parallel gripper, made here from published figures, with primitives alone.
+"""Panda-like seven-joint arm with a parallel gripper, built from published figures and primitive shapes.
 
-Kinematics and limits are the manufacturer's: the modified Denavit-Hartenberg table, ranges, speeds, accelerations and
-torques of its control interface. Masses, centres and inertias of the links are those identified by Gaz et al., "Dynamic
-identification of the Franka Emika Panda robot with retrieval of feasible parameters" (RA-L 2019); the drives' reflected
-inertias those published for the sister model FR3. The shapes are capsules, cylinders and boxes of our own.
+Kinematics and limits follow the manufacturer: modified Denavit-Hartenberg table, ranges, speeds, accelerations and
+torques of its control interface. Masses, centers and inertias of the links are those identified by Gaz et al., "Dynamic
+identification of the Franka Emika Panda robot with retrieval of feasible parameters" (RA-L 2019); reflected inertias of
+the drives those published for the sister model FR3. The capsules, cylinders and boxes are original.
 """
 
 from dataclasses import dataclass
@@ -14,14 +14,14 @@ import numpy as np
 
 from tableverse_factory.robotics.robots.arm import Arm, GripperShape
 from tableverse_factory.robotics.robots.panda_shapes import (
-    FINGER_LOOK,
+    COLLISION_SHAPES,
     FINGER_ROOT_M,
+    FINGER_VISUAL,
     HAND,
-    HAND_LOOK,
-    LOOK,
+    HAND_VISUAL,
     PAD,
     SHANK,
-    TOUCH,
+    VISUAL_SHAPES,
     LinkShape,
 )
 
@@ -29,17 +29,16 @@ COLLISION_GROUP, VISUAL_GROUP = 3, 2
 MAX_OPENING_M = 0.08
 GRIP_FORCE_N = 60.0
 PAD_FRICTION = (0.5, 0.01, 0.0001)
-"""Sliding, torsional [m], rolling [m]; the pads have priority, so that this holds whatever they touch."""
+"""Sliding, torsional [m], rolling [m]; the pads have contact priority, so it applies whatever they touch."""
 
 TCP_BEYOND_FLANGE_M = 0.1034
 LAG_S = 0.03
-"""Damping over stiffness of every servo [s]: the arm follows its command this much later, joint by joint alike, and so
-on the same path."""
+"""Damping over stiffness of every servo [s]: all joints follow their command equally late, so the path is kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Joint:
-    """A row of the table: `a` [m] and `alpha` [rad] of the link before, `d` [m], and what the drive can do."""
+    """Row of the DH table: `a` [m] and `alpha` [rad] of the previous link, `d` [m], and the drive's limits."""
 
     a: float
     alpha: float
@@ -54,7 +53,7 @@ class _Joint:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Mass [kg], centre of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m²], in the link's frame."""
+    """Mass [kg], center of mass [m], inertia about it (xx, yy, zz, xy, xz, yz) [kg m²], in the link's frame."""
 
     mass: float
     center: tuple[float, float, float]
@@ -89,14 +88,14 @@ _FINGER = _Link(0.015, (0.0, 0.012, 0.024), (2.4e-6, 2.4e-6, 7.5e-7, 0.0, 0.0, 0
 
 
 @lru_cache(maxsize=1)
-def panda() -> Arm:
-    """The arm; its TCP stands at (0.307, 0, 0.487) m with the gripper pointing down where it is at home."""
+def build_panda() -> Arm:
+    """Build the arm; at home its TCP is at (0.307, 0, 0.487) m with the gripper pointing down."""
     names = tuple(f"joint{index}" for index in range(1, len(JOINTS) + 1))
     tcp = np.array([0.0, 0.0, TCP_BEYOND_FLANGE_M])
     root = np.array([0.0, 0.0, FINGER_ROOT_M])
     return Arm(
         name="panda",
-        template=_spec(),
+        template=_build_spec(),
         base_body="link0",
         joint_names=names,
         actuator_names=names,
@@ -126,12 +125,12 @@ def panda() -> Arm:
     )
 
 
-def _spec() -> mujoco.MjSpec:
+def _build_spec() -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "panda"
     spec.compiler.degree = False
     body = _add_body(spec.worldbody, "link0", _LINKS[0])
-    _add_shapes(body, TOUCH[0], LOOK[0])
+    _add_shapes(body, COLLISION_SHAPES[0], VISUAL_SHAPES[0])
     for index, (joint, link) in enumerate(zip(JOINTS, _LINKS[1:], strict=True), start=1):
         body = _add_body(body, f"link{index}", link)
         cos, sin = np.cos(joint.alpha), np.sin(joint.alpha)
@@ -139,7 +138,7 @@ def _spec() -> mujoco.MjSpec:
         body.quat = [np.cos(joint.alpha / 2), np.sin(joint.alpha / 2), 0.0, 0.0]
         hinge = body.add_joint(name=f"joint{index}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
         hinge.range, hinge.armature = joint.range, joint.reflected_inertia
-        _add_shapes(body, TOUCH[index], LOOK[index])
+        _add_shapes(body, COLLISION_SHAPES[index], VISUAL_SHAPES[index])
         _add_servo(spec, f"joint{index}", joint)
         spec.add_exclude(bodyname1=f"link{index - 1}", bodyname2=f"link{index}")
     _add_gripper(spec, body)
@@ -187,7 +186,7 @@ def _add_gripper(spec: mujoco.MjSpec, wrist: mujoco.MjsBody) -> None:
     hand = _add_body(wrist, "hand", _HAND)
     hand.pos = [0.0, 0.0, FLANGE_M]
     hand.quat = [np.cos(np.pi / 8), 0.0, 0.0, -np.sin(np.pi / 8)]
-    _add_shapes(hand, (HAND,), HAND_LOOK)
+    _add_shapes(hand, (HAND,), HAND_VISUAL)
     hand.add_site(name="tcp", pos=[0.0, 0.0, TCP_BEYOND_FLANGE_M], size=[0.002, 0.002, 0.002])
     for name, turn in (("left", (1.0, 0.0, 0.0, 0.0)), ("right", (0.0, 0.0, 0.0, 1.0))):
         _add_finger(hand, name, turn)
@@ -204,7 +203,7 @@ def _add_finger(hand: mujoco.MjsBody, name: str, turn: tuple[float, float, float
     finger.pos, finger.quat = [0.0, 0.0, FINGER_ROOT_M], turn
     slide = finger.add_joint(name=f"finger_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0])
     slide.range, slide.armature = [0.0, MAX_OPENING_M / 2], 0.1
-    _add_shapes(finger, (SHANK,), FINGER_LOOK)
+    _add_shapes(finger, (SHANK,), FINGER_VISUAL)
     pad = _add_geom(finger, f"pad_{name}", PAD)
     pad.group = COLLISION_GROUP
     pad.condim, pad.friction, pad.priority = 4, PAD_FRICTION, 1
@@ -212,7 +211,7 @@ def _add_finger(hand: mujoco.MjsBody, name: str, turn: tuple[float, float, float
 
 
 def _couple_fingers(spec: mujoco.MjSpec) -> None:
-    """Both fingers move alike; one servo pulls at their sum, the opening, and so with its force at each."""
+    """Make both fingers move alike; one servo acts on their sum, the opening."""
     equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1="finger_right", name2="finger_left")
     equality.objtype = mujoco.mjtObj.mjOBJ_JOINT
     equality.data[:5] = [0.0, 1.0, 0.0, 0.0, 0.0]

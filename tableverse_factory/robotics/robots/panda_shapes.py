@@ -1,4 +1,4 @@
-"""The shapes of our Panda-like arm: some capsules and boxes to touch with, and nicer ones to look at.
+"""Collision and visual primitives of the Panda-like arm.
 
 Each is given in the frame of its link, whose z is the axis of the joint before it (`panda.JOINTS`).
 """
@@ -9,7 +9,6 @@ import mujoco
 
 Point = tuple[float, float, float]
 Rgba = tuple[float, float, float, float]
-
 WHITE: Rgba = (0.93, 0.94, 0.95, 1.0)
 GREY: Rgba = (0.62, 0.65, 0.69, 1.0)
 DARK: Rgba = (0.15, 0.16, 0.18, 1.0)
@@ -18,7 +17,7 @@ BLUE: Rgba = (0.16, 0.47, 0.78, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class LinkShape:
-    """A primitive: capsules and cylinders go from `a` to `b` [m], boxes have their middle `a` and half size `b` [m]."""
+    """Primitive shape: capsules and cylinders go from `a` to `b` [m]; boxes have middle `a` and half size `b` [m]."""
 
     kind: mujoco.mjtGeom
     a: Point
@@ -28,29 +27,27 @@ class LinkShape:
 
 
 def capsule(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> LinkShape:
-    """A cylinder with half balls at its ends, which reach beyond `a` and `b`."""
+    """Make a cylinder with half balls at its ends, which reach beyond `a` and `b`."""
     return LinkShape(mujoco.mjtGeom.mjGEOM_CAPSULE, a, b, radius, rgba)
 
 
 def cylinder(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> LinkShape:
-    """With flat ends at `a` and `b`."""
+    """Make a cylinder with flat ends at `a` and `b`."""
     return LinkShape(mujoco.mjtGeom.mjGEOM_CYLINDER, a, b, radius, rgba)
 
 
 def box(middle: Point, half_size: Point, rgba: Rgba = WHITE) -> LinkShape:
-    """Along the axes of the link."""
+    """Make a box along the axes of the link."""
     return LinkShape(mujoco.mjtGeom.mjGEOM_BOX, middle, half_size, 0.0, rgba)
 
 
-FINGER_ROOT_M = 0.0584
-"""Where the fingers begin, from the hand's flange."""
-
+FINGER_ROOT_M = 0.0584  # start of the fingers, from the hand's flange
 HAND = box((0.0, 0.0, 0.033), (0.0315, 0.102, 0.033))
 SHANK = box((0.0, 0.013, 0.018), (0.0105, 0.009, 0.018), GREY)
 PAD = box((0.0, 0.006, 0.045), (0.0105, 0.006, 0.0105), DARK)
-"""Of the left finger, in a frame whose y = 0 is the gripping face; its middle is at the height of the TCP."""
+"""Pad of the left finger, in a frame whose y = 0 is the gripping face; its middle is at the height of the TCP."""
 
-TOUCH: tuple[tuple[LinkShape, ...], ...] = (
+COLLISION_SHAPES: tuple[tuple[LinkShape, ...], ...] = (
     (box((-0.0375, 0.0, 0.035), (0.1, 0.095, 0.035)), cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.14), 0.075)),
     (capsule((0.0, 0.0, -0.17), (0.0, 0.0, 0.0), 0.06), capsule((0.0, -0.05, 0.0), (0.0, 0.05, 0.0), 0.06)),
     (capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06), capsule((0.0, -0.13, 0.0), (0.0, 0.0, 0.0), 0.06)),
@@ -73,9 +70,9 @@ TOUCH: tuple[tuple[LinkShape, ...], ...] = (
     ),
     (cylinder((0.0, 0.0, 0.03), (0.0, 0.0, 0.107), 0.045),),
 )
-"""Of links 0 to 7."""
+"""By link, 0 to 7."""
 
-LOOK: tuple[tuple[LinkShape, ...], ...] = (
+VISUAL_SHAPES: tuple[tuple[LinkShape, ...], ...] = (
     (
         box((-0.0375, 0.0, 0.004), (0.1, 0.095, 0.004), DARK),
         box((-0.045, 0.0, 0.037), (0.088, 0.082, 0.029)),
@@ -133,16 +130,16 @@ LOOK: tuple[tuple[LinkShape, ...], ...] = (
         cylinder((0.045, 0.045, 0.088), (0.045, 0.045, 0.092), 0.009, BLUE),
     ),
 )
-"""Of links 0 to 7."""
+"""By link, 0 to 7."""
 
-HAND_LOOK = (
+HAND_VISUAL = (
     cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.012), 0.041, GREY),
     box((0.0, 0.0, 0.034), (0.0285, 0.082, 0.024)),
     cylinder((0.0, 0.082, 0.01), (0.0, 0.082, 0.058), 0.0285),
     cylinder((0.0, -0.082, 0.01), (0.0, -0.082, 0.058), 0.0285),
     box((0.0, 0.0, 0.062), (0.016, 0.096, 0.004), DARK),
 )
-FINGER_LOOK = (
+FINGER_VISUAL = (
     box((0.0, 0.013, 0.006), (0.0105, 0.0095, 0.006), DARK),
     box((0.0, 0.0155, 0.024), (0.0095, 0.0065, 0.013), GREY),
     box((0.0, 0.0075, 0.045), (0.0098, 0.0045, 0.0102), GREY),

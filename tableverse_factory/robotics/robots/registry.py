@@ -1,4 +1,4 @@
-"""Arms by name: our own, those of the MuJoCo Menagerie, and files."""
+"""Arms by name: built-in arms, MuJoCo Menagerie models, and MJCF files."""
 
 import importlib
 from collections.abc import Callable, Mapping
@@ -11,39 +11,35 @@ from schemas.geometry import Vector3
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.robotics.robots.arm_file import arm_from_file
-from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.robots.arm_file import load_arm_file
+from tableverse_factory.robotics.robots.panda import build_panda
 
-ARMS: Mapping[str, Callable[[], Arm]] = {"panda": panda}
-"""Arms that are written here."""
-
+ARMS: Mapping[str, Callable[[], Arm]] = {"panda": build_panda}  # built-in arms
 MENAGERIE_PREFIX = "menagerie:"
 MENAGERIE_TCPS: Mapping[str, tuple[str, Vector3]] = {"franka_emika_panda": ("hand", np.array([0.0, 0.0, 0.1034]))}
-"""Body and place in it of the TCP, for models without a site `tcp` [m]."""
+"""Body and position of the TCP in its frame, for models without a site `tcp` [m]."""
 
 
 @lru_cache(maxsize=8)
-def arm_of(name: str) -> Arm:
-    """The arm of this name: `panda`, `menagerie:NAME`, or a file `….xml`.
-
-    A file that changes while the process runs is not read again.
+def load_arm(name: str) -> Arm:
+    """Load the arm `panda`, `menagerie:NAME`, or the file `….xml`; a file that changes later is not read again.
 
     Raises:
-        ConfigError: if there is none of this name, or its package is missing.
-        InputError: if the file is not the MJCF of an arm with all that is needed (`arm_file`).
+        ConfigError: if the name is unknown, or its package is missing.
+        InputError: if the file is not a usable arm (`arm_file`).
     """
     if name in ARMS:
         return ARMS[name]()
     if name.startswith(MENAGERIE_PREFIX):
-        return _menagerie_arm(name)
+        return _load_menagerie_arm(name)
     if name.endswith(".xml"):
-        return arm_from_file(Path(name).absolute(), name)
+        return load_arm_file(Path(name).absolute(), name)
     known = ", ".join(repr(known) for known in ARMS)
     raise ConfigError(f"no robot {sanitize_line(name, 80)!r}: give {known}, '{MENAGERIE_PREFIX}NAME' or a file '….xml'")
 
 
-def _menagerie_arm(name: str) -> Arm:
-    """The model's own default file, which the package fetches on first use."""
+def _load_menagerie_arm(name: str) -> Arm:
+    """Load a model's default file, which the package fetches on first use."""
     model = name.removeprefix(MENAGERIE_PREFIX)
     try:
         menagerie = importlib.import_module("mujoco_menagerie")
@@ -54,4 +50,4 @@ def _menagerie_arm(name: str) -> Arm:
         path = Path(robot.xml(robot.default_model))
     except (menagerie.MenagerieError, OSError) as error:
         raise ConfigError(f"robot {sanitize_line(name, 80)!r}: {sanitize_line(str(error), 400)}") from error
-    return arm_from_file(path, name, MENAGERIE_TCPS.get(model))
+    return load_arm_file(path, name, MENAGERIE_TCPS.get(model))

@@ -1,4 +1,4 @@
-"""An exported scene with an arm in it: one compiled model, in which the arm's base is moved without compiling again."""
+"""Exported scene with an arm: one compiled model whose arm base moves without recompiling."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -11,37 +11,32 @@ from schemas.geometry import Points, Pose
 from schemas.trajectories import JointVector, Numbers
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
-from tableverse_factory.geometry.relations.relations import Points2, outline_of
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.geometry.relations.relations import Points2, compute_outline
 from tableverse_factory.physics.mjcf.file_check import check_references
-from tableverse_factory.physics.simulate.at_rest import free_bodies, quiet_data
-from tableverse_factory.physics.simulate.model_solids import geom_shape
+from tableverse_factory.physics.simulate.at_rest import find_free_bodies, make_quiet_data
+from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import Arm
 
-PREFIX = "robot/"
-"""Of every name of the arm in the scene's model."""
-
+PREFIX = "robot/"  # prefix of the arm's names in the scene's model
 PEDESTAL_HEIGHT_M = 0.75
 PEDESTAL_TOP_M = -0.002
-"""Just below the foot of the base: what stands on the table has it inside the slab, where nobody sees it."""
+"""Just below the base's foot: for an arm on the table, the pedestal's top is hidden inside the slab."""
 
-PEDESTAL_SHARE = 0.75
-"""Radius of the pedestal over that of the foot's circle."""
-
-_SIZES = ("memory", "nstack", "njmax", "nconmax", "nuserdata")
+PEDESTAL_SHARE = 0.75  # radius of the pedestal over that of the foot's circle
+_SIZE_FIELDS = ("memory", "nstack", "njmax", "nconmax", "nuserdata")
 _PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
 _COLLISION_GROUP, _VISUAL_GROUP = 3, 2
-
 Ids = Int64[np.ndarray, "n"]
 
 
 class Station:
-    """The scene's bodies and the arm's in one model.
+    """Scene and arm in one model.
 
     Attributes:
-        arm: As it was attached.
+        arm: As attached.
         model: Compiled; only `place_base` changes it.
-        base: Where the arm's base stands, in the table frame.
+        base: Pose of the arm's base in the table frame.
         base_body: Id of the body that carries the arm and its pedestal.
         joint_qpos: Addresses of the arm's joints in qpos. Shape (j,).
         joint_dof: Addresses of the arm's joints in qvel. Shape (j,).
@@ -49,31 +44,31 @@ class Station:
         gripper_actuator: Id of the gripper's actuator.
         finger_qpos: Addresses of the fingers' joints in qpos. Shape (k,).
         finger_dof: Addresses of the fingers' joints in qvel. Shape (k,).
-        finger_geoms: Ids of the geoms that may touch what is gripped.
+        finger_geoms: Ids of the geoms that may touch the gripped object.
         arm_bodies: Ids of all bodies of the arm, its base included, ascending.
         tcp_site: Id of the site between the fingertips.
-        object_ids: Of the scene's objects, in the order of the model.
-        object_bodies: Id of each object's body.
-        object_qpos: Address of each object's position and quaternion in qpos.
-        object_dof: Address of each object's linear and angular velocity in qvel.
+        object_ids: The scene's objects, in the order of the model.
+        object_bodies: Body id by object id.
+        object_qpos: Address in qpos of each object's position and quaternion.
+        object_dof: Address in qvel of each object's linear and angular velocity.
     """
 
     def __init__(
         self, files: Mapping[str, bytes], arm: Arm, base: Pose | None = None, *, visuals: bool = False
     ) -> None:
-        """Compiles the scene's files and the arm.
+        """Compile the scene's files with the arm.
 
         Args:
-            files: `scene.xml` and what lies in `assets/`, as exported.
+            files: `scene.xml` and files under `assets/`, as exported.
             arm: Attached below a static body `robot/pedestal`.
-            base: Where the arm's base stands, in the table frame; 0.55 m in front of the origin by default.
-            visuals: Keep what is only seen. Without it the model simulates the same and compiles faster.
+            base: Pose of the arm's base in the table frame; 0.55 m in front of the origin by default.
+            visuals: Keep visual geoms. Without them the model simulates the same and compiles faster.
 
         Raises:
-            InputError: `bad_mjcf` if the files do not load, or no arm can be attached to them.
+            InputError: `bad_mjcf` if the files do not load, or the arm cannot be attached to them.
         """
         self.arm = arm
-        self.model = _compiled(files, arm, visuals)
+        self.model = _compile_station(files, arm, visuals)
         model = self.model
         joints = [model.joint(PREFIX + name).id for name in arm.joint_names]
         fingers = [model.joint(PREFIX + name).id for name in arm.finger_joints]
@@ -88,7 +83,7 @@ class Station:
         self.tcp_site = int(model.site(PREFIX + arm.tcp_site).id)
         self.base_body = int(model.body(f"{PREFIX}pedestal").id)
         self.arm_bodies: Ids = np.flatnonzero([_stands_on(model, body, self.base_body) for body in range(model.nbody)])
-        free = free_bodies(model)
+        free = find_free_bodies(model)
         self.object_ids = tuple(model.body(body).name for body in free)
         self.object_bodies = dict(zip(self.object_ids, free, strict=True))
         self.object_qpos = {
@@ -100,7 +95,7 @@ class Station:
 
     @property
     def pedestal_radius_m(self) -> float:
-        """Of the column below the base [m]."""
+        """Radius of the column below the base [m]."""
         return PEDESTAL_SHARE * self.arm.base_radius_m
 
     @cached_property
@@ -108,21 +103,19 @@ class Station:
         """Convex outline of each object as exported, seen from above, counter-clockwise. Each of shape (n, 2) [m]."""
         data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, data)
-        return tuple(outline_of(_points(self.model, data, body)[:, :2]) for body in self.object_bodies.values())
+        return tuple(
+            compute_outline(_collect_vertices(self.model, data, body)[:, :2]) for body in self.object_bodies.values()
+        )
 
     def place_base(self, base: Pose) -> None:
-        """Moves the base with all that stands on it. Data made before are stale: make fresh ones.
-
-        Args:
-            base: Frame of the arm's root body in the table frame.
-        """
-        self.base = Pose(np.array(base.position), normalized_quaternion(base.quaternion_wxyz))
+        """Move the arm's root body to a pose in the table frame. Existing data become stale: make fresh ones."""
+        self.base = Pose(np.array(base.position), normalize_quaternion(base.quaternion_wxyz))
         self.model.body_pos[self.base_body] = self.base.position
         self.model.body_quat[self.base_body] = self.base.quaternion_wxyz
 
     def data(self) -> mujoco.MjData:
-        """Fresh data: the objects as exported, the arm at home with open fingers, its servos told to stay there."""
-        data = quiet_data(self.model)
+        """Make fresh data: objects as exported, the arm held at home with open fingers."""
+        data = make_quiet_data(self.model)
         self.set_arm(data, self.arm.home, self.arm.max_opening_m)
         data.ctrl[self.joint_actuators] = self.arm.home
         data.ctrl[self.gripper_actuator] = self.arm.gripper_command(self.arm.max_opening_m)
@@ -130,45 +123,35 @@ class Station:
         return data
 
     def set_arm(self, data: mujoco.MjData, joints: JointVector, opening_m: float) -> None:
-        """Puts the arm's joints and fingers at positions; nothing else changes, and nothing is computed from it."""
+        """Set positions of the arm's joints and fingers; derived quantities are not recomputed."""
         data.qpos[self.joint_qpos] = joints
         data.qpos[self.finger_qpos] = self.arm.finger_positions(opening_m)
 
     def control(self, data: mujoco.MjData, command: Numbers) -> None:
-        """Tells the servos where to go.
-
-        Args:
-            data: Whose controls are set.
-            command: Targets of the joints [rad], then the opening [m]. Shape (j + 1,).
-        """
+        """Set the servos' targets: joints [rad], then the opening [m]. Shape of `command`: (j + 1,)."""
         data.ctrl[self.joint_actuators] = command[:-1]
         data.ctrl[self.gripper_actuator] = self.arm.gripper_command(float(command[-1]))
 
     def opening(self, data: mujoco.MjData) -> float:
-        """The distance between the fingertips as it is [m], by where the fingers' joints stand."""
+        """Compute the distance between the fingertips from the finger joints [m]."""
         arm = self.arm
         span = arm.finger_open - arm.finger_closed
         share = (data.qpos[self.finger_qpos] - arm.finger_closed) @ span / (span @ span)
         return float(share) * arm.max_opening_m
 
 
-def _points(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Points:
-    """Corners of all geoms of a free body in the world; where it has none, its origin. Shape (n, 3) [m]."""
+def _collect_vertices(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Points:
+    """Collect world vertices of all geoms of a free body, or its origin if it has none. Shape (n, 3) [m]."""
     points = [data.xpos[body][None].copy()]
     for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == body):
-        shape = geom_shape(model, int(geom))
+        shape = make_geom_mesh(model, int(geom))
         if shape is not None:
             points.append(shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
     return np.concatenate(points[1:] or points)
 
 
-def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) -> mujoco.MjSpec:
-    """The scene and the arm as one specification, not yet compiled; the pedestal `robot/pedestal` is at the origin.
-
-    Args:
-        files: `scene.xml` and what lies in `assets/`.
-        arm: Attached below the pedestal.
-        visuals: Keep what is only seen.
+def build_station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) -> mujoco.MjSpec:
+    """Build the uncompiled specification of scene and arm; the pedestal `robot/pedestal` is at the origin.
 
     Raises:
         InputError: `bad_mjcf` if the files do not load.
@@ -180,28 +163,28 @@ def station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) ->
     try:
         spec = mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
         if not visuals:
-            drop_visual_meshes(spec)
+            delete_visual_meshes(spec)
             spec.compiler.discardvisual = True
-        _attach(spec, arm)
+        _attach_arm(spec, arm)
         return spec
     except (ValueError, UnicodeDecodeError) as error:
-        raise _does_not_load(arm, error) from error
+        raise _load_error(arm, error) from error
 
 
-def _compiled(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjModel:
-    spec = station_spec(files, arm, visuals)
+def _compile_station(files: Mapping[str, bytes], arm: Arm, visuals: bool) -> mujoco.MjModel:
+    spec = build_station_spec(files, arm, visuals)
     try:
         return spec.compile()
     except ValueError as error:
-        raise _does_not_load(arm, error) from error
+        raise _load_error(arm, error) from error
 
 
-def _does_not_load(arm: Arm, error: Exception) -> InputError:
+def _load_error(arm: Arm, error: Exception) -> InputError:
     message = sanitize_line(str(error), 500)
     return InputError(f"scene.xml with the arm {arm.name!r} does not load: {message}", "bad_mjcf")
 
 
-def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
+def _attach_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
     pedestal = spec.worldbody.add_body(name=f"{PREFIX}pedestal")
     for name, group, touches in (("pedestal", _COLLISION_GROUP, 1), ("pedestal_look", _VISUAL_GROUP, 0)):
         column = pedestal.add_geom(name=f"{PREFIX}{name}", type=mujoco.mjtGeom.mjGEOM_CYLINDER, group=group)
@@ -209,16 +192,16 @@ def _attach(spec: mujoco.MjSpec, arm: Arm) -> None:
         column.size = [PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2, 0.0]
         column.rgba, column.contype, column.conaffinity = _PEDESTAL_RGBA, touches, touches
     child = arm.spec()
-    adopt_settings(child, spec)
+    copy_simulation_settings(child, spec)
     pedestal.add_frame().attach_body(child.body(arm.base_body), PREFIX, "")
 
 
-def adopt_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
-    """Gives a specification the scene's settings of the simulation: they count, and MuJoCo warns of any others."""
+def copy_simulation_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
+    """Copy the scene's simulation settings to a specification: the scene's apply, and MuJoCo warns of others."""
     for own, theirs in ((child.option, scene.option), *_parts(child.visual, scene.visual)):
         for name in _fields(own):
             setattr(own, name, getattr(theirs, name))
-    for name in _SIZES:
+    for name in _SIZE_FIELDS:
         setattr(child, name, getattr(scene, name))
 
 
@@ -230,8 +213,8 @@ def _fields(settings: object) -> list[str]:
     return [name for name in dir(settings) if not name.startswith("_")]
 
 
-def drop_visual_meshes(spec: mujoco.MjSpec) -> None:
-    """Takes away the meshes that touch nothing: the compiler would read each before it discards it."""
+def delete_visual_meshes(spec: mujoco.MjSpec) -> None:
+    """Delete meshes that do not collide, which the compiler would read before discarding them."""
     for geom in spec.geoms:
         if geom.contype == 0 and geom.conaffinity == 0 and geom.meshname:
             spec.delete(geom)

@@ -1,4 +1,4 @@
-"""Whether robot, planner and grasp model are there, asked before a dataset waits for them."""
+"""Availability check of robot, planner and grasp model before a build."""
 
 import importlib.util
 from pathlib import Path
@@ -10,32 +10,32 @@ from schemas.config import TrajectoriesConfig
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.grasps.remote import ask
+from tableverse_factory.robotics.grasps.remote import request_grasps
 from tableverse_factory.robotics.motion.curobo import ROBOT_FILES
 from tableverse_factory.robotics.motion.interfaces import PLANNERS
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.registry import load_arm
 
-_TRIAL_M = 0.05
+_CUBE_M = 0.05
 
 
-def check_all(config: TrajectoriesConfig, here: bool) -> None:
-    """Reads the robot, loads the planner and asks the grasp server once.
+def check_trajectory_models(config: TrajectoriesConfig, here: bool) -> None:
+    """Load the robot and planner, and query the grasp server once.
 
     Args:
-        config: The names.
-        here: Whether the stages run on this machine: else its GPU and what it reaches say nothing about theirs.
+        config: Their names.
+        here: Whether the stages run on this machine, so that its GPU and network say something about theirs.
 
     Raises:
-        ConfigError: if there is no such robot, or its planner is not installed or does not know it.
-        InputError: if the robot's file is no arm.
-        ModelAccessError: if the grasp server refuses to be asked.
-        ModelError: if the planner finds no GPU, or the grasp server gives no answer or none that is one.
+        ConfigError: if the robot is unknown, or its planner is not installed or does not support it.
+        InputError: if the robot's file is not a usable arm.
+        ModelAccessError: if the grasp server refuses access.
+        ModelError: if the planner finds no GPU, or the grasp server gives no valid answer.
     """
-    arm = arm_of(config.robot)
+    arm = load_arm(config.robot)
     if config.planner == "curobo":
         _check_curobo(arm.name, here)
     if config.grasp_model == "graspgen" and here:
-        _ask_once(config)
+        _check_grasp_server(config)
 
 
 def _check_curobo(robot: str, here: bool) -> None:
@@ -55,10 +55,10 @@ def _check_curobo(robot: str, here: bool) -> None:
         PLANNERS["curobo"]()
 
 
-def _ask_once(config: TrajectoriesConfig) -> None:
-    """About a cube on the table; nothing of it is kept."""
+def _check_grasp_server(config: TrajectoriesConfig) -> None:
+    """Request grasps of a cube on the table, with a temporary cache."""
     cube = from_trimesh(
-        trimesh.creation.box((_TRIAL_M,) * 3, trimesh.transformations.translation_matrix((0, 0, _TRIAL_M / 2)))
+        trimesh.creation.box((_CUBE_M,) * 3, trimesh.transformations.translation_matrix((0, 0, _CUBE_M / 2)))
     )
     with TemporaryDirectory() as folder:
-        ask(cube, config, Services(Path(folder)))
+        request_grasps(cube, config, Services(Path(folder)))

@@ -1,6 +1,6 @@
-"""TRAJECTORIES: for every accepted task of an exported scene a motion that physics has agreed to, or why there is none.
+"""Stage TRAJECTORIES: for every accepted task a motion that succeeds in physics, or the reason why there is none.
 
-What a task costs where its planner crashes or hangs is that task: each runs in a process apart (`apart.py`).
+Each task runs in a forked process (`fork_pool`), so a planner that crashes or hangs costs only its own task.
 """
 
 from collections.abc import Mapping
@@ -15,46 +15,44 @@ from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
 from tableverse_factory.dataset.trajectory_files import arrays_name
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.execution.arrays import arrays_bytes
-from tableverse_factory.robotics.robots.reach import reach_of
-from tableverse_factory.robotics.robots.registry import arm_of
-from tableverse_factory.stages.trajectories.failed_rows import accepted_tasks, failed_row
+from tableverse_factory.robotics.execution.arrays import encode_recording
+from tableverse_factory.robotics.robots.reach import compute_reach_map
+from tableverse_factory.robotics.robots.registry import load_arm
+from tableverse_factory.stages.trajectories.failed_rows import build_failed_row, select_accepted_tasks
 from tableverse_factory.stages.trajectories.fork_pool import ItemFailure, map_in_fork
-from tableverse_factory.stages.trajectories.rows import trajectory_row
-from tableverse_factory.stages.trajectories.search import search
+from tableverse_factory.stages.trajectories.rows import build_trajectory_row
+from tableverse_factory.stages.trajectories.search import search_trajectory
 from tableverse_factory.stages.trajectories.work_cell import WorkCell
 
 
-def trajectories(
+def plan_trajectories(
     scene: ExportedScene, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[ExportedScene]:
-    """The scene with a row per accepted task, and a file of arrays for each motion that was executed.
-
-    A scene is never lost here: a task without a trajectory has its reason in its row.
+    """Add a row per accepted task, and a file of arrays for each executed motion; a scene never fails here.
 
     Raises:
         InputError: if the files are not those of an exported scene.
-        ConfigError: if there is no such robot, or its planner knows none of it.
-        ModelError: if the grasp model or the planner does not answer: no task is to blame, and none gets a row for it.
+        ConfigError: if the robot is unknown, or its planner does not support it.
+        ModelError: if the grasp model or the planner does not answer, which no task is to blame for.
     """
     settings = config.trajectories
-    tasks = accepted_tasks(scene, settings)
+    tasks = select_accepted_tasks(scene, settings)
     for_things, for_tasks = rng.spawn(2)
     if not tasks:
         return Done(replace(scene, trajectory_rows=()))
-    arm = arm_of(settings.robot)
-    reach_of(arm)  # once, here, for all of the processes apart
+    arm = load_arm(settings.robot)
+    compute_reach_map(arm)  # once, here, for all of the processes apart
     cell = WorkCell(scene, arm, settings, for_things, services)
     streams = for_tasks.spawn(len(tasks))
 
     def work(index: int) -> bytes:
-        return encode(_trajectory(cell, tasks[index], config, streams[index]))
+        return encode(_plan_task(cell, tasks[index], config, streams[index]))
 
     answers = map_in_fork(work, len(tasks), settings.task_deadline_s, config.run.memory_mb)
     rows, files = [], dict(scene.files)
     for task, answer in zip(tasks, answers, strict=True):
         if isinstance(answer, ItemFailure):
-            rows.append(failed_row(task, settings, answer.kind, answer.detail))
+            rows.append(build_failed_row(task, settings, answer.kind, answer.detail))
             continue
         row, arrays = decode(answer)
         rows.append(row)
@@ -63,12 +61,12 @@ def trajectories(
     return Done(replace(scene, files=tuple(sorted(files.items())), trajectory_rows=tuple(rows)))
 
 
-def _trajectory(
+def _plan_task(
     cell: WorkCell, task: Mapping[str, Any], config: Config, rng: np.random.Generator
 ) -> tuple[dict[str, Any], bytes]:
-    """Row and arrays of one task; no bytes where nothing was executed."""
-    found = search(cell, task, config.trajectories, rng)
+    """Plan one task; return its row and arrays, empty if nothing was executed."""
+    found = search_trajectory(cell, task, config.trajectories, rng)
     proof = None if found.attempt is None else found.attempt.proof
     name = None if proof is None else arrays_name(task["task_id"])
-    arrays = b"" if proof is None else arrays_bytes(proof.recording)
-    return trajectory_row(task, config.trajectories, found, name), arrays
+    arrays = b"" if proof is None else encode_recording(proof.recording)
+    return build_trajectory_row(task, config.trajectories, found, name), arrays

@@ -61,7 +61,7 @@ def test_our_own_arms_stay_themselves_whatever_is_given(fifo):
 def test_an_arm_with_other_joints_is_refused():
     other = recording(3)
     other = replace(other, command=other.command[:, 1:], qpos=other.qpos[:, 1:], qvel=other.qvel[:, 1:])
-    with pytest.raises(InputError, match="of 6 joints, and panda has 7") as refused:
+    with pytest.raises(InputError, match="6 joints, but panda has 7") as refused:
         load_recorded_arm(other)
     assert refused.value.reason == "another_robot"
 

@@ -43,7 +43,7 @@ def test_gymnasium_finds_nothing_to_complain_about(out):
     """Its checker warns where it is not content, and warnings are errors here."""
     env = gymnasium.make(ID, dataset=str(out), scene="s-0", task="task_000", camera=(48, 64), render_size=(48, 64))
     check_env(env.unwrapped)
-    assert env.unwrapped.cell.instruction == "Pick up the wooden block and place it next to the bowl"
+    assert env.unwrapped.sim.instruction == "Pick up the wooden block and place it next to the bowl"
 
 
 def test_a_recorded_success_is_one_and_a_recorded_failure_is_none(scene):
@@ -153,7 +153,7 @@ def test_wide_moves_leave_everything_standing_on_the_table(scene):
 
 def test_places_that_were_tried_leave_no_trace(scene):
     """A place that is taken may fill MuJoCo's memory: its warning would end the episode as unstable."""
-    station = TableEnv(scene, "task_000").cell.station
+    station = TableEnv(scene, "task_000").sim.station
     data = station.data()
     mujoco.mj_forward(station.model, data)
     before = copy.copy(data)
@@ -188,7 +188,7 @@ def test_pictures_follow_what_happens(scene):
 
 
 def test_an_episode_ends_when_it_cannot_succeed_or_takes_too_long(scene):
-    recording, base = scene.trajectory("task_000").recording(), TableEnv(scene, "task_000").cell.station.base
+    recording, base = scene.trajectory("task_000").recording(), TableEnv(scene, "task_000").sim.station.base
     env = TableEnv(scene, {"x_id": "obj_001", "y_id": "obj_002", "relation": "next to"}, base=base)
     _, rewards, terminated, info = replayed(env, recording)
     assert (sum(rewards), terminated, info["failure"]) == (0.0, True, "disturbed"), "the block was none of its business"

@@ -11,7 +11,7 @@ import pytest
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.robotics.execution import arrays
-from tableverse_factory.robotics.execution.arrays import FORMAT, Recording, arrays_bytes, read_arrays
+from tableverse_factory.robotics.execution.arrays import FORMAT, Recording, decode_recording, encode_recording
 
 LENGTH = 7
 
@@ -63,7 +63,7 @@ def ids(text: str) -> np.ndarray:
 
 
 def test_what_is_written_is_read_bit_by_bit(recording: Recording) -> None:
-    read = read_arrays(arrays_bytes(recording))
+    read = decode_recording(encode_recording(recording))
     for field in fields(Recording):
         before, after = getattr(recording, field.name), getattr(read, field.name)
         if isinstance(before, np.ndarray):
@@ -73,11 +73,11 @@ def test_what_is_written_is_read_bit_by_bit(recording: Recording) -> None:
     assert np.array_equal(read.base.quaternion_wxyz, recording.base.quaternion_wxyz)
     assert (read.robot, read.step_s, read.max_disturbed_m) == ("panda", 0.02, 0.02)
     assert read.moved_ids == recording.moved_ids
-    assert arrays_bytes(read) == arrays_bytes(recording)
+    assert encode_recording(read) == encode_recording(recording)
 
 
 def test_numpy_reads_it_without_pickle(recording: Recording) -> None:
-    with np.load(io.BytesIO(arrays_bytes(recording)), allow_pickle=False) as found:
+    with np.load(io.BytesIO(encode_recording(recording)), allow_pickle=False) as found:
         assert found["format"].tobytes() == FORMAT.encode()
         assert found["robot"].tobytes() == b"panda"
         assert found["base"].shape == (7,)
@@ -86,7 +86,7 @@ def test_numpy_reads_it_without_pickle(recording: Recording) -> None:
 
 
 def test_no_clock_is_in_the_bytes(recording: Recording) -> None:
-    with zipfile.ZipFile(io.BytesIO(arrays_bytes(recording))) as archive:
+    with zipfile.ZipFile(io.BytesIO(encode_recording(recording))) as archive:
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
         assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
 
@@ -132,17 +132,17 @@ def test_no_clock_is_in_the_bytes(recording: Recording) -> None:
     ],
 )
 def test_what_is_wrong_is_named(recording: Recording, name: str, value: object, found: str) -> None:
-    files = members(arrays_bytes(recording))
+    files = members(encode_recording(recording))
     files[f"{name}.npy"] = npy(value)
     with pytest.raises(InputError, match="no arrays of tableverse-trajectory-1") as caught:
-        read_arrays(packed(files), "trajectories/task_000.npz")
+        decode_recording(packed(files), "trajectories/task_000.npz")
     assert found in str(caught.value)
     assert caught.value.reason == "bad_arrays"
     assert str(caught.value).startswith("trajectories/task_000.npz")
 
 
 def test_bombs_and_rubbish_are_refused(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    good = arrays_bytes(recording)
+    good = encode_recording(recording)
     files = members(good)
     vast, lying = (files["command.npy"].replace(b"(7, 8)", shape) for shape in (b"(9**9)", b"(9, 8)"))
     hostile = [
@@ -161,15 +161,15 @@ def test_bombs_and_rubbish_are_refused(recording: Recording, monkeypatch: pytest
     ]
     for data in hostile:
         with pytest.raises(InputError):
-            read_arrays(data)
+            decode_recording(data)
     for place in range(0, len(good), 97):  # one flipped byte is found by the zip's own sums, or leaves what is valid
         flipped = bytearray(good)
         flipped[place] ^= 0x55
         with suppress(InputError):
-            read_arrays(bytes(flipped))
+            decode_recording(bytes(flipped))
     monkeypatch.setattr(arrays, "MAX_BYTES", len(good) - 1)
     with pytest.raises(InputError, match="longer than"):
-        read_arrays(good)
+        decode_recording(good)
 
 
 def test_a_long_recording_stays_small(recording: Recording) -> None:
@@ -186,8 +186,8 @@ def test_a_long_recording_stays_small(recording: Recording) -> None:
         moved_ids=("obj_003",),
         moved_poses=few,
     )
-    assert len(arrays_bytes(long)) < 200_000
-    assert len(arrays_bytes(long)) - len(arrays_bytes(unmoved(long))) == 500 * 28 + len("obj_003")
+    assert len(encode_recording(long)) < 200_000
+    assert len(encode_recording(long)) - len(encode_recording(unmoved(long))) == 500 * 28 + len("obj_003")
 
 
 def unmoved(recording: Recording) -> Recording:
@@ -195,7 +195,7 @@ def unmoved(recording: Recording) -> Recording:
 
 
 def test_nothing_moved_is_read_too(recording: Recording) -> None:
-    read = read_arrays(arrays_bytes(unmoved(recording)))
+    read = decode_recording(encode_recording(unmoved(recording)))
     assert (read.moved_ids, read.moved_poses.shape) == ((), (LENGTH, 0, 7))
 
 
@@ -208,7 +208,7 @@ def test_no_recording_takes_longer_than_two_minutes(
     times = (np.arange(samples) * step_s).astype(np.float32)
     long = unmoved(replace(recording, **columns, step_s=step_s, time_s=times))
     if fits:
-        assert len(read_arrays(arrays_bytes(long))) == samples
+        assert len(decode_recording(encode_recording(long))) == samples
     else:
         with pytest.raises(InputError, match=r"more than 120 s|30002 samples"):
-            read_arrays(arrays_bytes(long))
+            decode_recording(encode_recording(long))

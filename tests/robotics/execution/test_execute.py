@@ -11,13 +11,17 @@ from schemas.geometry import Pose
 from schemas.trajectories import Phase
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.robotics.execution import rollout
-from tableverse_factory.robotics.execution.arrays import MAX_DURATION_S, arrays_bytes, read_arrays
-from tableverse_factory.robotics.execution.execute import REST_S, Proof, execute_and_check
-from tableverse_factory.robotics.execution.goal import goal_of
-from tableverse_factory.robotics.execution.perturbations import CHANGES, changed, robust_to
-from tableverse_factory.robotics.execution.rollout import Execution, commands_of
+from tableverse_factory.robotics.execution.arrays import MAX_DURATION_S, decode_recording, encode_recording
+from tableverse_factory.robotics.execution.execute import MAX_SETTLE_S, RolloutResult, execute_and_check
+from tableverse_factory.robotics.execution.goal import load_goal
+from tableverse_factory.robotics.execution.perturbations import (
+    PERTURBATIONS,
+    find_survived_perturbations,
+    perturb_station,
+)
+from tableverse_factory.robotics.execution.rollout import Rollout, build_commands
 from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.picking import (
     BASE,
@@ -34,17 +38,17 @@ from tests.helpers.picking import (
 
 
 @pytest.fixture(scope="module")
-def good() -> Proof:
+def good() -> RolloutResult:
     return execute_and_check(station(), BASE, pick_and_place(), goal())
 
 
-def speed_at_the_end(proof: Proof) -> float:
+def speed_at_the_end(proof: RolloutResult) -> float:
     """Of the object, over the last two samples [m/s]."""
     before, last = proof.recording.object_pose[-2:, :3].astype(np.float64)
     return float(np.linalg.norm(last - before)) / STEP_S
 
 
-def test_a_good_motion_succeeds(good: Proof) -> None:
+def test_a_good_motion_succeeds(good: RolloutResult) -> None:
     verdict = good.verdict
     assert (verdict.success, verdict.failed_phase, verdict.reason, verdict.detail) == (True, "", "", "")
     assert verdict.lifted_m == pytest.approx(0.16, abs=0.01)
@@ -52,7 +56,7 @@ def test_a_good_motion_succeeds(good: Proof) -> None:
     assert speed_at_the_end(good) < 1e-3
 
 
-def test_what_is_recorded_is_what_was_told_and_what_happened(good: Proof) -> None:
+def test_what_is_recorded_is_what_was_told_and_what_happened(good: RolloutResult) -> None:
     recording, motion = good.recording, pick_and_place()
     told = len(motion.positions)
     assert np.array_equal(recording.command[:told], np.column_stack([motion.positions, motion.openings]))
@@ -68,7 +72,7 @@ def test_what_is_recorded_is_what_was_told_and_what_happened(good: Proof) -> Non
     assert np.ptp(apart) < 1e-3, "the object goes with the gripper"
 
 
-def test_the_arm_is_moved_by_its_servos_alone(good: Proof) -> None:
+def test_the_arm_is_moved_by_its_servos_alone(good: RolloutResult) -> None:
     """Nothing jumps: positions are the integral of speeds, and no servo pulls harder than its limit."""
     recording = good.recording
     steps = np.diff(recording.qpos.astype(np.float64), axis=0)
@@ -79,24 +83,26 @@ def test_the_arm_is_moved_by_its_servos_alone(good: Proof) -> None:
     assert not station().model.neq or (station().model.eq_type != mujoco.mjtEq.mjEQ_WELD).all()
 
 
-def test_the_same_again_gives_the_same_bytes(good: Proof) -> None:
+def test_the_same_again_gives_the_same_bytes(good: RolloutResult) -> None:
     motion = pick_and_place()
     station().place_base(Pose(np.array([0.3, -0.4, 0.0]), BASE.quaternion_wxyz))
     again = execute_and_check(station(), BASE, motion, goal())
     assert again.verdict == good.verdict
-    assert arrays_bytes(again.recording) == arrays_bytes(good.recording)
+    assert encode_recording(again.recording) == encode_recording(good.recording)
 
 
 def test_an_open_gripper_grasps_nothing() -> None:
     proof = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
     assert (proof.verdict.failed_phase, proof.verdict.reason) == ("grasp", "not_grasped")
-    assert len(proof.recording) == commands_of(pick_and_place()).last_of(Phase.GRASP) + 1, "it ends where it is certain"
+    assert len(proof.recording) == build_commands(pick_and_place()).last_of(Phase.GRASP) + 1, (
+        "it ends where it is certain"
+    )
 
 
 @pytest.mark.parametrize(("share", "reason"), [(1.5, ""), (0.7, "slipped")])
 def test_what_is_slippery_slips(share: float, reason: str) -> None:
     """Two pads that press with F hold a mass m as long as 2 µ F > m g."""
-    slippery = changed(station(), "friction_doubled", BLOCK)
+    slippery = perturb_station(station(), "friction_doubled", BLOCK)
     weight = 9.81 * slippery.model.body_mass[slippery.object_bodies[BLOCK]]
     slippery.model.geom_friction[slippery.finger_geoms, :2] = share * weight / (2 * GRIP_FORCE_N)
     verdict = execute_and_check(slippery, BASE, pick_and_place(), goal()).verdict
@@ -115,8 +121,8 @@ def test_a_gripper_that_opens_too_early_drops() -> None:
 
 
 def test_what_is_too_heavy_slips() -> None:
-    heavy = changed(station(), "mass_plus_30", BLOCK)
-    grow, _ = CHANGES["mass_plus_30"]
+    heavy = perturb_station(station(), "mass_plus_30", BLOCK)
+    grow, _ = PERTURBATIONS["mass_plus_30"]
     grow(heavy, heavy.object_bodies[BLOCK], 30.0)
     assert execute_and_check(heavy, BASE, pick_and_place(), goal()).verdict.reason == "slipped"
 
@@ -179,15 +185,15 @@ def test_an_arm_that_does_not_stand_where_it_should_is_found() -> None:
 
 
 def test_nonsense_ends_as_unstable_and_not_in_numbers_that_look_good() -> None:
-    broken = changed(station(), "mass_minus_30", BLOCK)
+    broken = perturb_station(station(), "mass_minus_30", BLOCK)
     broken.model.opt.gravity[2] = 1e12
     verdict = execute_and_check(broken, BASE, pick_and_place(), goal()).verdict
     assert (verdict.success, verdict.reason) == (False, "simulation_unstable")
 
 
-def test_rest_is_waited_for_but_not_for_ever(good: Proof) -> None:
+def test_rest_is_waited_for_but_not_for_ever(good: RolloutResult) -> None:
     told = len(pick_and_place().positions)
-    assert told <= len(good.recording) < told + round(REST_S / STEP_S)
+    assert told <= len(good.recording) < told + round(MAX_SETTLE_S / STEP_S)
     assert good.recording.phase[-1] == list(Phase).index(Phase.POST_PLACE)
 
 
@@ -196,20 +202,20 @@ def test_what_keeps_moving_is_not_at_rest() -> None:
 
     MuJoCo takes the larger friction of a pair: the pads keep theirs.
     """
-    icy = changed(station(), "mass_minus_30", BLOCK)
+    icy = perturb_station(station(), "mass_minus_30", BLOCK)
     own = np.isin(icy.model.geom_bodyid, [icy.model.body("table").id, icy.object_bodies[BLOCK]])
     icy.model.geom_friction[own] = 1e-6
     icy.model.opt.gravity[1] = -0.015
     proof = execute_and_check(icy, BASE, pick_and_place(), goal(Relation.LEFT))
     assert (proof.verdict.failed_phase, proof.verdict.reason) == ("post_place", "not_at_rest"), proof.verdict
-    assert len(proof.recording) == len(pick_and_place().positions) + round(REST_S / STEP_S)
+    assert len(proof.recording) == len(pick_and_place().positions) + round(MAX_SETTLE_S / STEP_S)
     assert speed_at_the_end(proof) > 0.01
 
 
 def _standing_on_edge(past_balance_rad: float) -> Station:
     """The bystander on a lower edge, so little past its balance that it is slow to begin to fall; it does not roll."""
     wide, tall = 0.03, 0.1
-    here = Station(scene_files(), arm_of("panda"), BASE)
+    here = Station(scene_files(), load_arm("panda"), BASE)
     body, first = here.object_bodies[BYSTANDER], here.object_qpos[BYSTANDER]
     lean = np.arctan2(wide, tall) + past_balance_rad
     across, up = np.array([np.cos(lean), np.sin(lean)]), np.array([-np.sin(lean), np.cos(lean)])
@@ -245,7 +251,7 @@ def test_what_was_pushed_is_recorded_and_nothing_else() -> None:
     assert pushed.poses_of(REFERENCE) is None
 
 
-def test_nothing_is_recorded_of_what_stood(good: Proof) -> None:
+def test_nothing_is_recorded_of_what_stood(good: RolloutResult) -> None:
     assert good.recording.moved_ids == ()
     assert good.recording.moved_poses.shape == (len(good.recording), 0, 7)
 
@@ -262,7 +268,7 @@ def test_a_motion_without_end_is_not_executed() -> None:
     assert slow.duration_s > MAX_DURATION_S
     proof = execute_and_check(station(), BASE, slow, goal())
     assert (proof.verdict.success, proof.verdict.reason) == (False, "too_long")
-    assert len(read_arrays(arrays_bytes(proof.recording))) == 1
+    assert len(decode_recording(encode_recording(proof.recording))) == 1
 
 
 @pytest.mark.parametrize(
@@ -276,7 +282,7 @@ def test_a_scene_that_would_be_simulated_for_ever_is_refused(option: bytes, foun
     files = scene_files()
     xml = files["scene.xml"].replace(b"<option ", b"<option " + option + b" ")
     assert xml != files["scene.xml"]
-    endless = Station({**files, "scene.xml": xml}, arm_of("panda"), BASE)
+    endless = Station({**files, "scene.xml": xml}, load_arm("panda"), BASE)
     with pytest.raises(InputError, match=found):
         execute_and_check(endless, BASE, pick_and_place(), goal())
 
@@ -284,7 +290,7 @@ def test_a_scene_that_would_be_simulated_for_ever_is_refused(option: bytes, foun
 @pytest.mark.parametrize("step_s", [0.02, 0.013, 0.05])
 def test_samples_fall_on_steps_whatever_their_distance(step_s: float) -> None:
     motion = replace(pick_and_place(), step_s=step_s)
-    execution = Execution(station(), BASE, commands_of(motion), BLOCK, REFERENCE)
+    execution = Rollout(station(), BASE, build_commands(motion), BLOCK, REFERENCE)
     own = station().model.opt.timestep
     samples = execution.samples()
     taken = [next(samples) for _ in range(4)]
@@ -297,8 +303,8 @@ def test_samples_fall_on_steps_whatever_their_distance(step_s: float) -> None:
 def test_changes_change_what_they_say_and_nothing_else() -> None:
     before, body = station().model, station().object_bodies[BLOCK]
     held = (before.geom_bodyid == body) | np.isin(np.arange(before.ngeom), station().finger_geoms)
-    for name in CHANGES:
-        after = changed(station(), name, BLOCK).model
+    for name in PERTURBATIONS:
+        after = perturb_station(station(), name, BLOCK).model
         assert after is not before
         friction = {"friction_halved": 0.5, "friction_doubled": 2.0}.get(name, 1.0)
         mass = {"mass_minus_30": 0.7, "mass_plus_30": 1.3}.get(name, 1.0)
@@ -310,15 +316,15 @@ def test_changes_change_what_they_say_and_nothing_else() -> None:
         assert np.array_equal(np.delete(after.body_mass, body), np.delete(before.body_mass, body))
 
 
-def test_a_firm_grip_survives_all_changes_and_a_loose_one_does_not(good: Proof) -> None:
-    assert robust_to(station(), BASE, pick_and_place(), goal()) == tuple(CHANGES)
-    heavy = changed(station(), "mass_plus_30", BLOCK)
+def test_a_firm_grip_survives_all_changes_and_a_loose_one_does_not(good: RolloutResult) -> None:
+    assert find_survived_perturbations(station(), BASE, pick_and_place(), goal()) == tuple(PERTURBATIONS)
+    heavy = perturb_station(station(), "mass_plus_30", BLOCK)
     heavy.model.body_mass[heavy.object_bodies[BLOCK]] = 4.0
-    verdicts = robust_to(heavy, BASE, pick_and_place(), goal())
+    verdicts = find_survived_perturbations(heavy, BASE, pick_and_place(), goal())
     assert "friction_halved" not in verdicts
 
 
-def test_a_grip_is_quiet(good: Proof) -> None:
+def test_a_grip_is_quiet(good: RolloutResult) -> None:
     """Contact between pads and object neither chatters nor creeps: `implicitfast`, as the scene says."""
     assert station().model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     recording = good.recording
@@ -339,11 +345,11 @@ def test_a_grip_is_quiet(good: Proof) -> None:
 )
 def test_a_goal_names_what_the_scene_lacks(row, found: str) -> None:
     with pytest.raises(InputError, match=found):
-        goal_of(scene_files(), row, 0.02)
+        load_goal(scene_files(), row, 0.02)
 
 
 def test_commands_of_another_arm_are_refused() -> None:
     motion = pick_and_place()
-    commands = commands_of(replace(motion, positions=motion.positions[:, :6]))
+    commands = build_commands(replace(motion, positions=motion.positions[:, :6]))
     with pytest.raises(InputError, match="6 joints, but panda has 7"):
-        Execution(station(), BASE, commands, BLOCK, REFERENCE)
+        Rollout(station(), BASE, commands, BLOCK, REFERENCE)

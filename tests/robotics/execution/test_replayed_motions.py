@@ -12,13 +12,19 @@ from schemas.arrow import TABLES
 from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
-from tableverse_factory.dataset.trajectory_files import with_digests
-from tableverse_factory.robotics.execution.arrays import Recording, arrays_bytes, read_arrays
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard
+from tableverse_factory.dataset.trajectory_files import add_digests
+from tableverse_factory.robotics.execution.arrays import Recording, decode_recording, encode_recording
 from tableverse_factory.robotics.execution.audit import audit_trajectories
-from tableverse_factory.robotics.execution.execute import Proof, execute_and_check
-from tableverse_factory.robotics.execution.replay import Difference, named_arm, replay, replayed
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.execution.execute import RolloutResult, execute_and_check
+from tableverse_factory.robotics.execution.replay import (
+    ReplayDifference,
+    load_named_arm,
+    replay_recording,
+    replay_trajectory,
+)
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.picking import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scene_files, station
 
@@ -29,11 +35,11 @@ TASK |= {"relation": Relation.NEXT_TO.value, "source": "rules", "accepted": True
 
 
 @pytest.fixture(scope="module")
-def good() -> Proof:
+def good() -> RolloutResult:
     return execute_and_check(station(), BASE, pick_and_place(), goal())
 
 
-def row_of(proof: Proof, **changes: object) -> dict[str, object]:
+def row_of(proof: RolloutResult, **changes: object) -> dict[str, object]:
     verdict = proof.verdict
     return {
         "scene_id": "scene",
@@ -60,35 +66,35 @@ def row_of(proof: Proof, **changes: object) -> dict[str, object]:
 
 
 def problems(recording: Recording, row: dict[str, object], tasks: Sequence[dict[str, object]] = (TASK,)) -> str:
-    files = {**scene_files(), NAME: arrays_bytes(recording)}
+    files = {**scene_files(), NAME: encode_recording(recording)}
     (audit,) = audit_trajectories(files, [row], None, tasks, TrajectoriesConfig())
     return "; ".join(audit.problems)
 
 
-def test_a_replay_from_the_files_alone_is_equal(good: Proof) -> None:
-    data = arrays_bytes(good.recording)
-    assert replay(scene_files(), row_of(good), data) == good.verdict
-    fresh = Station(scene_files(), arm_of("panda"))
-    again = replayed(scene_files(), row_of(good), read_arrays(data), fresh)
-    assert again.difference() == Difference(0.0, 0.0, 0.0, 0.0, 0.0)
-    assert arrays_bytes(again.now) == data, "and its recording is the same to the last byte"
+def test_a_replay_from_the_files_alone_is_equal(good: RolloutResult) -> None:
+    data = encode_recording(good.recording)
+    assert replay_trajectory(scene_files(), row_of(good), data) == good.verdict
+    fresh = Station(scene_files(), load_arm("panda"))
+    again = replay_recording(scene_files(), row_of(good), decode_recording(data), fresh)
+    assert again.compute_difference() == ReplayDifference(0.0, 0.0, 0.0, 0.0, 0.0)
+    assert encode_recording(again.now) == data, "and its recording is the same to the last byte"
 
 
 @pytest.mark.parametrize("closed", [0.06, 0.0])
 def test_failures_are_reproduced_too(closed: float) -> None:
     failed = execute_and_check(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03), closed=closed), goal())
     assert not failed.verdict.success
-    assert replay(scene_files(), row_of(failed), arrays_bytes(failed.recording)) == failed.verdict
+    assert replay_trajectory(scene_files(), row_of(failed), encode_recording(failed.recording)) == failed.verdict
     assert problems(failed.recording, row_of(failed)) == ""
     assert "replayed it fails with" in problems(failed.recording, row_of(failed, reason="slipped"))
 
 
-def test_an_honest_trajectory_passes(good: Proof) -> None:
+def test_an_honest_trajectory_passes(good: RolloutResult) -> None:
     assert problems(good.recording, row_of(good)) == ""
     assert audit_trajectories(scene_files(), [row_of(good, success=False, arrays=None)]) == ()
 
 
-def test_tampered_arrays_are_found(good: Proof) -> None:
+def test_tampered_arrays_are_found(good: RolloutResult) -> None:
     r, row = good.recording, row_of(good)
     opened, wrong, moved, shifted = (np.array(x) for x in (r.command, r.command, r.object_pose, r.qpos))
     opened[:, -1], wrong[250:, 0] = 0.07, wrong[250:, 0] + 0.3
@@ -124,7 +130,7 @@ def test_tampered_arrays_are_found(good: Proof) -> None:
         assert found in problems(recording, row)
 
 
-def test_rows_that_lie_are_found(good: Proof) -> None:
+def test_rows_that_lie_are_found(good: RolloutResult) -> None:
     failed = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
     lies = problems(failed.recording, row_of(failed, success=True))
     assert "a success by its row; replayed it fails in grasp: not_grasped" in lies
@@ -164,7 +170,7 @@ def test_rows_that_lie_are_found(good: Proof) -> None:
         assert found in problems(good.recording, row_of(good, **changes))
 
 
-def test_a_task_has_to_be_asked_for_once_and_not_refused(good: Proof) -> None:
+def test_a_task_has_to_be_asked_for_once_and_not_refused(good: RolloutResult) -> None:
     row = row_of(good)
     assert "its task was refused" in problems(good.recording, row, [{**TASK, "accepted": False}])
     assert "its task stands in tasks/ 2 times" in problems(good.recording, row, [TASK, TASK])
@@ -177,7 +183,7 @@ def test_a_bound_that_arrays_widen_is_not_believed() -> None:
     motion = pick_and_place(over=(0.0, 0.06, 0.06))
     pushed = execute_and_check(station(there), BASE, motion, wide)
     assert pushed.verdict.success, pushed.verdict
-    files = {**scene_files(there), NAME: arrays_bytes(pushed.recording)}
+    files = {**scene_files(there), NAME: encode_recording(pushed.recording)}
     row = row_of(pushed, duration_s=motion.duration_s)
     (audit,) = audit_trajectories(files, [row], None, [TASK], TrajectoriesConfig())
     assert (audit.reproduced, "replayed it fails in" in audit.problems[0]) == (False, True)
@@ -189,7 +195,7 @@ def test_a_bound_that_arrays_widen_is_not_believed() -> None:
 @pytest.mark.parametrize("name", ["arm.xml", "/etc/passwd", "..\\arm", "menagerie:../../etc"])
 def test_arrays_name_no_file(name: str) -> None:
     with pytest.raises((InputError, ConfigError)):
-        named_arm(name)
+        load_named_arm(name)
 
 
 def dataset_of(out: Path, rows: list[dict[str, object]], arrays: dict[str, bytes]) -> Path:
@@ -199,7 +205,7 @@ def dataset_of(out: Path, rows: list[dict[str, object]], arrays: dict[str, bytes
     robot = str(rows[0]["robot"]) if rows else "panda"
     (out / "run.json").write_text(json.dumps({"config": {"trajectories": {"robot": robot}}}))
     scene = exported()
-    rows = with_digests(rows, tuple(arrays.items()))
+    rows = add_digests(rows, tuple(arrays.items()))
     with (out / "mjcf/shard-00000.tar").open("wb") as file:
         tar = TarShard(file)
         offset, size = tar.add(replace(scene, files=tuple(sorted({**dict(scene.files), **arrays}.items()))))
@@ -209,14 +215,14 @@ def dataset_of(out: Path, rows: list[dict[str, object]], arrays: dict[str, bytes
     tables = {"scenes": [{**scene.scene_row, **place, **counts}], "objects": [], "trajectories": rows}
     tables["tasks"] = [{**TASK, "task_id": task_id} for task_id in ("task_000", "task_001", "task_002")]
     for name, schema in TABLES.items():
-        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(tables[name], schema)))
+        (out / name / "shard-00000.parquet").write_bytes(encode_parquet(build_table(tables[name], schema)))
     return out
 
 
-def test_verify_replays_a_dataset(good: Proof, tmp_path: Path, run) -> None:
+def test_verify_replays_a_dataset(good: RolloutResult, tmp_path: Path, run) -> None:
     failed = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
     other = "trajectories/task_001.npz"
-    arrays = {NAME: arrays_bytes(good.recording), other: arrays_bytes(failed.recording)}
+    arrays = {NAME: encode_recording(good.recording), other: encode_recording(failed.recording)}
     rows = [
         row_of(good),
         row_of(failed, task_id="task_001", arrays=other),
@@ -235,8 +241,8 @@ def test_verify_replays_a_dataset(good: Proof, tmp_path: Path, run) -> None:
     assert (code, "a trajectory of 'task_009', which is none of the scene's tasks" in out) == (1, True), out
 
 
-def test_a_dataset_that_does_not_say_what_made_it_is_not_verified(good: Proof, tmp_path: Path, run) -> None:
-    out = dataset_of(tmp_path / "out", [row_of(good)], {NAME: arrays_bytes(good.recording)})
+def test_a_dataset_that_does_not_say_what_made_it_is_not_verified(good: RolloutResult, tmp_path: Path, run) -> None:
+    out = dataset_of(tmp_path / "out", [row_of(good)], {NAME: encode_recording(good.recording)})
     (out / "run.json").write_text("{}")
     code, _, err = run("verify", out, "--trajectories")
     assert (code, "run.json: it holds no configuration" in err) == (1, True), err
@@ -253,17 +259,17 @@ def test_verify_replays_nothing_but_datasets(tmp_path: Path, run) -> None:
     assert (code, "no trajectories in it to replay" in err) == (1, True)
 
 
-def test_an_arm_from_a_file_is_given_again(good: Proof, tmp_path: Path, run) -> None:
-    spec = arm_of("panda").spec()
-    spec.add_key(name="home", qpos=[*arm_of("panda").home, *arm_of("panda").finger_open])
+def test_an_arm_from_a_file_is_given_again(good: RolloutResult, tmp_path: Path, run) -> None:
+    spec = load_arm("panda").spec()
+    spec.add_key(name="home", qpos=[*load_arm("panda").home, *load_arm("panda").finger_open])
     spec.compile()
     (tmp_path / "mine.xml").write_text(spec.to_xml().replace('<size nkey="1"/>', ""))
-    mine = arm_of(str(tmp_path / "mine.xml"))
+    mine = load_arm(str(tmp_path / "mine.xml"))
     there = Station(scene_files(), mine, BASE)
     proof = execute_and_check(there, BASE, pick_and_place(), goal())
     assert proof.verdict.success, proof.verdict
     rows = [row_of(proof, robot=mine.name)]
-    out = dataset_of(tmp_path / "out", rows, {NAME: arrays_bytes(proof.recording)})
+    out = dataset_of(tmp_path / "out", rows, {NAME: encode_recording(proof.recording)})
     code, _, err = run("verify", out, "--trajectories")
     assert (code, "give that file with --robot" in err) == (1, True), err
     code, text, _ = run("verify", out, "--trajectories", "--robot", tmp_path / "mine.xml")

@@ -9,9 +9,9 @@ import trimesh
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, read_mesh
-from tableverse_factory.geometry.relations.antipodal import FRICTION, surface_points
-from tableverse_factory.robotics.grasps.antipodal import OPENING_MARGIN_M, sample
-from tableverse_factory.robotics.grasps.clearance import clear
+from tableverse_factory.geometry.relations.antipodal import FRICTION, sample_inward_normals
+from tableverse_factory.robotics.grasps.antipodal import OPENING_MARGIN_M, sample_antipodal_grasps
+from tableverse_factory.robotics.grasps.clearance import find_clear_grasps
 from tests.helpers.bodies import box, cup, middle, standing
 
 CONFIG = TrajectoriesConfig()
@@ -19,7 +19,9 @@ CONFIG = TrajectoriesConfig()
 
 def grasps_on(mesh, arm, seed=0, felt=None, **config):
     options = CONFIG.model_copy(update=config)
-    return sample(mesh, felt or mesh, arm.shape, arm.max_opening_m, middle(mesh), options, np.random.default_rng(seed))
+    return sample_antipodal_grasps(
+        mesh, felt or mesh, arm.shape, arm.max_opening_m, middle(mesh), options, np.random.default_rng(seed)
+    )
 
 
 def every_body():
@@ -95,8 +97,8 @@ def test_the_middle_is_better_than_the_end(arm):
 def test_thin_things_that_lie_flat_can_be_picked_up(arm):
     handle = box(0.18, 0.012, 0.008)
     found = grasps_on(handle, arm)
-    own, _ = surface_points(handle, 1000)
-    assert clear(found, arm.shape, arm.max_opening_m, own, []).sum() > 30
+    own, _ = sample_inward_normals(handle, 1000)
+    assert find_clear_grasps(found, arm.shape, arm.max_opening_m, own, []).sum() > 30
 
 
 def test_the_same_seed_gives_the_same_bytes(arm):

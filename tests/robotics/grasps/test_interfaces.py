@@ -1,4 +1,4 @@
-"""From a thing among others to the grasps that are tried: the default and a server, behind one door."""
+"""Grasps of an object among others, by the sampler and by a server."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import pytest
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.scene_objects import SceneObject, thing
-from tableverse_factory.robotics.grasps.interfaces import GRASP_MODELS, grasps_of
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject, make_scene_object
+from tableverse_factory.robotics.grasps.interfaces import GRASP_MODELS, propose_grasps
 from tests.helpers.bodies import box, middle
 from tests.helpers.model_server import Scripted
 
@@ -15,18 +15,18 @@ CONFIG = TrajectoriesConfig()
 
 
 def standing(name: str, mesh, x: float, y: float) -> SceneObject:
-    """A thing that is its own convex piece."""
-    return thing(name, mesh, (mesh,), Pose(np.array([x, y, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])), 0.2)
+    """Make an object that is its own convex piece."""
+    return make_scene_object(name, mesh, (mesh,), Pose(np.array([x, y, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])), 0.2)
 
 
 def tried(arm, others, tmp_path, config=CONFIG, seed=0):
-    return grasps_of(CARTON, others, arm, config, np.random.default_rng(seed), Services(tmp_path))
+    return propose_grasps(CARTON, others, arm, config, np.random.default_rng(seed), Services(tmp_path))
 
 
 CARTON = standing("carton", box(0.05, 0.03, 0.12), 0.1, 0.0)
 
 
-def test_a_thing_by_itself_is_held_from_above_first(arm, tmp_path):
+def test_an_object_by_itself_is_held_from_above_first(arm, tmp_path):
     found = tried(arm, [], tmp_path)
     assert (found.rotations[:, 2, 2] <= CONFIG.gamma_strict).sum() > 20
     assert (np.diff(found.scores) <= 0.0).all()
@@ -45,7 +45,9 @@ def test_what_stands_close_takes_grasps_away_and_adds_none(arm, tmp_path):
 
 def test_what_is_walled_in_and_roofed_has_none(arm, tmp_path):
     roof = standing("roof", box(0.3, 0.3, 0.02), 0.1, 0.0)
-    roof = thing("roof", roof.mesh, roof.hulls, Pose(np.array([0.1, 0.0, 0.13]), roof.pose.quaternion_wxyz), 0.2)
+    roof = make_scene_object(
+        "roof", roof.mesh, roof.hulls, Pose(np.array([0.1, 0.0, 0.13]), roof.pose.quaternion_wxyz), 0.2
+    )
     walls = [standing("w", box(0.3, 0.02, 0.2), 0.1, 0.05 * side) for side in (-1, 1)]
     walls += [standing("w", box(0.02, 0.3, 0.2), 0.1 + 0.06 * side, 0.0) for side in (-1, 1)]
     assert len(tried(arm, [roof, *walls], tmp_path)) == 0
@@ -72,5 +74,5 @@ def test_a_servers_grasps_need_room_too(arm, tmp_path, server):
     assert found.widths[0] == pytest.approx(0.03, abs=1e-6)
 
 
-def test_every_model_of_the_configuration_has_its_door():
+def test_every_model_of_the_configuration_is_registered():
     assert set(GRASP_MODELS) == set(TrajectoriesConfig.model_fields["grasp_model"].annotation.__args__)

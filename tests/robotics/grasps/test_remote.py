@@ -13,16 +13,16 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.models.remote.http import MAX_BODY_BYTES
+from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.models.remote.endpoint import MAX_BODY_BYTES
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.grasps.closing import closed
-from tableverse_factory.robotics.grasps.remote import COUNT, FORMAT, MAX_COUNT, POINTS, ask
+from tableverse_factory.robotics.grasps.closing import close_grasps
+from tableverse_factory.robotics.grasps.remote import COUNT, FORMAT, MAX_COUNT, POINTS, request_grasps
 from tests.helpers.bodies import box
 from tests.helpers.model_server import Scripted
 from tests.helpers.paths import ROOT
 
-BODY = placed_mesh(box(0.05, 0.03, 0.12), Pose(np.array([0.2, -0.1, 0.0]), quaternion_about_z(0.4)))
+BODY = place_mesh(box(0.05, 0.03, 0.12), Pose(np.array([0.2, -0.1, 0.0]), quaternion_about_z(0.4)))
 DEPTH_M = 0.1034
 
 
@@ -48,7 +48,7 @@ def put(server, tmp_path):
             grasp_url=server.url,
             **{"grasp_timeout_s": 5.0, "grasp_depth_m": DEPTH_M, **options},
         )
-        return ask(BODY, config, Services(tmp_path))
+        return request_grasps(BODY, config, Services(tmp_path))
 
     return ask_it
 
@@ -74,14 +74,14 @@ def test_their_frames_become_ours(put, server, arm):
     assert np.linalg.det(found.rotations[0]) == pytest.approx(1.0)
     assert np.abs(found.positions[0] - [0.2, -0.1, 0.08]).max() < 1e-3
     assert found.scores.tolist() == [7.5]
-    held = closed(found, BODY, arm.shape, arm.max_opening_m)
+    held = close_grasps(found, BODY, arm.shape, arm.max_opening_m)
     assert held.widths[0] == pytest.approx(0.03, abs=1e-6)
 
 
 def test_grasps_are_moved_to_where_both_fingers_touch_and_empty_ones_are_left_out(put, server, arm):
     sideways = np.array([-np.sin(0.4), np.cos(0.4)]) * 0.01
     server.say(answer(from_above(*sideways), from_above(z=0.2), from_above(x=0.04)))
-    held = closed(put(), BODY, arm.shape, arm.max_opening_m)
+    held = close_grasps(put(), BODY, arm.shape, arm.max_opening_m)
     assert len(held) == 1
     assert np.abs(held.positions[0, :2] - [0.2, -0.1]).max() < 1e-3
 
@@ -97,7 +97,7 @@ def test_an_answer_is_asked_for_once(put, server):
 
 def test_no_grasps_are_an_answer(put, server, arm):
     server.say(answer())
-    assert len(closed(put(), BODY, arm.shape, arm.max_opening_m)) == 0
+    assert len(close_grasps(put(), BODY, arm.shape, arm.max_opening_m)) == 0
 
 
 def test_tiny_errors_of_rotations_are_repaired(put, server):
@@ -220,7 +220,7 @@ def test_the_bridge_of_the_docs_is_understood(tmp_path):
     threading.Thread(target=bridge.serve_forever, daemon=True).start()
     try:
         url = f"http://127.0.0.1:{bridge.server_port}"
-        found = ask(BODY, TrajectoriesConfig(grasp_model="graspgen", grasp_url=url), Services(tmp_path))
+        found = request_grasps(BODY, TrajectoriesConfig(grasp_model="graspgen", grasp_url=url), Services(tmp_path))
     finally:
         bridge.shutdown()
         bridge.server_close()

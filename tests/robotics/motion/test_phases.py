@@ -8,13 +8,13 @@ import pytest
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Motion, NoMotion, Phase
 from tableverse_factory.geometry.math.transforms import rotation_angle
-from tableverse_factory.robotics.motion.kinematics import solutions
-from tableverse_factory.robotics.motion.obstacles import boxed
-from tableverse_factory.robotics.motion.phases import plan
+from tableverse_factory.robotics.motion.kinematics import solve_ik
+from tableverse_factory.robotics.motion.obstacles import list_boxed_objects
+from tableverse_factory.robotics.motion.phases import plan_motion
 from tableverse_factory.robotics.motion.rrt import RrtConnect
-from tableverse_factory.robotics.motion.segments import PathSegment, run_of
-from tableverse_factory.robotics.motion.validate import recheck
-from tableverse_factory.robotics.motion.world import World
+from tableverse_factory.robotics.motion.segments import PathSegment, time_segments
+from tableverse_factory.robotics.motion.validate import validate_motion
+from tableverse_factory.robotics.motion.world import CollisionWorld
 from tests.helpers.cells import (
     BLOCK,
     CONFIG,
@@ -36,8 +36,8 @@ PHASES = list(Phase)
 GRASP = down(0.0, 0.0, GRASP_M)
 
 
-def planned(world: World, place: Pose, grasp: Pose = GRASP, seed: int = 0) -> Motion | NoMotion:
-    return plan(world, HOME, grasp, place, BLOCK, WIDTH_M, CONFIG, np.random.default_rng(seed), RrtConnect())
+def planned(world: CollisionWorld, place: Pose, grasp: Pose = GRASP, seed: int = 0) -> Motion | NoMotion:
+    return plan_motion(world, HOME, grasp, place, BLOCK, WIDTH_M, CONFIG, np.random.default_rng(seed), RrtConnect())
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def test_where_something_hangs_over_the_way_up_the_lift_leans_away_and_that_is_s
     foot = box(0.09, 0.05, 0.02)
     footed = replace(block(0.0, 0.0), hulls=(block(0.0, 0.0).mesh, TriangleMesh(foot.vertices - _DOWN, foot.faces)))
     shelf = Solid(box(0.06, 0.06, 0.04), (0.072, 0.0, 0.06), object_id="shelf")  # 3 mm of the foot are below it
-    world = World(station_of([footed, shelf]))
+    world = CollisionWorld(station_of([footed, shelf]))
     found = planned(world, down(-0.2, 0.0, GRASP_M + 0.004))
     assert isinstance(found, Motion), found
     assert "post_grasp: slanted" in found.fallbacks
@@ -152,7 +152,7 @@ def test_where_something_hangs_over_the_way_up_the_lift_leans_away_and_that_is_s
 
 def test_an_object_is_put_into_an_open_box_and_fingers_come_out_again():
     tray = Solid(box(0.3, 0.3, 0.1), (0.22, 0.05, 0.05), object_id="tray", hulls=open_box())
-    world = World(station_of([block(-0.15, 0.0), tray]))
+    world = CollisionWorld(station_of([block(-0.15, 0.0), tray]))
     grasp, place = down(-0.15, 0.0, GRASP_M), down(0.22, 0.05, GRASP_M + 0.015)
     found = planned(world, place, grasp)
     assert isinstance(found, Motion), found
@@ -168,7 +168,7 @@ def test_the_recheck_sees_what_is_wrong(motion):
     world = clutter()
 
     def fault(changed: Motion) -> str:
-        found = recheck(world, changed, BLOCK, WIDTH_M, CONFIG)
+        found = validate_motion(world, changed, BLOCK, WIDTH_M, CONFIG)
         return "" if found is None else found.detail
 
     assert fault(motion) == ""
@@ -180,30 +180,30 @@ def test_the_recheck_sees_what_is_wrong(motion):
     assert "position" in fault(replace(motion, positions=q + 3.0))
     assert "order" in fault(replace(motion, phases=motion.phases[::-1].copy()))
     assert "order" in fault(replace(motion, phases=np.minimum(motion.phases, 4)))
-    low = planned(World(station_of([block(0.0, 0.0)])), down(-0.12, -0.1, GRASP_M + 0.004, 1.0))
+    low = planned(CollisionWorld(station_of([block(0.0, 0.0)])), down(-0.12, -0.1, GRASP_M + 0.004, 1.0))
     wall = Solid(box(0.02, 0.3, 0.5), (-0.06, -0.05, 0.25), object_id="wall")
-    walled = World(station_of([block(0.0, 0.0), wall]))
-    seen = recheck(walled, low, BLOCK, WIDTH_M, CONFIG)
+    walled = CollisionWorld(station_of([block(0.0, 0.0), wall]))
+    seen = validate_motion(walled, low, BLOCK, WIDTH_M, CONFIG)
     assert seen is not None
     assert "wall" in seen.detail
 
 
 def test_what_stands_in_the_table_may_be_lifted_out_but_not_carried_through_it():
     sunk = Solid(box(WIDTH_M, WIDTH_M, 0.1), (0.0, 0.0, 0.0495), object_id=BLOCK)
-    world = World(station_of([sunk]))
+    world = CollisionWorld(station_of([sunk]))
     found = planned(world, down(-0.12, -0.1, GRASP_M + 0.004))
     assert isinstance(found, Motion), found
     early = np.array(found.phases)
     lift = np.flatnonzero(early == PHASES.index(Phase.POST_GRASP))
     early[lift[1:]] = PHASES.index(Phase.PRE_PLACE)
-    fault = recheck(world, replace(found, phases=early), BLOCK, WIDTH_M, CONFIG)
+    fault = validate_motion(world, replace(found, phases=early), BLOCK, WIDTH_M, CONFIG)
     assert fault is not None
     assert fault.phase is Phase.PRE_PLACE
     assert "table" in fault.detail
 
 
 def test_too_heavy_a_load_is_not_lifted():
-    world = World(station_of([block(0.0, 0.0)], mass_kg=25.0))
+    world = CollisionWorld(station_of([block(0.0, 0.0)], mass_kg=25.0))
     found = planned(world, down(0.2, -0.1, GRASP_M + 0.004))
     assert isinstance(found, NoMotion)
     assert (found.phase, found.reason) == (Phase.PLACE, "too_fast")
@@ -212,13 +212,13 @@ def test_too_heavy_a_load_is_not_lifted():
 
 def test_a_run_through_a_wall_is_no_matter_of_limits():
     wall = Solid(box(0.02, 0.3, 0.5), (-0.06, -0.05, 0.25), object_id="wall")
-    world = World(station_of([block(0.0, 0.0), wall]))
+    world = CollisionWorld(station_of([block(0.0, 0.0), wall]))
     ends = [
-        solutions(world.chain, world.in_base(tcp), HOME, 1)[0] for tcp in (down(0.05, 0.0, 0.2), down(-0.2, 0.0, 0.2))
+        solve_ik(world.chain, world.in_base(tcp), HOME, 1)[0] for tcp in (down(0.05, 0.0, 0.2), down(-0.2, 0.0, 0.2))
     ]
     sections = [PathSegment(Phase.PRE_GRASP, np.array(ends), world.space(0.04))]
     arm = world.station.arm
-    found = run_of(sections, arm, world.dynamics, 0.5, 0.02, touch_at_start=False, touch_at_end=False)
+    found = time_segments(sections, arm, world.dynamics, 0.5, 0.02, touch_at_start=False, touch_at_end=False)
     assert isinstance(found, NoMotion)
     assert (found.phase, found.reason) == (Phase.PRE_GRASP, "no_blend")
     assert "wall" in found.detail
@@ -228,7 +228,7 @@ def test_a_line_that_something_ends_early_is_said():
     foot = box(0.09, 0.05, 0.02)
     footed = replace(block(0.0, 0.0), hulls=(block(0.0, 0.0).mesh, TriangleMesh(foot.vertices - _DOWN, foot.faces)))
     shelf = Solid(box(0.06, 0.06, 0.02), (0.072, 0.0, 0.138), object_id="shelf")  # above the foot by 0.108 m
-    found = planned(World(station_of([footed, shelf])), down(-0.2, 0.0, GRASP_M + 0.004))
+    found = planned(CollisionWorld(station_of([footed, shelf])), down(-0.2, 0.0, GRASP_M + 0.004))
     assert isinstance(found, Motion), found
     assert "post_grasp: 0.105 m" in found.fallbacks
 
@@ -237,21 +237,21 @@ def test_a_margin_that_cannot_be_kept_is_said():
     foot = box(0.16, 0.05, 0.02)
     footed = replace(block(0.0, 0.0), hulls=(block(0.0, 0.0).mesh, TriangleMesh(foot.vertices - _DOWN, foot.faces)))
     shelf = Solid(box(0.06, 0.06, 0.02), (-0.315, 0.0, 0.174), object_id="shelf")  # 5 mm from where a lowering begins
-    found = planned(World(station_of([footed, shelf])), down(-0.2, 0.0, GRASP_M + 0.004))
+    found = planned(CollisionWorld(station_of([footed, shelf])), down(-0.2, 0.0, GRASP_M + 0.004))
     assert isinstance(found, Motion), found
     assert found.fallbacks == ("pre_place: margin 3 mm",)
 
 
 def test_what_a_planner_sees_as_a_box_is_said():
     class Boxing(RrtConnect):
-        def fallbacks(self, world: World) -> tuple[str, ...]:
-            return boxed(world)
+        def list_fallbacks(self, world: CollisionWorld) -> tuple[str, ...]:
+            return list_boxed_objects(world)
 
     half = box(0.06, 0.06, 0.05)
     halves = tuple(TriangleMesh(half.vertices + np.array([0.0, 0.0, z]), half.faces) for z in (-0.025, 0.025))
     stacked = Solid(box(0.06, 0.06, 0.1), (0.2, 0.1, 0.05), object_id="stacked", hulls=halves)  # with a wall inside
-    world = World(station_of([block(0.0, 0.0), stacked]))
+    world = CollisionWorld(station_of([block(0.0, 0.0), stacked]))
     place = down(-0.12, -0.1, GRASP_M + 0.004)
-    found = plan(world, HOME, GRASP, place, BLOCK, WIDTH_M, CONFIG, np.random.default_rng(0), Boxing())
+    found = plan_motion(world, HOME, GRASP, place, BLOCK, WIDTH_M, CONFIG, np.random.default_rng(0), Boxing())
     assert isinstance(found, Motion), found
     assert found.fallbacks == ("obstacles: stacked as its box (open)",)

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.robotics.motion.blend import blended
-from tableverse_factory.robotics.motion.carried_object import Carried
-from tableverse_factory.robotics.motion.dynamics import Dynamics
-from tableverse_factory.robotics.motion.retime import TORQUE_SHARE, retimed
-from tableverse_factory.robotics.robots.panda import panda
+from tableverse_factory.robotics.motion.blend import blend_path
+from tableverse_factory.robotics.motion.carried_object import CarriedObject
+from tableverse_factory.robotics.motion.dynamics import ArmDynamics
+from tableverse_factory.robotics.motion.retime import TORQUE_SHARE, retime_curve
+from tableverse_factory.robotics.robots.panda import build_panda
 from tests.helpers.cells import BLOCK, HOME, alone, down, held_pose, station_of
 from tests.helpers.simple_scenes import Solid, box
 
@@ -27,7 +27,7 @@ def corners(seed: int, count: int) -> np.ndarray:
 @settings(max_examples=30)
 def test_a_blend_keeps_the_ends_and_stays_near_the_corners(seed, count, radius):
     path = corners(seed, count)
-    curve = blended(path, radius, touch_at_start=True, touch_at_end=False)
+    curve = blend_path(path, radius, touch_at_start=True, touch_at_end=False)
     marks = np.linspace(curve.t[0], curve.t[-1], 400)
     values = curve(marks)
     np.testing.assert_allclose(values[[0, -1]], path[[0, -1]], atol=1e-12)
@@ -43,7 +43,7 @@ def test_a_blend_keeps_the_ends_and_stays_near_the_corners(seed, count, radius):
 
 def test_a_straight_line_stays_one_at_unit_speed():
     path = np.array([HOME, HOME + 0.1, HOME + 0.4])
-    curve = blended(path, 0.2, touch_at_start=True, touch_at_end=True)
+    curve = blend_path(path, 0.2, touch_at_start=True, touch_at_end=True)
     marks = np.linspace(curve.t[0], curve.t[-1], 50)
     np.testing.assert_allclose(np.linalg.norm(curve.derivative(1)(marks), axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(curve.derivative(2)(marks), 0.0, atol=1e-7)
@@ -52,14 +52,14 @@ def test_a_straight_line_stays_one_at_unit_speed():
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("mass_kg", [0.0, 3.0])
 def test_timing_holds_every_limit_and_is_at_rest_at_both_ends(seed, mass_kg):
-    arm = panda()
-    dynamics, load = Dynamics(arm), None
+    arm = build_panda()
+    dynamics, load = ArmDynamics(arm), None
     station = station_of([Solid(box(0.05, 0.05, 0.1), (0.0, 0.0, 0.05), object_id=BLOCK)], max(mass_kg, 0.1))
     if mass_kg:
-        load = Carried(BLOCK, held_pose(down(0.0, 0.0, 0.07), alone().object_pose(BLOCK)))
-    dynamics.carry(station, load)
-    curve = blended(corners(seed, 4), 0.2, touch_at_start=False, touch_at_end=True)
-    timed = retimed(curve, arm, dynamics, SPEED, STEP_S)
+        load = CarriedObject(BLOCK, held_pose(down(0.0, 0.0, 0.07), alone().object_pose(BLOCK)))
+    dynamics.set_payload(station, load)
+    curve = blend_path(corners(seed, 4), 0.2, touch_at_start=False, touch_at_end=True)
+    timed = retime_curve(curve, arm, dynamics, SPEED, STEP_S)
     q, v = timed.positions, timed.velocities
     assert np.abs(v[[0, -1]]).max() == 0.0
     assert (np.abs(v) <= SPEED * arm.max_velocity).all()
@@ -68,20 +68,22 @@ def test_timing_holds_every_limit_and_is_at_rest_at_both_ends(seed, mass_kg):
     mean = (v[1:] + v[:-1]) / 2
     assert (np.abs(np.diff(q, axis=0) / STEP_S - mean) <= 0.5 * SPEED * arm.max_acceleration * STEP_S).all()
     assert (np.diff(timed.places) >= 0.0).all()
-    torques = np.array([dynamics.torques(*row) for row in zip(q, v, np.gradient(v, STEP_S, axis=0), strict=True)])
+    torques = np.array(
+        [dynamics.compute_torques(*row) for row in zip(q, v, np.gradient(v, STEP_S, axis=0), strict=True)]
+    )
     assert (np.abs(torques) <= arm.max_torque).all()
     assert 0.3 < len(q) * STEP_S < 10.0
 
 
 def test_a_load_that_is_near_the_limit_slows_the_motion_down():
-    arm = panda()
+    arm = build_panda()
     path = np.array([HOME, HOME + np.array([0.0, 0.9, 0.0, 0.4, 0.0, 0.0, 0.0])])
-    curve, times = blended(path, 0.2, touch_at_start=False, touch_at_end=False), []
+    curve, times = blend_path(path, 0.2, touch_at_start=False, touch_at_end=False), []
     for mass_kg in (0.1, 8.0):
-        dynamics = Dynamics(arm)
+        dynamics = ArmDynamics(arm)
         station = station_of([Solid(box(0.05, 0.05, 0.1), (0.0, 0.0, 0.05), object_id=BLOCK)], mass_kg)
-        dynamics.carry(station, Carried(BLOCK, held_pose(down(0.0, 0.0, 0.07), alone().object_pose(BLOCK))))
-        timed = retimed(curve, arm, dynamics, 1.0, STEP_S)
+        dynamics.set_payload(station, CarriedObject(BLOCK, held_pose(down(0.0, 0.0, 0.07), alone().object_pose(BLOCK))))
+        timed = retime_curve(curve, arm, dynamics, 1.0, STEP_S)
         times.append(np.inf if timed is None else len(timed.positions))
     assert times[1] > times[0]
     assert TORQUE_SHARE < 1.0
@@ -90,11 +92,11 @@ def test_a_load_that_is_near_the_limit_slows_the_motion_down():
 @pytest.mark.parametrize("seed", range(3))
 def test_torques_are_those_of_mujoco_with_the_object_welded_on(seed):
     """The load is the object's own mass and inertia where it hangs, the arm's weight not compensated."""
-    arm, rng = panda(), np.random.default_rng(seed)
+    arm, rng = build_panda(), np.random.default_rng(seed)
     station = station_of([Solid(box(0.05, 0.06, 0.1), (0.0, 0.0, 0.05), object_id=BLOCK)], 1.5)
     hang = held_pose(down(0.01, 0.02, 0.08, 0.4), alone().object_pose(BLOCK))
-    dynamics = Dynamics(arm)
-    dynamics.carry(station, Carried(BLOCK, hang))
+    dynamics = ArmDynamics(arm)
+    dynamics.set_payload(station, CarriedObject(BLOCK, hang))
     spec = arm.spec()
     for body in spec.bodies:
         body.gravcomp = 0.0
@@ -112,4 +114,6 @@ def test_torques_are_those_of_mujoco_with_the_object_welded_on(seed):
     data.qpos[model.jnt_qposadr[joints]], data.qvel[model.jnt_dofadr[joints]] = q, v
     data.qacc[model.jnt_dofadr[joints]] = a
     mujoco.mj_inverse(model, data)
-    np.testing.assert_allclose(dynamics.torques(q, v, a), data.qfrc_inverse[model.jnt_dofadr[joints]], atol=1e-6)
+    np.testing.assert_allclose(
+        dynamics.compute_torques(q, v, a), data.qfrc_inverse[model.jnt_dofadr[joints]], atol=1e-6
+    )

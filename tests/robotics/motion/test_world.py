@@ -5,10 +5,10 @@ import pytest
 
 from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
-from tableverse_factory.robotics.motion.carried_object import Carried
-from tableverse_factory.robotics.motion.kinematics import solutions
-from tableverse_factory.robotics.motion.pick_place import Handling
-from tableverse_factory.robotics.motion.world import World, _coarse_to_fine
+from tableverse_factory.robotics.motion.carried_object import CarriedObject
+from tableverse_factory.robotics.motion.kinematics import solve_ik
+from tableverse_factory.robotics.motion.pick_place import PickPlace
+from tableverse_factory.robotics.motion.world import CollisionWorld, _order_coarse_to_fine
 from tests.helpers.cells import (
     BLOCK,
     GRASP_M,
@@ -31,7 +31,7 @@ def near_the_table(count: int) -> np.ndarray:
     world, rng, rows = clutter(), np.random.default_rng(3), []
     while len(rows) < count:
         x, y, z, yaw = rng.uniform([-0.2, -0.2, 0.0, -3.0], [0.25, 0.2, 0.3, 3.0])
-        rows.extend(solutions(world.chain, world.in_base(down(x, y, z, yaw)), HOME, 1))
+        rows.extend(solve_ik(world.chain, world.in_base(down(x, y, z, yaw)), HOME, 1))
     return np.array(rows)
 
 
@@ -39,18 +39,21 @@ def near_the_table(count: int) -> np.ndarray:
 def test_free_agrees_with_the_distance_of_every_pair(carrying):
     world = clutter()
     held = held_pose(down(0.0, 0.0, GRASP_M), world.object_pose(BLOCK)) if carrying else None
-    carried = Carried(BLOCK, held) if held else None
+    carried = CarriedObject(BLOCK, held) if held else None
     for margin in (0.0, 0.01):
         space, seen = world.space(0.06, margin_m=margin, carried=carried), set()
         for q in near_the_table(60):
             distance = deepest(world, q, 0.06, held, object_geoms(world))
             if abs(distance - margin) < 2e-4:
                 continue  # the two routines differ by that much
-            free = space.free(q)
+            free = space.is_free(q)
             if free and distance < margin:
-                raise AssertionError(f"{distance} is nearer than {margin}: {world.blocked_by(space, q)}")
+                raise AssertionError(f"{distance} is nearer than {margin}: {world.describe_collision(space, q)}")
             if not free and distance > margin:  # the held object on the table, or the arm with itself
-                assert "table" in world.blocked_by(space, q) or world.blocked_by(space, q).count("robot") == 2
+                assert (
+                    "table" in world.describe_collision(space, q)
+                    or world.describe_collision(space, q).count("robot") == 2
+                )
             seen.add(free)
         assert seen == {True, False}
 
@@ -59,31 +62,31 @@ def test_a_block_standing_on_the_table_may_be_lifted_but_not_pushed_down():
     world = clutter()
     grasp = down(0.0, 0.0, GRASP_M)
     at, below, above = (
-        solutions(world.chain, world.in_base(down(0.0, 0.0, GRASP_M + z)), HOME, 1)[0] for z in (0.0, -0.002, 0.003)
+        solve_ik(world.chain, world.in_base(down(0.0, 0.0, GRASP_M + z)), HOME, 1)[0] for z in (0.0, -0.002, 0.003)
     )
-    handling = Handling(world, BLOCK, grasp, grasp, WIDTH_M)
-    strict = handling.lifting(0.0003)
-    assert not strict.free(at)
-    lift = handling.taken_at(at).lifting(0.0003)
-    assert lift.free(at)
-    assert lift.free(above)
-    assert not lift.free(below)
-    assert "table" in world.blocked_by(lift, below)
+    task = PickPlace(world, BLOCK, grasp, grasp, WIDTH_M)
+    strict = task.lifting_space(0.0003)
+    assert not strict.is_free(at)
+    lift = task.allow_grasp_contacts(at).lifting_space(0.0003)
+    assert lift.is_free(at)
+    assert lift.is_free(above)
+    assert not lift.is_free(below)
+    assert "table" in world.describe_collision(lift, below)
 
 
 def test_open_fingers_may_not_touch_what_they_are_to_grasp():
     world = clutter()
-    q = solutions(world.chain, world.in_base(down(0.0, 0.0, GRASP_M)), HOME, 1)[0]
-    assert world.space(WIDTH_M + 0.01).free(q)
-    assert not world.space(WIDTH_M - 0.01).free(q)
+    q = solve_ik(world.chain, world.in_base(down(0.0, 0.0, GRASP_M)), HOME, 1)[0]
+    assert world.space(WIDTH_M + 0.01).is_free(q)
+    assert not world.space(WIDTH_M - 0.01).is_free(q)
 
 
 def test_an_object_that_was_let_go_elsewhere_is_an_obstacle_there_and_no_more_here():
     world = alone()
-    here, there = (solutions(world.chain, world.in_base(down(x, 0.0, 0.04)), HOME, 1)[0] for x in (0.0, 0.2))
+    here, there = (solve_ik(world.chain, world.in_base(down(x, 0.0, 0.04)), HOME, 1)[0] for x in (0.0, 0.2))
     as_is, moved = world.space(0.02), world.space(0.02, standing={BLOCK: Pose(np.array([0.2, 0.0, 0.05]), _UPRIGHT)})
-    assert (as_is.free(here), as_is.free(there)) == (False, True)
-    assert (moved.free(here), moved.free(there)) == (True, False)
+    assert (as_is.is_free(here), as_is.is_free(there)) == (False, True)
+    assert (moved.is_free(here), moved.is_free(there)) == (True, False)
 
 
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -91,18 +94,18 @@ _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 def test_the_arm_may_not_go_through_itself():
     folded = np.array([0.0, -1.7, 0.0, -3.05, 0.0, 0.1, 0.0])
-    assert not alone().space(0.04).free(folded)
-    assert alone().blocked_by(alone().space(0.04), folded).count("robot/") == 2
-    assert alone().space(0.04).free(HOME)
+    assert not alone().space(0.04).is_free(folded)
+    assert alone().describe_collision(alone().space(0.04), folded).count("robot/") == 2
+    assert alone().space(0.04).is_free(HOME)
 
 
 def test_a_base_elsewhere_sees_the_same_scene_from_there():
     station = station_of([block(0.0, 0.0), Solid(box(0.1, 0.1, 0.3), (0.2, 0.0, 0.15))])
-    first = World(station)
-    turned = World(station, Pose(np.array([0.55, 0.0, 0.0]), quaternion_about_z(np.pi)))
-    q = solutions(turned.chain, turned.in_base(down(0.2, 0.0, 0.1)), HOME, 1)[0]
-    assert not turned.space(0.04).free(q)
-    assert first.space(0.04).free(HOME)
+    first = CollisionWorld(station)
+    turned = CollisionWorld(station, Pose(np.array([0.55, 0.0, 0.0]), quaternion_about_z(np.pi)))
+    q = solve_ik(turned.chain, turned.in_base(down(0.2, 0.0, 0.1)), HOME, 1)[0]
+    assert not turned.space(0.04).is_free(q)
+    assert first.space(0.04).is_free(HOME)
     np.testing.assert_allclose(station.model.body_pos[station.base_body], first.base.position)  # left as it was
 
 
@@ -110,11 +113,11 @@ def test_spaces_of_one_world_do_not_disturb_each_other():
     world = clutter()
     rows = near_the_table(20)
     spaces = [world.space(0.06), world.space(0.02, margin_m=0.01)]
-    alone_each = [[space.free(q) for q in rows] for space in spaces]
-    mixed = [[space.free(q) for space in spaces] for q in rows]
+    alone_each = [[space.is_free(q) for q in rows] for space in spaces]
+    mixed = [[space.is_free(q) for space in spaces] for q in rows]
     assert [list(row) for row in zip(*mixed, strict=True)] == alone_each
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 64, 101])
 def test_every_step_of_an_edge_is_looked_at_once(count):
-    assert sorted(_coarse_to_fine(count)) == list(range(1, count))
+    assert sorted(_order_coarse_to_fine(count)) == list(range(1, count))

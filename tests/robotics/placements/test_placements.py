@@ -13,15 +13,15 @@ from schemas.curation import Relation
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Placement
 from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.relations.relations import body_of, holds
-from tableverse_factory.physics.mjcf.scene_objects import SceneObject, thing
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.relations.relations import compute_body_features, relation_holds
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject, make_scene_object
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.robotics.placements.clearance import box_gaps, least_gaps, outlines_clear
-from tableverse_factory.robotics.placements.domains import PREDICATES, Predicate, domain, sampled
+from tableverse_factory.robotics.placements.clearance import are_outlines_clear, compute_box_gaps, compute_least_gaps
+from tableverse_factory.robotics.placements.domains import PREDICATES, Predicate, build_domain, sample_regions
 from tableverse_factory.robotics.placements.on_and_in import WALL_CLEARANCE_M
-from tableverse_factory.robotics.placements.request import RELEASE_M, NoPlacement
-from tableverse_factory.robotics.placements.sampling import placements
+from tableverse_factory.robotics.placements.request import RELEASE_HEIGHT_M, NoPlacement
+from tableverse_factory.robotics.placements.sampling import sample_placements
 from tests.helpers.simple_scenes import ball, box, cylinder
 
 TABLE = Slab(np.zeros(2), np.array([0.5, 0.4]), 0.0, (150, 120, 90))
@@ -31,7 +31,7 @@ ON_TABLE = [r for r in Relation if PREDICATES[r] not in (Predicate.TOP, Predicat
 
 def standing(name: str, mesh: TriangleMesh, x: float, y: float, yaw: float = 0.0, z: float = 0.0) -> SceneObject:
     lowest = float(mesh.vertices[:, 2].min())
-    return thing(name, mesh, (mesh,), Pose(np.array([x, y, z - lowest]), quaternion_about_z(yaw)), 0.2)
+    return make_scene_object(name, mesh, (mesh,), Pose(np.array([x, y, z - lowest]), quaternion_about_z(yaw)), 0.2)
 
 
 def bowl(x: float, y: float, radius: float, height: float, wall: float = 0.005, name: str = "y") -> SceneObject:
@@ -47,18 +47,18 @@ def bowl(x: float, y: float, radius: float, height: float, wall: float = 0.005, 
         pieces.append(np.concatenate([np.column_stack([ring, np.full(4, z)]) for z in (-height / 2, height / 2)]))
     pieces.append(trimesh.creation.cylinder(radius - wall, wall).vertices - [0, 0, (height - wall) / 2])
     hulls = tuple(from_trimesh(trimesh.convex.convex_hull(points)) for points in pieces)
-    return thing(name, mesh, hulls, Pose(np.array([x, y, height / 2]), quaternion_about_z(0.0)), 0.4)
+    return make_scene_object(name, mesh, hulls, Pose(np.array([x, y, height / 2]), quaternion_about_z(0.0)), 0.4)
 
 
 def found(relation, x, y, others=(), table=TABLE, config=CONFIG, seed=0) -> tuple[Placement, ...]:
-    result = placements(relation, x, y, others, table, config, np.random.default_rng(seed))
+    result = sample_placements(relation, x, y, others, table, config, np.random.default_rng(seed))
     assert not isinstance(result, NoPlacement), result
     assert 0 < len(result) <= config.placements
     return result
 
 
 def refused(relation, x, y, others=(), table=TABLE, config=CONFIG) -> str:
-    result = placements(relation, x, y, others, table, config, np.random.default_rng(0))
+    result = sample_placements(relation, x, y, others, table, config, np.random.default_rng(0))
     assert isinstance(result, NoPlacement), result
     assert result.detail
     return result.reason
@@ -66,7 +66,7 @@ def refused(relation, x, y, others=(), table=TABLE, config=CONFIG) -> str:
 
 def at_rest(x: SceneObject, place: Placement) -> TriangleMesh:
     pose = Pose(place.pose.position - [0, 0, place.drop_m], place.pose.quaternion_wxyz)
-    return placed_mesh(x.mesh, pose)
+    return place_mesh(x.mesh, pose)
 
 
 def scene() -> tuple[SceneObject, SceneObject, list[SceneObject]]:
@@ -85,11 +85,11 @@ def test_beside_the_reference_all_stand_clear_on_the_table_where_the_relation_ho
         rest = at_rest(x, place)
         low, high = rest.vertices.min(axis=0), rest.vertices.max(axis=0)
         assert low[2] == pytest.approx(0.0, abs=1e-9)
-        assert place.drop_m == RELEASE_M
+        assert place.drop_m == RELEASE_HEIGHT_M
         assert (np.abs(rest.vertices[:, :2]) <= TABLE.half_size_xy).all()
         assert place.clear_by == "boxes"
-        assert least_gaps(low[None], high[None], [o.body for o in (y, *others)])[0] >= CONFIG.epsilon_m - 1e-6
-        assert holds(relation, body_of(rest), y.body)
+        assert compute_least_gaps(low[None], high[None], [o.body for o in (y, *others)])[0] >= CONFIG.epsilon_m - 1e-6
+        assert relation_holds(relation, compute_body_features(rest), y.body)
 
 
 @pytest.mark.parametrize(
@@ -112,18 +112,18 @@ def test_every_relation_has_a_domain_and_all_samples_lie_in_it():
     assert set(PREDICATES) == set(Relation)
     assert set(PREDICATES.values()) == set(Predicate)
     for predicate in Predicate:
-        regions = domain(predicate, np.array([0.02, 0.03]), y, 0.02)
-        points = sampled(regions, 500, rng)
+        regions = build_domain(predicate, np.array([0.02, 0.03]), y, 0.02)
+        points = sample_regions(regions, 500, rng)
         assert len(points) == 500
-        assert np.any([region.holds(points) for region in regions], axis=0).all()
-    empty = regions[0].within(np.array([9.0, 9.0]), np.array([10.0, 10.0]))
+        assert np.any([region.contains(points) for region in regions], axis=0).all()
+    empty = regions[0].intersect(np.array([9.0, 9.0]), np.array([10.0, 10.0]))
     assert empty.area == 0.0
-    assert sampled((empty,), 10, rng).shape == (0, 2)
+    assert sample_regions((empty,), 10, rng).shape == (0, 2)
 
 
 def test_the_top_of_the_paper_is_the_upper_face():
     y = standing("y", box(0.1, 0.06, 0.04), 0.1, 0.2).body
-    (region,) = domain(Predicate.TOP, np.array([0.02, 0.03]), y, 0.02)
+    (region,) = build_domain(Predicate.TOP, np.array([0.02, 0.03]), y, 0.02)
     np.testing.assert_allclose(region.low, [0.05, 0.17])
     np.testing.assert_allclose(region.high, [0.15, 0.23])
 
@@ -166,7 +166,7 @@ def test_a_ball_comes_to_lie_on_the_floor_of_a_bowl_within_its_wall(relation):
 def test_into_a_narrow_vessel_it_is_let_go_with_its_top_above_the_rim_first():
     x, y = standing("x", ball(0.02), 0.3, 0.2), bowl(-0.1, 0.05, 0.035, 0.1)
     places = found(Relation.IN, x, y)
-    tops = [placed_mesh(x.mesh, place.pose).vertices[:, 2].max() for place in places]
+    tops = [place_mesh(x.mesh, place.pose).vertices[:, 2].max() for place in places]
     assert tops[0] >= 0.1 + 0.019
     assert places[0].drop_m > 0.05
     assert min(place.drop_m for place in places) == pytest.approx(WALL_CLEARANCE_M, abs=1e-4)
@@ -178,7 +178,7 @@ def test_a_long_thing_goes_into_a_cup_on_its_end():
     for place in found(Relation.IN, x, y):
         axis = rotation_matrix(place.pose.quaternion_wxyz)[:, 0]
         assert abs(axis[2]) > 0.99
-        assert holds(Relation.IN, body_of(at_rest(x, place)), y.body)
+        assert relation_holds(Relation.IN, compute_body_features(at_rest(x, place)), y.body)
 
 
 def test_what_would_topple_out_of_a_dish_is_not_stood_on_its_end_in_it():
@@ -205,7 +205,7 @@ def test_reasons():
     ring += [standing(f"v{k}", box(0.02, 0.3, 0.1), *place) for k, place in enumerate([(0.08, 0), (-0.08, 0)])]
     assert refused(Relation.NEXT_TO, x, y, ring) == "no_room"
     leaning = Pose(np.array([0.3, 0.2, 0.05]), np.array([np.cos(0.3), np.sin(0.3), 0.0, 0.0]))
-    tilted = thing("x", x.mesh, (x.mesh,), leaning, 0.2)
+    tilted = make_scene_object("x", x.mesh, (x.mesh,), leaning, 0.2)
     assert refused(Relation.LEFT, tilted, y) == "does_not_stand"
 
 
@@ -217,12 +217,14 @@ def test_where_boxes_leave_no_room_outlines_do_and_say_so():
     places = found(Relation.RIGHT, x, y, walls)
     assert {place.clear_by for place in places} == {"outlines"}
     for place in places:
-        assert outlines_clear(body_of(at_rest(x, place)), [w.body for w in walls], CONFIG.epsilon_m - 1e-4)
+        assert are_outlines_clear(
+            compute_body_features(at_rest(x, place)), [w.body for w in walls], CONFIG.epsilon_m - 1e-4
+        )
 
 
 def test_what_holds_already_is_moved_all_the_same():
     x, y = standing("x", box(0.04, 0.04, 0.05), 0.1, 0.0), standing("y", box(0.05, 0.05, 0.05), 0.0, 0.0)
-    assert holds(Relation.RIGHT, x.body, y.body)
+    assert relation_holds(Relation.RIGHT, x.body, y.body)
     for place in found(Relation.RIGHT, x, y, config=TrajectoriesConfig(placements=4)):
         assert np.linalg.norm(place.pose.position[:2] - x.pose.position[:2]) > 0.038
 
@@ -252,12 +254,12 @@ def test_no_placement_leaves_a_turned_table_or_the_relation(where, size, relatio
     table = Slab(np.array([0.05, -0.02]), np.array([0.4, 0.3]), yaw, (0, 0, 0))
     y, x = standing("y", box(*size), *where), standing("x", box(0.05, 0.03, 0.04), 0.0, 0.0)
     config = TrajectoriesConfig(placements=6)
-    result = placements(relation, x, y, (), table, config, np.random.default_rng(0))
+    result = sample_placements(relation, x, y, (), table, config, np.random.default_rng(0))
     if isinstance(result, NoPlacement):
         return
     for place in result:
         rest = at_rest(x, place)
-        assert holds(relation, body_of(rest), y.body)
+        assert relation_holds(relation, compute_body_features(rest), y.body)
         if relation is not Relation.ON:
             assert table.holds(rest.vertices).all()
 
@@ -270,7 +272,7 @@ def test_odd_settings_give_an_answer(changes):
     x, y, others = scene()
     for relation in Relation:
         config = TrajectoriesConfig(**changes)
-        result = placements(relation, x, y, others, TABLE, config, np.random.default_rng(0))
+        result = sample_placements(relation, x, y, others, TABLE, config, np.random.default_rng(0))
         assert isinstance(result, NoPlacement) or len(result) <= config.placements
 
 
@@ -283,20 +285,20 @@ def test_a_table_of_no_size_carries_nothing():
 def test_boxes_are_apart_as_soon_as_one_axis_is():
     here = np.zeros((1, 3)), np.full((1, 3), 0.1)
     others = [standing("a", box(0.1, 0.1, 0.1), *xy).body for xy in ((0.17, 0.05), (0.05, 0.05), (0.17, 0.17))]
-    np.testing.assert_allclose(box_gaps(*here, others), [[0.02, -0.1, 0.02]], atol=1e-12)
-    np.testing.assert_allclose(box_gaps(here[0] + [0, 0, 0.15], here[1] + 0.15, others[1:2], True), [[0.05]])
-    assert least_gaps(*here, ())[0] == np.inf
+    np.testing.assert_allclose(compute_box_gaps(*here, others), [[0.02, -0.1, 0.02]], atol=1e-12)
+    np.testing.assert_allclose(compute_box_gaps(here[0] + [0, 0, 0.15], here[1] + 0.15, others[1:2], True), [[0.05]])
+    assert compute_least_gaps(*here, ())[0] == np.inf
 
 
 @pytest.mark.parametrize(("rim", "stands"), [(0.003, True), (0.009, False)])
 def test_on_pieces_that_fill_a_plate_it_stands_higher_unless_that_is_no_longer_on_it(rim, stands):
     plate = bowl(-0.1, 0.05, 0.1, 0.005 + rim)
     filled = trimesh.convex.convex_hull(plate.mesh.vertices)
-    plate = thing("y", plate.mesh, (from_trimesh(filled),), plate.pose, 0.4)
+    plate = make_scene_object("y", plate.mesh, (from_trimesh(filled),), plate.pose, 0.4)
     x = standing("x", box(0.05, 0.05, 0.05), 0.3, 0.2)
     if not stands:
         assert refused(Relation.ON, x, plate) == "no_room"
         return
     for place in found(Relation.ON, x, plate):
         assert at_rest(x, place).vertices[:, 2].min() == pytest.approx(0.005 + rim, abs=1e-5)
-        assert place.drop_m == RELEASE_M
+        assert place.drop_m == RELEASE_HEIGHT_M

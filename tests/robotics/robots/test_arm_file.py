@@ -8,12 +8,12 @@ import pytest
 
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.robotics.motion.kinematics import solutions
+from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.rrt import RrtConnect
-from tableverse_factory.robotics.motion.world import World
-from tableverse_factory.robotics.robots.base import bases
-from tableverse_factory.robotics.robots.panda import panda
-from tableverse_factory.robotics.robots.registry import arm_of
+from tableverse_factory.robotics.motion.world import CollisionWorld
+from tableverse_factory.robotics.robots.base import find_bases
+from tableverse_factory.robotics.robots.panda import build_panda
+from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.blocks_on_table import WIDE_TABLE, Mover, block_files
 from tests.helpers.six_axes import HOME, six_axes
@@ -23,7 +23,7 @@ BLOCKS = [((0.03, 0.03, 0.05), (0.0, 0.0))]
 
 def test_a_file_becomes_an_arm(tmp_path: Path) -> None:
     path = six_axes(tmp_path)
-    arm = arm_of(str(path))
+    arm = load_arm(str(path))
     assert arm.name == str(path)
     assert arm.joint_names == ("a", "b", "c", "d", "e", "f")
     np.testing.assert_allclose(arm.home, HOME, atol=1e-5)
@@ -44,8 +44,8 @@ def test_settings_of_the_file_s_own_simulation_do_not_count(tmp_path: Path) -> N
         '<option integrator="Euler" timestep="1e-9" gravity="5 0 0"/><size nuserdata="3"/>'
         '<visual><map znear="3"/></visual>',
     )
-    arm = arm_of(str(six_axes(tmp_path / "odd", odd)))
-    plain = arm_of(str(six_axes(tmp_path / "plain")))
+    arm = load_arm(str(six_axes(tmp_path / "odd", odd)))
+    plain = load_arm(str(six_axes(tmp_path / "plain")))
     assert arm.max_opening_m == plain.max_opening_m
     station = Station(block_files(BLOCKS), arm)
     assert station.model.opt.timestep == 0.002
@@ -55,10 +55,10 @@ def test_settings_of_the_file_s_own_simulation_do_not_count(tmp_path: Path) -> N
 def test_it_works_in_a_station_with_openings_in_metres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     six_axes(tmp_path)
     monkeypatch.chdir(tmp_path)
-    arm = arm_of("arm.xml")
+    arm = load_arm("arm.xml")
     monkeypatch.chdir("/")
     station = Station(block_files(BLOCKS, table=WIDE_TABLE), arm, visuals=True)
-    station.place_base(bases(station, np.array([[0.0, 0.0, 0.05]]))[0])
+    station.place_base(find_bases(station, np.array([[0.0, 0.0, 0.05]]))[0])
     mover = Mover(station)
     mover.go(arm.home + 0.2, 0.02, 1.0)
     rows = mover.go(arm.home + 0.2, 0.02, 1.0)
@@ -70,20 +70,22 @@ def test_it_works_in_a_station_with_openings_in_metres(tmp_path: Path, monkeypat
 def test_motions_are_planned_within_what_the_actuators_can_be_told(tmp_path: Path) -> None:
     """A joint that could turn by 150 degrees and more, whose actuator takes 34 only."""
     narrow = ('name="a" joint="a"', 'name="a" joint="a" ctrlrange="-0.6 0.6"')
-    arms = {"wide": arm_of(str(six_axes(tmp_path / "w"))), "narrow": arm_of(str(six_axes(tmp_path / "n", narrow)))}
+    arms = {"wide": load_arm(str(six_axes(tmp_path / "w"))), "narrow": load_arm(str(six_axes(tmp_path / "n", narrow)))}
     stations = {name: Station(block_files(BLOCKS, table=WIDE_TABLE), arm) for name, arm in arms.items()}
-    worlds = {name: World(station, Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))) for name, station in stations.items()}
+    worlds = {
+        name: CollisionWorld(station, Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))) for name, station in stations.items()
+    }
     for name, arm in arms.items():
         np.testing.assert_array_equal(worlds[name].chain.lower, arm.lower)
         np.testing.assert_array_equal(worlds[name].chain.upper, arm.upper)
     turned = arms["wide"].home.copy()
     turned[0] = 1.2
     target = worlds["wide"].tcp(turned)
-    assert len(solutions(worlds["wide"].chain, target, turned, 4))
-    kept = solutions(worlds["narrow"].chain, target, turned, 4)
+    assert len(solve_ik(worlds["wide"].chain, target, turned, 4))
+    kept = solve_ik(worlds["narrow"].chain, target, turned, 4)
     assert (np.abs(kept[:, 0]) < 0.6).all()
     ahead, side = (np.where(np.arange(6) == 0, angle, arms["wide"].home) for angle in (-0.5, 0.5))
-    path = RrtConnect().path(ahead, side, worlds["narrow"].space(0.05), np.random.default_rng(0))
+    path = RrtConnect().plan_path(ahead, side, worlds["narrow"].space(0.05), np.random.default_rng(0))
     assert path is not None
     assert (np.abs(path[:, 0]) <= 0.6).all()
 
@@ -128,10 +130,10 @@ def test_motions_are_planned_within_what_the_actuators_can_be_told(tmp_path: Pat
 def test_what_is_missing_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = six_axes(tmp_path, (old, new))
     if not message:  # the fingers may touch each other in the file: they are apart at home
-        assert arm_of(str(path)).max_opening_m > 0.05
+        assert load_arm(str(path)).max_opening_m > 0.05
         return
     with pytest.raises(InputError, match=message) as caught:
-        arm_of(str(path))
+        load_arm(str(path))
     assert str(caught.value).startswith("arm.xml: ")
     assert caught.value.reason in ("bad_robot", "bad_mjcf")
     assert "\n" not in str(caught.value)
@@ -143,7 +145,7 @@ def test_an_arm_s_file_reads_nothing_outside_its_folder(tmp_path: Path, hostile:
     path = six_axes(folder, ('file="foot.obj"', f'file="{hostile}"'))
     (tmp_path / "secret.obj").write_bytes((folder / "assets" / "foot.obj").read_bytes())
     with pytest.raises(InputError, match=r"outside|no regular file") as caught:
-        arm_of(str(path))
+        load_arm(str(path))
     assert caught.value.reason == "bad_mjcf"
 
 
@@ -153,15 +155,15 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path: Path) -> None:
     mesh.rename(tmp_path / "foot.obj")
     mesh.symlink_to(tmp_path / "foot.obj")
     with pytest.raises(InputError, match="outside"):
-        arm_of(str(path))
+        load_arm(str(path))
 
 
 def test_names_that_are_none_say_what_would_be_right(tmp_path: Path) -> None:
-    assert arm_of("panda") is panda()
+    assert load_arm("panda") is build_panda()
     with pytest.raises(ConfigError, match="'panda', 'menagerie:NAME' or a file"):
-        arm_of("pandas")
+        load_arm("pandas")
     with pytest.raises(InputError, match="is no file"):
-        arm_of(str(tmp_path / "none.xml"))
+        load_arm(str(tmp_path / "none.xml"))
 
 
 def test_the_menagerie_is_read_through_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,17 +177,17 @@ def test_the_menagerie_is_read_through_its_package(tmp_path: Path, monkeypatch: 
         name="panda.xml",
     )
     monkeypatch.setenv("MENAGERIE_ROOT", os.fspath(tmp_path))
-    arm = arm_of("menagerie:franka_emika_panda")
+    arm = load_arm("menagerie:franka_emika_panda")
     assert arm.name == "menagerie:franka_emika_panda"
     assert arm.max_opening_m == pytest.approx(0.06, abs=1e-6)
     np.testing.assert_allclose(arm.shape.pad_half_size_xz, [0.01, 0.01], atol=1e-6)
     with pytest.raises(ConfigError, match="Did you mean 'franka_emika_panda'"):
-        arm_of("menagerie:franka_emika_pandas")
+        load_arm("menagerie:franka_emika_pandas")
     with pytest.raises(ConfigError, match="ufactory_xarm7"):
-        arm_of("menagerie:ufactory_xarm7")
+        load_arm("menagerie:ufactory_xarm7")
 
 
 def test_without_the_package_it_is_said_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mujoco_menagerie", None)
     with pytest.raises(ConfigError, match=r"pip install 'tableverse-factory\[robots\]'"):
-        arm_of("menagerie:kuka_iiwa_14")
+        load_arm("menagerie:kuka_iiwa_14")

@@ -10,10 +10,10 @@ from schemas.config import TrajectoriesConfig
 from schemas.geometry import TriangleMesh
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.geometry.relations.antipodal import surface_points
-from tableverse_factory.robotics.grasps.antipodal import sample
-from tableverse_factory.robotics.grasps.clearance import TABLE_M, clear
-from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, openings
+from tableverse_factory.geometry.relations.antipodal import sample_inward_normals
+from tableverse_factory.robotics.grasps.antipodal import sample_antipodal_grasps
+from tableverse_factory.robotics.grasps.clearance import TABLE_CLEARANCE_M, find_clear_grasps
+from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, compute_approach_openings
 from tests.helpers.bodies import box, cup, middle, standing
 
 FAR = np.array([[10.0, 10.0, 10.0]])
@@ -34,7 +34,7 @@ def down(turn: float = 0.0, lean: float = 0.0) -> np.ndarray:
 
 def swept(arm, grasps) -> np.ndarray:
     """Points of the gripper's boxes, their corners among them, at many places of its straight way. Shape (n, 3)."""
-    opening = float(openings(grasps.widths, arm.max_opening_m)[0])
+    opening = float(compute_approach_openings(grasps.widths, arm.max_opening_m)[0])
     steps = np.linspace(-1.0, 1.0, 5)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 1, 3)
     centers, halves = arm.shape.boxes(opening)
@@ -48,15 +48,15 @@ def swept(arm, grasps) -> np.ndarray:
 def test_nothing_of_the_gripper_is_ever_below_the_table(arm, turn, lean, height, width):
     grasps = one_grasp(down(turn, lean), [0.0, 0.0, height], width)
     lowest = swept(arm, grasps)[:, 2].min()
-    if clear(grasps, arm.shape, arm.max_opening_m, FAR, [])[0]:
-        assert lowest >= TABLE_M - 1e-9
+    if find_clear_grasps(grasps, arm.shape, arm.max_opening_m, FAR, [])[0]:
+        assert lowest >= TABLE_CLEARANCE_M - 1e-9
     else:
-        assert lowest <= TABLE_M + 1e-9
+        assert lowest <= TABLE_CLEARANCE_M + 1e-9
 
 
 def test_a_grasp_from_below_has_no_room(arm):
     up = down() @ np.diag([1.0, -1.0, -1.0])
-    assert not clear(one_grasp(up, [0.0, 0.0, 0.05]), arm.shape, arm.max_opening_m, FAR, [])[0]
+    assert not find_clear_grasps(one_grasp(up, [0.0, 0.0, 0.05]), arm.shape, arm.max_opening_m, FAR, [])[0]
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_other_things_are_kept_clear_of_along_the_whole_way(arm, place, free):
     other = trimesh.creation.box([0.02, 0.02, 0.02])
     other.apply_translation(place)
     grasps = one_grasp(down(), [0.0, 0.0, 0.05])
-    assert clear(grasps, arm.shape, arm.max_opening_m, FAR, [from_trimesh(other)])[0] == free
+    assert find_clear_grasps(grasps, arm.shape, arm.max_opening_m, FAR, [from_trimesh(other)])[0] == free
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-0.8, 0.8), st.tuples(*[st.floats(-0.15, 0.15)] * 2), st.floats(0.02, 0.25))
@@ -83,7 +83,7 @@ def test_what_passes_touches_no_other_thing(arm, turn, lean, at, height):
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.03)
     ball.apply_translation([*at, height])
     grasps = one_grasp(down(turn, lean), [0.0, 0.0, 0.12])
-    if not clear(grasps, arm.shape, arm.max_opening_m, FAR, [from_trimesh(ball)])[0]:
+    if not find_clear_grasps(grasps, arm.shape, arm.max_opening_m, FAR, [from_trimesh(ball)])[0]:
         return
     above = (swept(arm, grasps) @ ball.face_normals.T - (ball.triangles_center * ball.face_normals).sum(axis=1)).max(
         axis=1
@@ -93,26 +93,30 @@ def test_what_passes_touches_no_other_thing(arm, turn, lean, at, height):
 
 def test_the_hand_does_not_go_through_what_it_holds(arm):
     mesh = box(0.05, 0.03, 0.16)
-    own, _ = surface_points(mesh, 1500)
+    own, _ = sample_inward_normals(mesh, 1500)
     low = one_grasp(down(np.pi / 2), [0.0, 0.0, 0.05], 0.05)
     high = one_grasp(down(np.pi / 2), [0.0, 0.0, 0.14], 0.05)
-    assert not clear(low, arm.shape, arm.max_opening_m, own, [])[0], "11 cm of the box would be inside the hand"
-    assert clear(high, arm.shape, arm.max_opening_m, own, [])[0]
+    assert not find_clear_grasps(low, arm.shape, arm.max_opening_m, own, [])[0], (
+        "11 cm of the box would be inside the hand"
+    )
+    assert find_clear_grasps(high, arm.shape, arm.max_opening_m, own, [])[0]
 
 
 @pytest.mark.parametrize("mesh", [cup(), box(0.06, 0.04, 0.09)], ids=["cup", "box"])
 def test_fingers_do_not_come_down_on_the_body(arm, mesh):
-    found = sample(
+    found = sample_antipodal_grasps(
         mesh, mesh, arm.shape, arm.max_opening_m, middle(mesh), TrajectoriesConfig(), np.random.default_rng(0)
     )
-    own, _ = surface_points(mesh, 1500)
-    free = found.chosen(np.flatnonzero(clear(found, arm.shape, arm.max_opening_m, own, [])).astype(np.int32))
+    own, _ = sample_inward_normals(mesh, 1500)
+    free = found.chosen(
+        np.flatnonzero(find_clear_grasps(found, arm.shape, arm.max_opening_m, own, [])).astype(np.int32)
+    )
     assert 20 < len(free) < len(found)
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
     dense = solid.sample(20_000, seed=1)
     inside = 0
     for k in range(0, len(free), max(1, len(free) // 40)):
-        opening = float(openings(free.widths[k : k + 1], arm.max_opening_m)[0])
+        opening = float(compute_approach_openings(free.widths[k : k + 1], arm.max_opening_m)[0])
         local = (dense - free.positions[k]) @ free.rotations[k]
         centers, halves = arm.shape.boxes(opening)
         deep = np.abs(local[:, None] - centers) <= halves - 0.004
@@ -123,6 +127,6 @@ def test_fingers_do_not_come_down_on_the_body(arm, mesh):
 def test_no_grasps_and_no_things_are_no_error(arm):
     none = Grasps(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     flat = TriangleMesh(np.zeros((3, 3)), np.array([[0, 1, 2]], dtype=np.int32))
-    assert clear(none, arm.shape, arm.max_opening_m, FAR, [flat]).shape == (0,)
+    assert find_clear_grasps(none, arm.shape, arm.max_opening_m, FAR, [flat]).shape == (0,)
     ball = standing(trimesh.creation.icosphere(subdivisions=1, radius=0.03))
-    assert clear(none, arm.shape, arm.max_opening_m, FAR, [ball]).shape == (0,)
+    assert find_clear_grasps(none, arm.shape, arm.max_opening_m, FAR, [ball]).shape == (0,)

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N, LAG_S, panda
+from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N, LAG_S, build_panda
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.blocks_on_table import Mover, block_files, reached
 
@@ -34,7 +34,7 @@ def gripper_by_table(joints: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def alone() -> mujoco.MjModel:
-    return panda().spec().compile()
+    return build_panda().spec().compile()
 
 
 def test_forward_kinematics_are_those_of_the_published_table(alone: mujoco.MjModel) -> None:
@@ -49,13 +49,13 @@ def test_forward_kinematics_are_those_of_the_published_table(alone: mujoco.MjMod
 
 
 def test_at_home_the_gripper_points_down_in_front_of_the_base() -> None:
-    frame = gripper_by_table(panda().home)
+    frame = gripper_by_table(build_panda().home)
     np.testing.assert_allclose(frame[:3, 3], [0.307, 0.0, 0.487], atol=5e-4)
     np.testing.assert_allclose(frame[:3, 2], [0.0, 0.0, -1.0], atol=1e-9)
 
 
 def test_limits_are_the_published_ones_and_hold_in_the_model(alone: mujoco.MjModel) -> None:
-    arm = panda()
+    arm = build_panda()
     np.testing.assert_array_equal(arm.lower, LOWER)
     np.testing.assert_array_equal(arm.upper, UPPER)
     np.testing.assert_array_equal(arm.max_velocity, SPEED)
@@ -86,16 +86,16 @@ def test_masses_and_inertias_are_those_of_matter(alone: mujoco.MjModel) -> None:
 
 def test_home_touches_nothing_and_few_random_configurations_do(alone: mujoco.MjModel) -> None:
     data, rng, touching = mujoco.MjData(alone), np.random.default_rng(2), 0
-    for joints in (panda().home, *rng.uniform(LOWER, UPPER, (500, 7))):
+    for joints in (build_panda().home, *rng.uniform(LOWER, UPPER, (500, 7))):
         data.qpos[:7], data.qpos[7:] = joints, 0.04
         mujoco.mj_fwdPosition(alone, data)
-        assert not (joints is panda().home and data.ncon)
+        assert not (joints is build_panda().home and data.ncon)
         touching += data.ncon > 0
     assert 10 < touching < 100  # arms do run into themselves, but nothing is always in the way
 
 
 def test_the_gripper_shape_covers_all_that_touches_of_the_hand(alone: mujoco.MjModel) -> None:
-    arm, data = panda(), mujoco.MjData(alone)
+    arm, data = build_panda(), mujoco.MjData(alone)
     rng = np.random.default_rng(3)
     for opening in (0.0, 0.03, 0.08):
         data.qpos[:7], data.qpos[7:] = arm.home, opening / 2
@@ -114,7 +114,7 @@ def test_the_gripper_shape_covers_all_that_touches_of_the_hand(alone: mujoco.MjM
 
 
 def test_servos_follow_on_the_same_path_a_moment_later() -> None:
-    station = Station(block_files([((0.04, 0.04, 0.04), (0.1, 0.1))]), panda())
+    station = Station(block_files([((0.04, 0.04, 0.04), (0.1, 0.1))]), build_panda())
     mover = Mover(station)
     away = station.arm.home + np.array([0.8, 0.5, -0.4, 0.6, 0.5, 0.4, -0.6])
     rows = mover.go(away, 0.08, 1.2)
@@ -128,7 +128,7 @@ def test_servos_follow_on_the_same_path_a_moment_later() -> None:
 @pytest.mark.parametrize(("width", "mass"), [(0.04, 0.5), (0.076, 0.5), (0.006, 0.1), (0.03, 1.5)])
 def test_the_gripper_closes_on_a_block_and_lifts_it(width: float, mass: float) -> None:
     size = (width, 0.04, 0.06)
-    station = Station(block_files([(size, (0.0, 0.0))], mass), panda())
+    station = Station(block_files([(size, (0.0, 0.0))], mass), build_panda())
     above = reached(station, (0.0, 0.0, 0.16), station.arm.home)
     at, up = reached(station, (0.0, 0.0, 0.035), above), reached(station, (0.0, 0.0, 0.2), above)
     mover, body = Mover(station), station.object_bodies["obj_000"]

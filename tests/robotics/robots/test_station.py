@@ -8,8 +8,8 @@ from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.physics.mjcf.load import load_model
-from tableverse_factory.robotics.robots.panda import panda
-from tableverse_factory.robotics.robots.station import PREFIX, Station, station_spec
+from tableverse_factory.robotics.robots.panda import build_panda
+from tableverse_factory.robotics.robots.station import PREFIX, Station, build_station_spec
 from tests.helpers.blocks_on_table import WIDE_TABLE, Mover, block_files
 
 BLOCKS = [((0.05, 0.05, 0.08), (0.0, 0.1)), ((0.06, 0.03, 0.04), (0.12, -0.05)), ((0.04, 0.04, 0.12), (-0.15, 0.0))]
@@ -18,14 +18,14 @@ FILES = block_files(BLOCKS, 0.3, WIDE_TABLE)
 
 def compiled_at(base: Pose) -> mujoco.MjModel:
     """The model as MuJoCo compiles it with the base there from the start."""
-    spec = station_spec(FILES, panda())
+    spec = build_station_spec(FILES, build_panda())
     body = spec.body(f"{PREFIX}pedestal")
     body.pos, body.quat = base.position, base.quaternion_wxyz
     return spec.compile()
 
 
 def test_a_base_that_was_moved_is_one_that_was_compiled_there() -> None:
-    rng, station = np.random.default_rng(4), Station(FILES, panda())
+    rng, station = np.random.default_rng(4), Station(FILES, build_panda())
     touched = 0
     for _ in range(4):
         base = Pose(np.array([*rng.uniform(-0.5, 0.5, 2), 0.0]), quaternion_about_z(float(rng.uniform(-3, 3))))
@@ -48,7 +48,7 @@ def test_a_base_that_was_moved_is_one_that_was_compiled_there() -> None:
 
 
 def test_a_base_moves_where_what_rests_may_sleep_too() -> None:
-    awake, asleep = Station(FILES, panda()), Station(FILES, panda())
+    awake, asleep = Station(FILES, build_panda()), Station(FILES, build_panda())
     asleep.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     for station in (awake, asleep):
         station.data()
@@ -61,7 +61,7 @@ def test_a_base_moves_where_what_rests_may_sleep_too() -> None:
 
 
 def test_moving_there_and_back_gives_the_same_bytes() -> None:
-    station = Station(FILES, panda())
+    station = Station(FILES, build_panda())
     model_before, home = station.model.body_pos.tobytes(), station.base
     mover = Mover(station)
     mover.go(station.arm.home + 0.1, 0.02, 0.4)
@@ -76,7 +76,7 @@ def test_moving_there_and_back_gives_the_same_bytes() -> None:
 def test_objects_rest_as_certified_with_the_arm_beside_them() -> None:
     alone = load_model(FILES)
     data = mujoco.MjData(alone)
-    station = Station(FILES, panda())
+    station = Station(FILES, build_panda())
     own = station.data()
     for name, address in station.object_qpos.items():
         start = alone.jnt_qposadr[alone.joint(name).id]
@@ -91,7 +91,7 @@ def test_objects_rest_as_certified_with_the_arm_beside_them() -> None:
 
 
 def test_without_what_is_seen_the_model_simulates_the_same() -> None:
-    plain, seen = Station(FILES, panda()), Station(FILES, panda(), visuals=True)
+    plain, seen = Station(FILES, build_panda()), Station(FILES, build_panda(), visuals=True)
     assert plain.model.ngeom < seen.model.ngeom
     assert not ((plain.model.geom_contype == 0) & (plain.model.geom_conaffinity == 0)).any()
     data = [Mover(station) for station in (plain, seen)]
@@ -101,14 +101,14 @@ def test_without_what_is_seen_the_model_simulates_the_same() -> None:
 
 
 def test_objects_may_be_called_as_parts_of_the_arm() -> None:
-    station = Station(block_files(BLOCKS, names=["link1", "hand", "panda"]), panda())
+    station = Station(block_files(BLOCKS, names=["link1", "hand", "panda"]), build_panda())
     assert station.object_ids == ("link1", "hand", "panda")
     assert not set(station.object_bodies.values()) & set(station.arm_bodies.tolist())
     assert len(station.arm_bodies) == 12  # pedestal, links 0 to 7, hand, two fingers
 
 
 def test_openings_come_back() -> None:
-    station = Station(FILES, panda())
+    station = Station(FILES, build_panda())
     data = station.data()
     for opening in (0.0, 0.025, 0.08):
         station.set_arm(data, station.arm.home, opening)
@@ -131,5 +131,5 @@ def test_openings_come_back() -> None:
 )
 def test_a_scene_that_is_none_is_refused(files: dict[str, bytes], message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
-        Station(files, panda())
+        Station(files, build_panda())
     assert caught.value.reason == "bad_mjcf"

@@ -80,7 +80,7 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
         def __init__(self) -> None:
             made.append(self)
 
-        def path(self, start, goal, space, rng):
+        def plan_path(self, start, goal, space, rng):
             return None
 
     monkeypatch.setitem(interfaces.PLANNERS, "rrt", Counted)

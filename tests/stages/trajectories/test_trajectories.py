@@ -115,7 +115,7 @@ def _hang() -> None:
 @pytest.mark.parametrize(("befall", "reason", "said"), [(_crash, "crash", "SIGSEGV"), (_hang, "timeout", "6 s")])
 def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeypatch, befall, reason, said):
     """Both tasks whose motions are planned carry the same object: only the place tells the first from the last."""
-    undisturbed = trajectories_module.search
+    undisturbed = trajectories_module.search_trajectory
 
     def searched(cell, task, config, rng):
         befalls["now"] = task["task_id"] == "task_000"
@@ -124,13 +124,13 @@ def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeyp
     class Treacherous(RrtConnect):
         """Sound, but for the first task."""
 
-        def path(self, start, goal, space, rng):
+        def plan_path(self, start, goal, space, rng):
             if befalls["now"]:
                 befall()
-            return super().path(start, goal, space, rng)
+            return super().plan_path(start, goal, space, rng)
 
     befalls = {"now": False}
-    monkeypatch.setattr(trajectories_module, "search", searched)
+    monkeypatch.setattr(trajectories_module, "search_trajectory", searched)
     monkeypatch.setitem(interfaces.PLANNERS, "rrt", Treacherous)
     config = Config.model_validate({"trajectories": {"task_deadline_s": 6.0}}) if befall is _hang else Config()
     lost = run(config)
