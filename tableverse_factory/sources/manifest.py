@@ -42,7 +42,7 @@ def make_manifest(
     paths: Sequence[str],
     bounds: ObserveConfig,
     listed: FetchedLists = NO_LISTS,
-    sift: FilterCriteria | None = None,
+    criteria: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> Manifest:
     """Make a manifest of `paths`: every entry is decoded, and a bad one becomes a row that says why.
@@ -51,7 +51,7 @@ def make_manifest(
         paths: Folders and files.
         bounds: On what is decoded.
         listed: What lists of addresses led to.
-        sift: What bare pictures must have; None takes all that decode.
+        criteria: What bare pictures must have; None takes all that decode.
         on_checked: Called with how many entries are checked, of how many.
 
     Raises:
@@ -60,16 +60,16 @@ def make_manifest(
     found = discover_entries(paths)
     entries = [*((entry, NO_ORIGIN) for entry in found.entries), *listed.entries]
     checks = _EntryChecker(bounds)
-    rows, looks = [], []
+    rows, measured = [], []
     for number, (entry, origin) in enumerate(entries):
-        row, look = checks.row(entry, origin, sift is not None)
+        row, stats = checks.make_row(entry, origin, criteria is not None)
         rows.append(row)
-        looks.append(look)
+        measured.append(stats)
         on_checked(number + 1, len(entries))
     unique = _reject_duplicates(rows)
-    if sift is not None:
-        seen = {row.scene_id: look for row, look in zip(unique, looks, strict=True) if look is not None}
-        unique = filter_rows(unique, seen, sift)
+    if criteria is not None:
+        stats_by_id = {row.scene_id: stats for row, stats in zip(unique, measured, strict=True) if stats is not None}
+        unique = filter_rows(unique, stats_by_id, criteria)
     return Manifest(unique, {**found.ignored, **listed.ignored})
 
 
@@ -78,7 +78,7 @@ def create_manifest(
     out: str,
     bounds: ObserveConfig | None = None,
     listed: FetchedLists = NO_LISTS,
-    sift: FilterCriteria | None = None,
+    criteria: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> Manifest:
     """Make the image manifest of folders and files, and write it as Parquet.
@@ -88,7 +88,7 @@ def create_manifest(
         out: The Parquet file to write, a path or URI.
         bounds: On what is decoded; None for the defaults.
         listed: Entries of lists of addresses.
-        sift: Criteria for bare pictures; None accepts all that decode.
+        criteria: Criteria for bare pictures; None accepts all that decode.
         on_checked: Called with the number of checked entries and of all entries.
 
     Returns:
@@ -102,7 +102,7 @@ def create_manifest(
         >>> manifest = create_manifest(["captures"], "images.parquet")
         >>> sum(not row.rejected for row in manifest.rows)
     """
-    made = make_manifest(paths, ObserveConfig() if bounds is None else bounds, listed, sift, on_checked)
+    made = make_manifest(paths, ObserveConfig() if bounds is None else bounds, listed, criteria, on_checked)
     if not made.rows:
         raise InputError(
             f"nothing found in {', '.join(sanitize_line(path) for path in paths)[:500]}: a capture is a folder with "
@@ -139,19 +139,19 @@ class _EntryChecker:
         self.digests: dict[str, str] = {}
         self.refused: dict[str, str] = {}
 
-    def row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
+    def make_row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
         """Make the row of an entry, and statistics of a bare picture if they are asked for."""
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
-        look = None
+        stats = None
         try:
             if entry.problem is not None:
                 raise InputError(entry.problem[1], entry.problem[0])
             digest = hash_entry(entry.kind, entry.uri, self.bounds, self.digests)
-            picture = self._decoded(entry)
+            picture = self._decode(entry)
             if origin is NO_ORIGIN:
                 source, licence = _read_provenance(entry)
-            look = measure_image(picture) if measure and picture is not None else None
+            stats = measure_image(picture) if measure and picture is not None else None
         except InputError as error:
             reason, detail = error.reason, sanitize_line(str(error), 1000)
         row = ImageRow(
@@ -166,9 +166,9 @@ class _EntryChecker:
             rejected=reason,
             rejected_detail=detail,
         )
-        return row, look
+        return row, stats
 
-    def _decoded(self, entry: ManifestEntry) -> Picture | None:
+    def _decode(self, entry: ManifestEntry) -> Picture | None:
         """Decode everything that belongs to an entry; returns the pixels of a bare picture.
 
         Raises:

@@ -40,7 +40,7 @@ class TextureLibrary:
     def __len__(self) -> int:
         return int(self.table.num_rows)
 
-    def row(self, which: int | str) -> dict[str, Any]:
+    def get_row(self, which: int | str) -> dict[str, Any]:
         """Get the row of a seed (modulo the number of sets), of a texture_id, or of the first set of a name.
 
         Raises:
@@ -60,13 +60,13 @@ class TextureLibrary:
         row: dict[str, Any] = self.table.slice(index, 1).to_pylist()[0]
         return row
 
-    def picture(self, which: int | str, most_px: int = DEFAULT_PX) -> Picture:
+    def read_picture(self, which: int | str, most_px: int = DEFAULT_PX) -> Picture:
         """Read the colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`.
 
         Raises:
             InputError: if there is no such set, or its file is gone, broken or outside the repository.
         """
-        file = str(self.row(which)["color"])
+        file = str(self.get_row(which)["color"])
         path = (self.root / file).resolve()
         if not path.is_relative_to(self.root.resolve()):
             raise InputError(f"{sanitize_line(file)} lies outside {sanitize_line(str(self.root))}", "unreadable_map")

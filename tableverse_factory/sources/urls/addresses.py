@@ -96,7 +96,7 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
             httpcore.ConnectError: if the name is unknown or no address answers.
         """
         error: Exception = httpcore.ConnectError(f"{sanitize_line(host)} has no address")
-        addresses = (await self._resolved(host, port))[:_MAX_ADDRESSES]
+        addresses = (await self._resolve(host, port))[:_MAX_ADDRESSES]
         share_s = min(self._connect_s if timeout is None else timeout, self._connect_s) / max(len(addresses), 1)
         for address in addresses:
             try:
@@ -105,7 +105,7 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
                 error = refused
         raise error
 
-    async def _resolved(self, host: str, port: int) -> list[str]:
+    async def _resolve(self, host: str, port: int) -> list[str]:
         try:
             found = await asyncio.get_running_loop().run_in_executor(
                 self._lookups, socket.getaddrinfo, host, port, 0, socket.SOCK_STREAM

@@ -17,9 +17,9 @@ from tableverse_factory.sources.urls.fetch import FetchBounds, HostRateLimiter, 
 from tableverse_factory.sources.urls.image_store import SUFFIXES, ImageStore
 
 MAX_HOST_FAILURES = 5
-"""Addresses of one host that cannot be reached, one after the other: the rest of them are not asked in this run."""
+"""Unreachable addresses of a host in a row, after which the rest of them are skipped in this run."""
 _TASKS_PER_REQUEST = 8
-"""Pictures under way for each request at a time: most of them wait, for a turn or because their server asks to."""
+"""Pictures in flight for each request: most of them wait for a slot, or because their server asks to."""
 
 
 @dataclass(slots=True)
@@ -27,9 +27,9 @@ class DownloadResult:
     """Results of downloads by address.
 
     Attributes:
-        paths: Where the picture of an address lies.
-        refused: Code and detail of the reason why it has none.
-        fetched: How many came now; the others of `paths` were there.
+        paths: Picture of an address.
+        refused: Code and detail of why an address has none.
+        fetched: Number of pictures fetched now; the others of `paths` existed.
     """
 
     paths: dict[str, Path] = field(default_factory=dict)
@@ -39,7 +39,7 @@ class DownloadResult:
 
 def download_images(
     urls: Sequence[str],
-    kept: ImageStore,
+    store: ImageStore,
     bounds: FetchBounds,
     pictures: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
@@ -48,32 +48,32 @@ def download_images(
 
     Args:
         urls: Each once, untrusted.
-        kept: Where pictures go.
+        store: Where pictures are kept.
         bounds: On fetching.
-        pictures: Bounds on what is kept.
-        on_done: Called with how many are done, of how many.
+        pictures: Bounds on pictures that are stored.
+        on_done: Called with the numbers of finished and of all addresses.
 
     Raises:
         BuildError: if the disk refuses.
     """
-    done = DownloadResult()
+    result = DownloadResult()
     missing: dict[bytes, _HostQueue] = {}
     for url in urls:
-        if (path := kept.find(url)) is not None:
-            done.paths[url] = path
+        if (path := store.find(url)) is not None:
+            result.paths[url] = path
             continue
         try:
             missing.setdefault(parse_url(url).raw_host, _HostQueue()).urls.append(url)
         except InputError as error:
-            done.refused[url] = (error.reason, str(error))
-        on_done(len(done.paths) + len(done.refused), len(urls))
+            result.refused[url] = (error.reason, str(error))
+        on_done(len(result.paths) + len(result.refused), len(urls))
     if missing:
         within = replace(bounds, max_bytes=min(bounds.max_bytes, pictures.max_file_bytes))
         fetcher = _Fetcher(
-            kept, within, pictures, done, lambda: on_done(len(done.paths) + len(done.refused), len(urls))
+            store, within, pictures, result, lambda: on_done(len(result.paths) + len(result.refused), len(urls))
         )
-        asyncio.run(fetcher.all_of(missing.values()))
-    return done
+        asyncio.run(fetcher.fetch_all(missing.values()))
+    return result
 
 
 @dataclass(slots=True)
@@ -87,33 +87,33 @@ class _HostQueue:
 class _Fetcher:
     def __init__(
         self,
-        kept: ImageStore,
+        store: ImageStore,
         bounds: FetchBounds,
         pictures: ObserveConfig,
-        done: DownloadResult,
+        result: DownloadResult,
         on_done: Callable[[], None],
     ) -> None:
-        self._kept, self._bounds, self._pictures = kept, bounds, pictures
-        self._done, self._on_done = done, on_done
+        self._store, self._bounds, self._pictures = store, bounds, pictures
+        self._result, self._on_done = result, on_done
         self._turns = HostRateLimiter(bounds)
         self._writing = asyncio.Lock()
 
-    async def all_of(self, hosts: Collection[_HostQueue]) -> None:
+    async def fetch_all(self, hosts: Collection[_HostQueue]) -> None:
         """Fetch the addresses of every host, at most `per_host` of one at a time."""
         for host in hosts:
             host.urls.reverse()  # they are taken from the end
         waiting = deque(host for host in hosts for _ in range(min(self._bounds.per_host, len(host.urls))))
         async with open_connections(self._bounds) as pool:
-            runners = min(len(waiting), _TASKS_PER_REQUEST * self._bounds.parallel)
-            await asyncio.gather(*(self._one_by_one(pool, waiting) for _ in range(runners)))
+            tasks = min(len(waiting), _TASKS_PER_REQUEST * self._bounds.parallel)
+            await asyncio.gather(*(self._fetch_queue(pool, waiting) for _ in range(tasks)))
 
-    async def _one_by_one(self, pool: httpcore.AsyncConnectionPool, waiting: deque[_HostQueue]) -> None:
+    async def _fetch_queue(self, pool: httpcore.AsyncConnectionPool, waiting: deque[_HostQueue]) -> None:
         while waiting:
             host = waiting.popleft()
             while host.urls:
-                await self._one(pool, host.urls.pop(), host)
+                await self._fetch_one(pool, host.urls.pop(), host)
 
-    async def _one(self, pool: httpcore.AsyncConnectionPool, url: str, host: _HostQueue) -> None:
+    async def _fetch_one(self, pool: httpcore.AsyncConnectionPool, url: str, host: _HostQueue) -> None:
         try:
             if host.failures >= MAX_HOST_FAILURES:
                 raise InputError(f"not asked: {host.failures} others of its host were out of reach", "unreachable")
@@ -121,12 +121,12 @@ class _Fetcher:
             host.failures = 0
             suffix = _detect_suffix(data, self._pictures)
             async with self._writing:
-                self._done.paths[url] = await asyncio.to_thread(self._kept.keep, url, data, suffix)
-            self._done.fetched += 1
+                self._result.paths[url] = await asyncio.to_thread(self._store.store, url, data, suffix)
+            self._result.fetched += 1
         except InputError as error:
             if host.failures < MAX_HOST_FAILURES:
                 host.failures = host.failures + 1 if error.reason == "unreachable" else 0
-            self._done.refused[url] = (error.reason, sanitize_line(str(error), 1000))
+            self._result.refused[url] = (error.reason, sanitize_line(str(error), 1000))
         self._on_done()
 
 

@@ -63,40 +63,46 @@ def measure_image(picture: Picture) -> ImageStats:
     return ImageStats(width, height, math.sqrt(variance), sharpness, compute_phash(picture))
 
 
-def find_rejection(look: ImageStats, sift: FilterCriteria) -> tuple[str, str] | None:
+def find_rejection(stats: ImageStats, criteria: FilterCriteria) -> tuple[str, str] | None:
     """Find code and detail of the first reason against a picture."""
-    short, long = sorted((look.width, look.height))
-    if short < sift.min_side_px:
-        return "too_small", f"{look.width} x {look.height} pixels: the shorter side has less than {sift.min_side_px}"
-    if long > sift.max_aspect * short:
-        return "odd_shape", f"{look.width} x {look.height} pixels: one side is over {sift.max_aspect:g} times the other"
-    if look.contrast < sift.min_contrast:
+    short, long = sorted((stats.width, stats.height))
+    if short < criteria.min_side_px:
+        return (
+            "too_small",
+            f"{stats.width} x {stats.height} pixels: the shorter side has less than {criteria.min_side_px}",
+        )
+    if long > criteria.max_aspect * short:
+        return (
+            "odd_shape",
+            f"{stats.width} x {stats.height} pixels: one side is over {criteria.max_aspect:g} times the other",
+        )
+    if stats.contrast < criteria.min_contrast:
         return (
             "uniform",
-            f"its grey varies by {look.contrast:.1f} of 255 around its mean: less than {sift.min_contrast:g}",
+            f"its grey varies by {stats.contrast:.1f} of 255 around its mean: less than {criteria.min_contrast:g}",
         )
-    if look.sharpness < sift.min_sharpness:
-        return "blurred", f"its sharpness is {look.sharpness:.4f}: less than {sift.min_sharpness:g}"
+    if stats.sharpness < criteria.min_sharpness:
+        return "blurred", f"its sharpness is {stats.sharpness:.4f}: less than {criteria.min_sharpness:g}"
     return None
 
 
 def filter_rows(
-    rows: Sequence[ImageRow], looks: Mapping[str, ImageStats], sift: FilterCriteria
+    rows: Sequence[ImageRow], stats: Mapping[str, ImageStats], criteria: FilterCriteria
 ) -> tuple[ImageRow, ...]:
     """Reject the rows of pictures that fail the criteria.
 
     Args:
         rows: Of a manifest; ids are unique.
-        looks: Of the bare pictures among them, by scene id. Nothing else is checked.
-        sift: What they must have.
+        stats: Of the bare pictures among them, by scene id. Nothing else is checked.
+        criteria: What they must have.
     """
-    checked = [_apply_criteria(row, looks.get(row.scene_id), sift) for row in rows]
-    remaining = [number for number, row in enumerate(checked) if not row.rejected and row.scene_id in looks]
-    if sift.near_bits < 0:
+    checked = [_apply_criteria(row, stats.get(row.scene_id), criteria) for row in rows]
+    remaining = [number for number, row in enumerate(checked) if not row.rejected and row.scene_id in stats]
+    if criteria.near_bits < 0:
         return tuple(checked)
-    seen = [looks[checked[number].scene_id] for number in remaining]
-    ranks = [_rank(checked[number], look) for number, look in zip(remaining, seen, strict=True)]
-    duplicates = find_near_duplicates([look.phash for look in seen], ranks, sift.near_bits)
+    candidates = [stats[checked[number].scene_id] for number in remaining]
+    ranks = [_rank(checked[number], seen) for number, seen in zip(remaining, candidates, strict=True)]
+    duplicates = find_near_duplicates([seen.phash for seen in candidates], ranks, criteria.near_bits)
     for number, (kept, bits) in duplicates.items():
         first = checked[remaining[kept]]
         detail = f"{bits} bits from {first.scene_id}, not smaller, at {sanitize_line(first.url or first.uri, 500)}"
@@ -104,13 +110,13 @@ def filter_rows(
     return tuple(checked)
 
 
-def _rank(row: ImageRow, look: ImageStats) -> int:
+def _rank(row: ImageRow, stats: ImageStats) -> int:
     """Rank by pixels; among equally large pictures a known licence wins."""
-    return 2 * look.width * look.height + bool(row.licence)
+    return 2 * stats.width * stats.height + bool(row.licence)
 
 
-def _apply_criteria(row: ImageRow, look: ImageStats | None, sift: FilterCriteria) -> ImageRow:
-    against = None if look is None or row.rejected else find_rejection(look, sift)
+def _apply_criteria(row: ImageRow, stats: ImageStats | None, criteria: FilterCriteria) -> ImageRow:
+    against = None if stats is None or row.rejected else find_rejection(stats, criteria)
     return row if against is None else _reject(row, *against)
 
 

@@ -56,7 +56,7 @@ class ImageStore:
         except OSError:  # it went: it is fetched again
             return None
 
-    def keep(self, url: str, data: bytes, suffix: str) -> Path:
+    def store(self, url: str, data: bytes, suffix: str) -> Path:
         """Store the bytes of an address.
 
         Raises:

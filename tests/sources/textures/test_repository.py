@@ -189,13 +189,13 @@ def test_the_index_is_the_same_each_time_and_gives_pictures_back(tmp_path):
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     library = open_library(tmp_path / "a.parquet")
     assert len(library) == 2
-    np.testing.assert_allclose(library.picture("Wood002", 128).mean(axis=(0, 1)), [10, 200, 30], atol=3)
-    assert library.picture(1, 128).shape == (64, 128, 3)
-    assert library.picture(3).shape == (256, 512, 3), "seeds go round"
+    np.testing.assert_allclose(library.read_picture("Wood002", 128).mean(axis=(0, 1)), [10, 200, 30], atol=3)
+    assert library.read_picture(1, 128).shape == (64, 128, 3)
+    assert library.read_picture(3).shape == (256, 512, 3), "seeds go round"
     with pytest.raises(InputError, match="no texture"):
-        library.picture("Wood003")
+        library.read_picture("Wood003")
     with pytest.raises(InputError, match="cannot be read"):
-        open_library(tmp_path / "a.parquet", tmp_path / "elsewhere").picture(0)
+        open_library(tmp_path / "a.parquet", tmp_path / "elsewhere").read_picture(0)
 
 
 def test_an_index_that_somebody_forged_opens_nothing_else(tmp_path):
@@ -205,7 +205,7 @@ def test_an_index_that_somebody_forged_opens_nothing_else(tmp_path):
     forged = table.set_column(table.schema.get_field_index("color"), "color", pa.array(["../secret.jpg"]))
     write_index(tmp_path / "forged.parquet", forged)
     with pytest.raises(InputError, match="outside"):
-        open_library(tmp_path / "forged.parquet").picture(0)
+        open_library(tmp_path / "forged.parquet").read_picture(0)
     pq.write_table(pa.table({"a": [1]}), tmp_path / "other.parquet")
     for name in ("other.parquet", "secret.jpg", "nowhere.parquet"):
         with pytest.raises(InputError):

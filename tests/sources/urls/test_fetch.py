@@ -52,10 +52,10 @@ def write_list(path: Path, rows) -> Path:
     return path
 
 
-def made(folder: Path, urls, fetching=HERE, sift=None):
+def made(folder: Path, urls, fetching=HERE, criteria=None):
     rows = [(url, "", "") if isinstance(url, str) else url for url in urls]
     listed = fetch_lists([str(write_list(folder / "list.csv", rows))], folder / "pictures", fetching, BOUNDS)
-    return make_manifest([], BOUNDS, listed, sift).rows, listed
+    return make_manifest([], BOUNDS, listed, criteria).rows, listed
 
 
 def only(folder: Path, url: str, **changes):
@@ -389,7 +389,7 @@ def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
         "other.jpg": photo(5),
     }
     pictures.answers |= {f"/{name}": body(encoded(image, quality=70)) for name, image in sent.items()}
-    rows, _ = made(tmp_path, [f"{pictures.url}/{name}" for name in sent], sift=FilterCriteria())
+    rows, _ = made(tmp_path, [f"{pictures.url}/{name}" for name in sent], criteria=FilterCriteria())
     assert {row.name: row.rejected for row in rows} == {
         "small.jpg": "near_duplicate_of",
         "large.jpg": "",
@@ -405,7 +405,7 @@ def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
 def test_captures_are_never_sifted(tmp_path):
     write_capture(tmp_path / "c", 1)
     write_picture(tmp_path / "p" / "a.png", 2)
-    rows = make_manifest([str(tmp_path)], BOUNDS, sift=FilterCriteria()).rows
+    rows = make_manifest([str(tmp_path)], BOUNDS, criteria=FilterCriteria()).rows
     assert [row.rejected for row in rows] == ["", "too_small"]
 
 
