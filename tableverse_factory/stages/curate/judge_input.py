@@ -8,9 +8,9 @@ from schemas.config import CurateConfig
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
-from tableverse_factory.geometry.math.aabb import aabb_size
+from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 from tableverse_factory.geometry.mesh.height_maps import CELL_M
-from tableverse_factory.geometry.mesh.meshes import bounds, box_center, concatenate_meshes, place_mesh
+from tableverse_factory.geometry.mesh.meshes import box_center, concatenate_meshes, place_mesh
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
 from tableverse_factory.geometry.relations.antipodal import Grips, filter_grips, find_antipodal_grips
 from tableverse_factory.geometry.relations.relations import BodyFeatures, compute_body_features
@@ -78,7 +78,7 @@ def build_judge_input(scene: SettledScene, config: CurateConfig) -> JudgeInput:
     """Measure a settled scene."""
     placed = scene.rectified.placed
     meshes = [place_mesh(o.mesh, pose, o.scale) for o, pose in zip(placed.objects, scene.poses, strict=True)]
-    extent = aabb_size(np.concatenate([corner for mesh in meshes for corner in bounds(mesh)]).reshape(-1, 3))
+    extent = aabb_size(np.concatenate([corner for mesh in meshes for corner in aabb(mesh.vertices)]).reshape(-1, 3))
     cell = max(CELL_M, float(extent[:2].max()) / _MAX_CELLS)
     items = tuple(
         _measure_object(o, mesh, tuple(pieces.hulls), pose, cell, config.gripper_width_m)
@@ -99,7 +99,7 @@ def _measure_object(
     cell: float,
     gripper_width: float,
 ) -> JudgedObject:
-    low, high = bounds(item.mesh)
+    low, high = aabb(item.mesh.vertices)
     before = None if item.copy_of else box_center(place_mesh(item.mesh, item.pose, item.scale))
     caster = make_raycasting_scene(mesh)
     pieces_caster = make_raycasting_scene(place_mesh(concatenate_meshes(hulls), pose, item.scale))

@@ -7,7 +7,7 @@ from PIL import Image
 from schemas.config import CurateConfig
 from schemas.curation import AnswerOrigin
 from tableverse_factory.models.remote.client import ModelClient
-from tableverse_factory.models.remote.endpoint import endpoint_of
+from tableverse_factory.models.remote.endpoint import read_endpoint
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.drawables import make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
@@ -25,7 +25,7 @@ class ModelJudge:
 
     def __init__(self, config: CurateConfig, services: Services) -> None:
         self._model = config.model
-        self._client = ModelClient(endpoint_of(config), services)
+        self._client = ModelClient(read_endpoint(config), services)
 
     def judge(self, case: JudgeInput) -> Judgement:
         """Ask the model about the scene.

@@ -6,8 +6,8 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from schemas.curation import GeneratedTask, JudgeAnswer, PhysicalProperties, Relabelling, SevereLabelError
-from tableverse_factory.models.remote.exchange import whole_text
-from tableverse_factory.models.remote.json_text import json_object, validate_answer
+from tableverse_factory.models.remote.exchange import replace_lone_surrogates
+from tableverse_factory.models.remote.json_text import parse_json_object, validate_answer
 
 MAX_TASKS = 500
 MAX_ENTRIES = 1000
@@ -27,7 +27,7 @@ def parse_judgement(text: str) -> JudgeAnswer:
     Raises:
         AnswerInvalidError: if the text is too long, holds no JSON object, or lacks those three.
     """
-    raw = json_object(text)
+    raw = parse_json_object(text)
     cleaned = {
         "usability": raw.get("usability"),
         "per_criterion": raw.get("per_criterion"),
@@ -95,7 +95,7 @@ def _read_task(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_text(value: Any) -> str:
-    return whole_text(value[:4000]) if isinstance(value, str) else ""
+    return replace_lone_surrogates(value[:4000]) if isinstance(value, str) else ""
 
 
 def _read_integer(value: Any) -> int:

@@ -1,4 +1,4 @@
-"""Room for every face of a mesh in one square texture: two faces to a square, large faces in large squares."""
+"""Texture atlas of a mesh: two faces to a square, large faces in large squares."""
 
 from dataclasses import dataclass
 
@@ -9,29 +9,27 @@ from schemas.geometry import Frozen, Points, TriangleMesh
 from tableverse_factory.geometry.math.aabb import aabb
 
 CELL = 4
-"""Texels along the smallest square."""
+"""Side of the smallest square [texels]."""
 
 LEVELS = 5
-"""Squares have CELL · 2^k texels along a side, k below this."""
+"""Number of sizes: squares have CELL · 2^k texels along a side, k below this."""
 
 INSET, GUTTER = 1, 6
-"""Texels between a triangle and its square's border, and all that a square's side loses to borders and the diagonal.
+"""Texels between a triangle and its square's border, and texels of a side lost to borders and the diagonal.
 
 Filters then mix a face with copies of its own edge. The smallest squares, of faces without detail, have no room for it.
 """
-
-
 FINE_TEXELS = 1.5
-"""A face no larger than so many texels shows all its detail in the smallest square, which has two along an edge."""
+"""A face of at most this size [texels] shows all its detail in the smallest square, which has two along an edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas(Frozen):
-    """Where the faces lie in the texture.
+    """Places of the faces in the texture.
 
     Attributes:
-        side: Texels along the texture.
-        square: Texels along the square of each face. Shape (m,).
+        side: Side of the texture [texels].
+        square: Side of the square of each face [texels]. Shape (m,).
         corner: Column and row of the first texel of that square. Shape (m, 2).
         second: Whether a face has the half of its square away from that texel. Shape (m,).
     """
@@ -43,7 +41,7 @@ class Atlas(Frozen):
 
 
 def lay_out_atlas(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"], side: int) -> Atlas | None:
-    """The atlas at this density of each face, or None where the texture is too small for it.
+    """Lay out an atlas at this density of each face; None where the texture is too small.
 
     Squares are cut by size, the largest first, along a Morton curve of the texture, which packs powers of two without
     a gap; faces of a size follow one another along a Morton curve in space, so that neighbours in the texture, which
@@ -68,7 +66,7 @@ def lay_out_atlas(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"
 
 
 def list_triangle_texels(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 2"], Float64[np.ndarray, "t 3"]]:
-    """Texels (column, row) of one half of a square, and their barycentric weights in its face.
+    """List texels (column, row) of one half of a square, and their barycentric weights in its face.
 
     Beyond the face's edge, in the gutter, texels repeat the edge.
     """
@@ -83,7 +81,7 @@ def list_triangle_texels(square: int, second: bool) -> tuple[Int64[np.ndarray, "
 
 
 def find_corner_texels(atlas: Atlas) -> Int64[np.ndarray, "m 3 2"]:
-    """Texels (column, row) at each face's three corners."""
+    """Find the texels (column, row) at each face's three corners."""
     sizes, which = np.unique(atlas.square, return_inverse=True)
     inset, reach = (np.array([_inset_triangle(int(size))[k] for size in sizes])[which, None, None] for k in range(2))
     steps = inset + reach * np.array([[0, 0], [1, 0], [0, 1]])
@@ -92,12 +90,12 @@ def find_corner_texels(atlas: Atlas) -> Int64[np.ndarray, "m 3 2"]:
 
 
 def _inset_triangle(square: int) -> tuple[int, int]:
-    """Texels from a square's border to its triangle, and along the triangle's legs."""
+    """Return the texels from a square's border to its triangle, and along the triangle's legs."""
     return (INSET, square - GUTTER) if square > CELL else (0, 1)
 
 
 def _choose_levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
-    """Size of each face's square, as a power of two: by its area, and for slivers by half their length."""
+    """Choose the size of each face's square, as a power of two: by area, and for slivers by half their length."""
     if not texels_per_metre.any():
         return np.zeros(len(mesh.faces), dtype=np.int64)
     corners = mesh.vertices[mesh.faces]
@@ -110,7 +108,7 @@ def _choose_levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m
 
 
 def _sort_along_curve(points: Points) -> Int64[np.ndarray, " n"]:
-    """Order of the points along a Morton curve."""
+    """Sort the points along a Morton curve."""
     low, high = aabb(points)
     cells = ((points - low) / max(float((high - low).max()), 1e-30) * 1023).astype(np.int64)
     code = np.zeros(len(points), dtype=np.int64)
@@ -121,7 +119,7 @@ def _sort_along_curve(points: Points) -> Int64[np.ndarray, " n"]:
 
 
 def _decode_morton(code: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, "n 2"]:
-    """Column and row of positions along a Morton curve of the plane."""
+    """Decode positions along a Morton curve of the plane to column and row."""
     place = np.zeros((len(code), 2), dtype=np.int64)
     for bit in range(16):
         for axis in range(2):

@@ -11,13 +11,13 @@ from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
 from tableverse_factory.core.errors import GeometryError, TableverseError
 from tableverse_factory.geometry.math.aabb import aabb_size
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.bodies.materials import estimate_mass_kg
 from tableverse_factory.physics.bodies.prior_mass import apply_material_friction
 from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
 from tableverse_factory.physics.mjcf.spec import SceneBody, SceneFiles, TableTexture, make_scene_body, make_scene_files
-from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, increase_rolling_friction, move_bodies
 from tableverse_factory.sources.textures.catalogue import TILE_M

@@ -1,16 +1,16 @@
-"""`meta.json`: what the MJCF cannot say. Written by export; `read_meta` reads it again."""
+"""Writer of `meta.json`: what the MJCF cannot hold; `read_meta` reads it."""
 
 import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from typing import Any
 
 import numpy as np
 
-from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
-from schemas.objects import PlacedObjects, Table
+from schemas.geometry import ConvexPieces, TriangleMesh
+from schemas.objects import PlacedObjects
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.dataset.scene_meta import FORMAT
 from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
@@ -19,23 +19,23 @@ from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
 def build_meta_json(
     scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate, files: Mapping[str, bytes]
 ) -> bytes:
-    """The file: sorted keys, shortest exact floats, so that equal scenes give equal bytes.
+    """Build the file with sorted keys and shortest exact floats, so that equal scenes give equal bytes.
 
     Args:
-        scene: Where it all comes from.
-        bodies: As exported, in the order of the objects.
-        certificate: Measured on the exported XML.
-        files: All other files of the scene, whose digests it keeps.
+        scene: The scene.
+        bodies: The exported bodies, in the order of the objects.
+        certificate: Measurements on the exported XML.
+        files: All other files of the scene, whose digests are kept.
     """
     placed = scene.settled.rectified.placed
     evidence = placed.evidence
     content = {
         "format": FORMAT,
         "scene_id": scene.scene_id,
-        "certificate": asdict(certificate),
-        "table": _table(placed.table),
-        "camera": None if evidence is None else _camera(evidence.camera),
-        "camera_to_table": None if evidence is None else _pose(evidence.camera_to_table),
+        "certificate": certificate,
+        "table": placed.table,
+        "camera": None if evidence is None else evidence.camera,
+        "camera_to_table": None if evidence is None else evidence.camera_to_table,
         "perception": placed.perception,
         "detection": None if placed.detection is None else placed.detection.model_dump(mode="json"),
         "judge": scene.judge,
@@ -50,7 +50,7 @@ def build_meta_json(
 
 
 def compute_file_digests(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
-    """Size and SHA-256 of each file."""
+    """Compute size and SHA-256 of each file."""
     return {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()}
 
 
@@ -73,9 +73,9 @@ def _describe_objects(
             "fit_residual_m": item.fit_residual_m,
             "mask_value": value,
             "poses": {
-                "placed": _pose(item.pose) if item.copy_of is None else None,
-                "rectified": _pose(before),
-                "settled": _pose(body.pose),
+                "placed": item.pose if item.copy_of is None else None,
+                "rectified": before,
+                "settled": body.pose,
             },
             "pieces": _describe_pieces(pieces, item.scale, body),
             "appearance": _describe_appearance(item.mesh),
@@ -89,7 +89,7 @@ def _describe_objects(
 
 
 def _describe_pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dict[str, Any]:
-    """Lengths are those of the exported object, scale included."""
+    """Describe the convex pieces; lengths include the scale."""
     return {
         "count": len(body.hulls),
         "too_thin": body.dropped_pieces,
@@ -103,32 +103,16 @@ def _describe_pieces(pieces: ConvexPieces, scale: float, body: SceneBody) -> dic
 
 
 def _describe_appearance(mesh: TriangleMesh) -> str:
-    """Where the colours come from: the mesh's own texture, its vertices (and the picture), or our palette."""
+    """Name the source of the colours: the mesh's own texture, its vertices (and the picture), or the palette."""
     if mesh.texture is not None:
         return "texture"
     return "palette" if mesh.vertex_colors is None else "vertex_colors"
 
 
-def _table(table: Table) -> dict[str, Any]:
-    return {
-        "center_xy": table.center_xy,
-        "half_size_xy": table.half_size_xy,
-        "yaw": table.yaw,
-        "color": table.color,
-        "rms_m": table.rms_m,
-    }
-
-
-def _camera(camera: Camera) -> dict[str, Any]:
-    return asdict(camera)
-
-
-def _pose(pose: Pose) -> dict[str, Any]:
-    return {"position": pose.position, "quaternion_wxyz": pose.quaternion_wxyz}
-
-
 def _to_json_value(value: Any) -> Any:
-    """Arrays as lists; what is not finite becomes null, for JSON knows no other word."""
+    """Convert to what JSON can hold: arrays as lists, dataclasses as objects, what is not finite as null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, Mapping):
         return {str(key): _to_json_value(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

@@ -1,10 +1,9 @@
-"""Colours of a surface from the picture it was seen in."""
+"""Projection of the picture's colours onto a surface."""
 
 import io
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float64
 from PIL import Image
 from scipy.ndimage import binary_erosion
@@ -13,25 +12,26 @@ from schemas.geometry import Camera, Frozen, Mask, Picture, Points, Pose, Triang
 from schemas.objects import Evidence
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 
 LEAST_FACING = 0.2
-"""Cosine between surface and line of sight below which pixels are too stretched to be worth more than a guess."""
+"""Least cosine between normal and line of sight; pixels of steeper faces are too stretched."""
 
 BORDER_PIXELS = 2
-"""Pixels this near an object's outline mix it with what is behind."""
+"""Width of the outline whose pixels mix the object with its background [px]."""
 
 SAME_SURFACE = 0.004
-"""A point is seen if the first thing on its line of sight is no nearer by more than this share of the distance."""
+"""A point is visible if the first surface on its line of sight is nearer by at most this share of the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColorProjector(Frozen):
-    """The picture as one object sees it.
+    """The picture, relative to one object.
 
     Attributes:
         color: Shape (h, w, 3) sRGB.
-        own: Pixels that show this object and nothing else.
-        object_to_camera: The mesh's own frame, at `scale`, in the camera frame.
+        own: Pixels that show this object alone.
+        object_to_camera: Pose of the mesh's own frame, at `scale`, in the camera frame.
     """
 
     color: Picture
@@ -42,12 +42,12 @@ class ColorProjector(Frozen):
 
     @property
     def texels_per_metre(self) -> float:
-        """Pixels that a metre of the mesh's own length spans where the object stands."""
+        """Pixels per metre of the mesh's own length at the object's distance."""
         return self.camera.fx * self.scale / max(float(self.object_to_camera.position[2]), 0.05)
 
 
 def load_projectors(evidence: Evidence, poses: list[Pose], scales: list[float]) -> list[ColorProjector]:
-    """The picture for each object, at the pose where the picture put it."""
+    """Decode the picture and prepare it for each object, at its placed pose."""
     color = np.asarray(Image.open(io.BytesIO(evidence.color_jpg)).convert("RGB"))
     ids = np.asarray(Image.open(io.BytesIO(evidence.masks_png))).astype(np.int64)
     table_to_camera = invert_pose(evidence.camera_to_table)
@@ -66,12 +66,12 @@ def load_projectors(evidence: Evidence, poses: list[Pose], scales: list[float]) 
 def project_colors(
     photograph: ColorProjector, mesh: TriangleMesh, points: Points, faces: np.ndarray
 ) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
-    """Which points of the mesh's surface the picture shows, and their sRGB there.
+    """Find which points of the mesh's surface the picture shows, and their sRGB there.
 
     Args:
-        photograph: Of this object.
-        mesh: In its own frame, before scale.
-        points: On its surface, same frame. Shape (n, 3).
+        photograph: The picture, prepared for this object.
+        mesh: Mesh in its own frame, before scale.
+        points: Points on its surface, same frame. Shape (n, 3).
         faces: Index of the face each point lies on. Shape (n,).
     """
     pose, scale = photograph.object_to_camera, photograph.scale
@@ -87,22 +87,13 @@ def project_colors(
     inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
     u, v = np.clip(nearest, 0, [width - 1, height - 1]).T
     seen = facing & inside & photograph.own[v, u]
-    seen[seen] = _find_visible(placed, mesh.faces, at[seen])
+    # A point is visible if no other part of the mesh is nearer on its line of sight.
+    scene = make_raycasting_scene(TriangleMesh(placed, mesh.faces))
+    first = scene.cast_rays(pack_rays(np.zeros(3), at[seen]), nthreads=1)["t_hit"].numpy()
+    seen[seen] = first > 1.0 - SAME_SURFACE
     colors = np.zeros((len(points), 3))
     colors[seen] = _sample_bilinear(photograph.color, pixels[seen])
     return seen, colors
-
-
-def _find_visible(vertices: Points, faces: np.ndarray, points: Points) -> np.ndarray:
-    """Which points the camera sees, the mesh's other parts being in the way of the rest."""
-    caster = o3d.t.geometry.RaycastingScene(nthreads=1)
-    caster.add_triangles(
-        o3d.core.Tensor.from_numpy(vertices.astype(np.float32)), o3d.core.Tensor.from_numpy(faces.astype(np.uint32))
-    )
-    rays = np.concatenate([np.zeros_like(points), points], axis=1).astype(np.float32)
-    first: np.ndarray = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
-    visible: np.ndarray = first > 1.0 - SAME_SURFACE
-    return visible
 
 
 def _sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

@@ -1,4 +1,4 @@
-"""A scene's rows of the tables at rest (`schemas.arrow`)."""
+"""Rows of one scene for the tables of `schemas.arrow`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,9 +13,22 @@ from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.physics.mjcf.spec import SceneBody
 
+_CERTIFICATE_COLUMNS = (
+    *("epsilon_m", "piece_penetration_before_m", "mesh_penetration_before_m", "piece_penetration_m"),
+    *("mesh_penetration_m", "drift_m", "drift_rad", "at_rest", "colliding"),
+)
+_VERDICT_COLUMNS = (
+    *("relabel_name", "label_confidence", "label_error", "answered_mass_kg", "mass_clipped", "has_hinge"),
+    *("hinge_category", "graspable", "bad_geometry", "non_tabletop"),
+)
+
+
+def _pick(record: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
 
 def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
-    """The columns of scenes/ that the scene knows itself; source, status and offsets are the executor's."""
+    """Build the columns of scenes/ that the scene itself knows; source, status and offsets are the executor's."""
     shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
     placed = scene.settled.rectified.placed
     return {
@@ -28,25 +41,17 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, 
         "quality_score": scene.assessment.quality_score,
         **_describe_detector(placed.detection),
         **_describe_judge(scene.assessment),
-        "epsilon_m": certificate.epsilon_m,
-        "piece_penetration_before_m": certificate.piece_penetration_before_m,
-        "mesh_penetration_before_m": certificate.mesh_penetration_before_m,
-        "piece_penetration_m": certificate.piece_penetration_m,
-        "mesh_penetration_m": certificate.mesh_penetration_m,
-        "drift_m": certificate.drift_m,
-        "drift_rad": certificate.drift_rad,
+        **_pick(certificate, *_CERTIFICATE_COLUMNS),
         "displacement_median_m": float(np.median(shifts)),
         "displacement_max_m": max(shifts),
         "n_fell": len(certificate.fell),
         "n_left_container": len(certificate.left_container),
-        "at_rest": certificate.at_rest,
-        "colliding": certificate.colliding,
         "settle_time_s": scene.settled.settle_time_s,
     }
 
 
 def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
-    """Which model found the objects, and what the rules did to its answer; nothing where none was asked."""
+    """Describe the model that found the objects and the remarks on its answer; empty where no model was asked."""
     if record is None:
         return {}
     return {
@@ -57,7 +62,7 @@ def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
 
 
 def _describe_judge(verdict: Assessment) -> dict[str, Any]:
-    """What the judge said itself, where it came from, and how far the rules agree."""
+    """Describe the judge's own answer, its origin, and how far the rules agree."""
     origin, agreement = verdict.origin, verdict.agreement
     columns: dict[str, Any] = {
         "answered_usable": verdict.answered_usable,
@@ -65,17 +70,12 @@ def _describe_judge(verdict: Assessment) -> dict[str, Any]:
         "judge_remarks": [f"{r.code}:{r.object_id}" if r.object_id else r.code for r in verdict.remarks],
     }
     if origin.model:
-        columns |= {
-            "judge_model": origin.model,
-            "judge_prompt_sha256": origin.prompt_sha256,
-        }
+        columns |= {"judge_model": origin.model, "judge_prompt_sha256": origin.prompt_sha256}
     if agreement is not None:
         columns |= {
-            "rules_usable": agreement.rules_usable,
-            "rules_score": agreement.rules_score,
+            **_pick(agreement, "rules_usable", "rules_score", "rules_tasks"),
             "rules_names_share": agreement.names_share,
             "rules_mass_ratio": agreement.mass_ratio,
-            "rules_tasks": agreement.rules_tasks,
             "rules_shared_tasks": agreement.shared_tasks,
         }
     return columns
@@ -84,7 +84,7 @@ def _describe_judge(verdict: Assessment) -> dict[str, Any]:
 def build_object_rows(
     scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate
 ) -> tuple[dict[str, Any], ...]:
-    """A row of objects/ per object, in their order."""
+    """Build a row of objects/ per object, in their order."""
     rectified = scene.settled.rectified
     verdicts = {verdict.object_id: verdict for verdict in scene.assessment.objects}
     shifts = dict(certificate.displacement_m)
@@ -103,7 +103,7 @@ def build_object_rows(
 
 
 def build_task_rows(scene: CuratedScene) -> tuple[dict[str, Any], ...]:
-    """A row of tasks/ per task, also for the refused."""
+    """Build a row of tasks/ per task, also for the refused."""
     return tuple({"scene_id": scene.scene_id, **task.model_dump(mode="json")} for task in scene.assessment.tasks)
 
 
@@ -111,19 +111,10 @@ def _describe_name(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, A
     return {
         "object_id": item.object_id,
         "label": item.label,
-        "relabel_name": verdict.relabel_name,
+        **_pick(verdict, *_VERDICT_COLUMNS),
         "distinguishing_phrases": list(verdict.distinguishing_phrases),
-        "label_confidence": verdict.label_confidence,
-        "label_error": verdict.label_error,
         "corrected_label": verdict.corrected_label or None,
         "from_rules": list(verdict.from_rules),
-        "answered_mass_kg": verdict.answered_mass_kg,
-        "mass_clipped": verdict.mass_clipped,
-        "has_hinge": verdict.has_hinge,
-        "hinge_category": verdict.hinge_category,
-        "graspable": verdict.graspable,
-        "bad_geometry": verdict.bad_geometry,
-        "non_tabletop": verdict.non_tabletop,
     }
 
 
@@ -131,8 +122,7 @@ def _describe_body(body: SceneBody) -> dict[str, Any]:
     columns = ("size_x_m", "size_y_m", "size_z_m", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
     values = (*aabb_size(body.mesh.vertices), *body.pose.position, *body.pose.quaternion_wxyz)
     return {
-        "mass_kg": body.properties.mass_kg,
-        "volume_m3": body.properties.volume_m3,
+        **_pick(body.properties, "mass_kg", "volume_m3"),
         **dict(zip(columns, map(float, values), strict=True)),
     }
 
@@ -140,13 +130,11 @@ def _describe_body(body: SceneBody) -> dict[str, Any]:
 def _describe_mesh(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:
     sure = item.uncertainty if item.copy_of is None else None
     return {
-        "fit_residual_m": item.fit_residual_m,
+        **_pick(item, "fit_residual_m", "completion", "mesh_licence"),
         "position_std_m": sure and sure.position_std_m,
         "heading_std_rad": sure and sure.heading_std_rad,
         "heading_folds": sure and sure.heading_folds,
         "fit_ambiguity": sure and sure.ambiguity,
-        "completion": item.completion,
-        "mesh_licence": item.mesh_licence,
         "n_pieces": len(body.hulls),
         "piece_volume_ratio": pieces.volume_ratio,
         "piece_hausdorff_m": item.scale * pieces.hausdorff_m,

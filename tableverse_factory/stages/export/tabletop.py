@@ -1,50 +1,52 @@
-"""What lies on the exported table: a quiet procedural texture in the colour that the picture shows."""
+"""Texture of the exported table: a quiet procedural one in the colour that the picture shows."""
 
 import numpy as np
 from PIL import Image
 
 from schemas.geometry import Picture
 from tableverse_factory.core.png import encode_png
-from tableverse_factory.sources.textures.catalogue import TEXTURE_COUNT, FAMILIES, make_texture, parse_texture_seed
+from tableverse_factory.sources.textures.catalogue import FAMILIES, TEXTURE_COUNT, make_texture, parse_texture_seed
 
 QUIET = (
     "planks", "butcher_block", "veneer", "plywood", "laminate", "lacquer", "plaster", "linen", "marble", "concrete",
 )  # fmt: skip
-"""Families that most real tables belong to."""
+"""Texture families of most real tables."""
 
 SIDE_PX = 384
 PALETTE = 64
-"""Few colours keep the file to tens of kB; between neighbouring ones no step shows."""
+"""Number of colours: few keep the file to tens of kB without visible steps."""
 
 MAX_SPREAD = 12.0
-"""Standard deviation of each channel [levels]: of more, the colour would not stand for the table."""
+"""Most standard deviation of each channel [levels], so that the mean colour represents the table."""
 MAX_SHARE = 0.1
-"""And as a share of the channel's mean: on dark wood, the spread of a light table would glow."""
+"""The same as a share of the channel's mean: on dark wood, the spread of a light table would glow."""
 
 BOLDEST = 3.0
-"""In standard deviations: veins of a dark stone, tinted, would glow."""
+"""Clip of each channel [standard deviations]: tinted veins of a dark stone would glow."""
 
 _SKETCH_PX = 32
 
 
 def draw_tabletop_texture(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes:
-    """A tile of a table-top whose mean colour is the table's, as a PNG file.
+    """Draw a tile of a table-top whose mean colour is the table's, as a PNG file.
 
-    Of one member of each quiet family, drawn at random, the nearest in colour is taken and tinted the rest of the way.
+    Of one random member of each quiet family, the nearest in colour is tinted to match.
 
     Args:
-        rng: Draws the members.
+        rng: Generator of the members.
         color: Mean sRGB of the table in the picture.
     """
     numbers = rng.integers(0, TEXTURE_COUNT // len(FAMILIES), len(QUIET))
     seeds = [parse_texture_seed(f"{family}-{number}") for family, number in zip(QUIET, numbers, strict=True)]
     wanted = np.array(color, dtype=np.float64)
     gaps = [float(((_compute_mean(make_texture(seed, _SKETCH_PX)) - wanted) ** 2).sum()) for seed in seeds]
-    return _encode_palette(_tint(make_texture(seeds[int(np.argmin(gaps))], SIDE_PX), wanted))
+    tile = _tint(make_texture(seeds[int(np.argmin(gaps))], SIDE_PX), wanted)
+    few = Image.fromarray(tile).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    return encode_png(few, compress_level=6)
 
 
 def _tint(picture: Picture, wanted: np.ndarray) -> Picture:
-    """Each channel scaled to the wanted mean, bold patterns softened; what is out of range is clipped."""
+    """Scale each channel to the wanted mean and soften bold patterns; values out of range are clipped."""
     gain = np.maximum(wanted, 1.0) / np.maximum(_compute_mean(picture), 1.0)
     most = np.minimum(MAX_SPREAD, MAX_SHARE * np.maximum(wanted, 1.0))
     calm = min(1.0, float((most / np.maximum(gain * np.std(picture, axis=(0, 1)), 1e-9)).min()))
@@ -57,8 +59,3 @@ def _tint(picture: Picture, wanted: np.ndarray) -> Picture:
 def _compute_mean(picture: Picture) -> np.ndarray:
     mean: np.ndarray = picture.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (picture.size // 3)
     return mean
-
-
-def _encode_palette(picture: Picture) -> bytes:
-    few = Image.fromarray(picture).quantize(PALETTE, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    return encode_png(few, compress_level=6)

@@ -1,14 +1,17 @@
-"""The stage `place`: each object of the picture becomes a closed metric mesh that stands in the table frame."""
+"""The stage `place`: each object of the picture becomes a closed metric mesh in the table frame."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
+from PIL import Image
 
 from schemas.config import Config
 from schemas.geometry import Points, TriangleMesh
-from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
+from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.registration.icp import PartialView
 from tableverse_factory.geometry.registration.register import (
@@ -18,9 +21,8 @@ from tableverse_factory.geometry.registration.register import (
     register,
 )
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.place.completion.completion import Completion
-from tableverse_factory.stages.place.evidence import encode_evidence
-from tableverse_factory.stages.place.interface import MESH_MODELS
+from tableverse_factory.stages.place.interfaces import Completion
+from tableverse_factory.stages.place.registry import MESH_MODELS
 from tableverse_factory.stages.place.vertex_colors import paint_vertices
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space, view_object
 from tableverse_factory.stages.place.view.support_from_depth import DepthSupport, find_supports
@@ -28,22 +30,25 @@ from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 MIN_POINTS = 30
 MIN_BREADTH_M = 0.001
 LEANING_STD_M, HIDDEN_STD_M = 0.005, 0.03
-"""How well the height is known on which contents stand: of long ones, which reach the floor, and of others [m]."""
+"""Standard deviation of the height on which contents stand: of long ones, which reach the floor, and of others [m]."""
+MAX_MASK_VALUE = 65_535
 
 
 def place(
     item: PerceivedObjects, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[PlacedObjects]:
-    """Completes and registers every object (paper section 3.1); what cannot be is left out with its reason."""
+    """Complete and register every object (paper section 3.1); objects that fail are left out with the reason."""
     left_out = list(item.left_out)
     seen = _view_objects(item, left_out)
     complete = MESH_MODELS[config.place.mesh_model]
-    answers = complete(item, [sighting for _, sighting in seen], config.place, rng, services)
+    answers = complete(item, [view for _, view in seen], config.place, rng, services)
     placed: list[PlacedObject] = []
     kept: list[PerceivedObject] = []
-    for (perceived, sighting), answer in zip(seen, answers, strict=True):
+    for (perceived, view), answer in zip(seen, answers, strict=True):
         try:
-            placed.append(_register_object(perceived, sighting, _given(answer)))
+            if isinstance(answer, GeometryError):
+                raise answer
+            placed.append(_register_object(perceived, view, answer))
             kept.append(perceived)
         except GeometryError as error:
             left_out.append((perceived.object_id, str(error)))
@@ -55,7 +60,7 @@ def place(
         PlacedObjects(
             scene_id=item.scene_id,
             table=item.table,
-            objects=tuple(_drop_lost_container(o, names) for o in placed),
+            objects=tuple(o if o.contained_in in names else replace(o, contained_in=None) for o in placed),
             evidence=encode_evidence(item, tuple(kept), config.export.jpeg_quality),
             perception=item.perception,
             left_out=tuple(left_out),
@@ -65,7 +70,7 @@ def place(
 
 
 def _view_objects(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> list[tuple[PerceivedObject, ObjectView]]:
-    """The objects of which enough was seen; the others are added to `left_out`."""
+    """View the objects of which enough was observed; the others are added to `left_out`."""
     supports = find_supports(scene)
     seen = []
     for perceived in scene.objects:
@@ -81,43 +86,37 @@ def _view_one(scene: PerceivedObjects, perceived: PerceivedObject, support: Dept
         raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
     if _measure_breadth(perceived.points_camera) < MIN_BREADTH_M:
         raise GeometryError(f"its {len(perceived.points_camera)} points lie on a line: no shape can be read from them")
-    sighting = view_object(scene, perceived, support)
-    if len(sighting.points) < MIN_POINTS:
-        raise GeometryError(f"{len(sighting.points)} points with depth are too few; at least {MIN_POINTS} are needed")
-    return sighting
+    view = view_object(scene, perceived, support)
+    if len(view.points) < MIN_POINTS:
+        raise GeometryError(f"{len(view.points)} points with depth are too few; at least {MIN_POINTS} are needed")
+    return view
 
 
-def _given(answer: Completion | GeometryError) -> Completion:
-    if isinstance(answer, GeometryError):
-        raise answer
-    return answer
-
-
-def _register_object(perceived: PerceivedObject, sighting: ObjectView, completion: Completion) -> PlacedObject:
+def _register_object(perceived: PerceivedObject, view: ObjectView, completion: Completion) -> PlacedObject:
     mesh, pose = completion.mesh, completion.pose
-    view = PartialView(
-        sighting.points,
-        sighting.eye,
-        sighting.support_z,
-        _estimate_support_std(perceived, sighting.support),
-        lambda points: measure_free_space(sighting, points),
+    partial = PartialView(
+        view.points,
+        view.eye,
+        view.support_z,
+        _estimate_support_std(perceived, view.support),
+        lambda points: measure_free_space(view, points),
     )
     if pose is None:
-        found = register(mesh, view)
+        found = register(mesh, partial)
         mesh, pose = TriangleMesh(mesh.vertices * found.size, mesh.faces, mesh.vertex_colors), found.pose
         uncertainty = found.uncertainty
     else:
-        uncertainty = estimate_uncertainty(mesh, pose, view)
+        uncertainty = estimate_uncertainty(mesh, pose, partial)
     return PlacedObject(
         object_id=perceived.object_id,
         label=perceived.label,
         label_confidence=perceived.score,
-        mesh=mesh if mesh.vertex_colors is not None else paint_vertices(mesh, pose, sighting),
+        mesh=mesh if mesh.vertex_colors is not None else paint_vertices(mesh, pose, view),
         scale=1.0,
         pose=pose,
         contained_in=perceived.contained_in,
         count=perceived.count,
-        fit_residual_m=measure_median_distance(sighting.points, place_mesh(mesh, pose)),
+        fit_residual_m=measure_median_distance(view.points, place_mesh(mesh, pose)),
         completion=completion.method,
         uncertainty=uncertainty,
         mesh_licence=completion.licence,
@@ -130,14 +129,27 @@ def _estimate_support_std(perceived: PerceivedObject, support: DepthSupport) -> 
     return LEANING_STD_M if support.leaning else HIDDEN_STD_M
 
 
-def _drop_lost_container(item: PlacedObject, names: set[str]) -> PlacedObject:
-    """Forgets a container that was itself left out."""
-    if item.contained_in is None or item.contained_in in names:
-        return item
-    return replace(item, contained_in=None)
-
-
 def _measure_breadth(points: Points) -> float:
     """Standard deviation of points across the line that fits them best [m]."""
     centred = points - points.mean(axis=0)
     return float(np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred / len(points))[1], 0.0)))
+
+
+def encode_evidence(scene: PerceivedObjects, objects: tuple[PerceivedObject, ...], jpeg_quality: int) -> Evidence:
+    """Encode the picture, its instance ids and the camera for the dataset; `object_pixels` follows `objects`.
+
+    Raises:
+        GeometryError: if an instance id does not fit into 16 bits.
+    """
+    color = io.BytesIO()
+    Image.fromarray(np.asarray(scene.observation.color)).save(color, "JPEG", quality=jpeg_quality)
+    ids = np.maximum(scene.instance_ids, 0)
+    if int(ids.max(initial=0)) > MAX_MASK_VALUE:
+        raise GeometryError(f"instance id {int(ids.max())}: masks hold at most {MAX_MASK_VALUE}")
+    return Evidence(
+        color_jpg=color.getvalue(),
+        masks_png=encode_png(ids.astype(np.uint16), compress_level=6),
+        object_pixels=tuple(o.instance_id for o in objects),
+        camera=scene.observation.camera,
+        camera_to_table=scene.camera_to_table,
+    )

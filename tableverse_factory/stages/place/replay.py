@@ -4,11 +4,11 @@ import numpy as np
 
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.stages.place.completion.completion import Completion
+from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 
-def replay_mesh(scene: PerceivedObjects, sighting: ObjectView) -> Completion:
+def replay_mesh(scene: PerceivedObjects, view: ObjectView) -> Completion:
     """The recorded mesh of the instance that covers most of the object's pixels; its pose is left to registration.
 
     Raises:
@@ -18,7 +18,7 @@ def replay_mesh(scene: PerceivedObjects, sighting: ObjectView) -> Completion:
     ids = scene.observation.recorded_ids
     if not meshes or ids is None:
         raise GeometryError("the capture has no recorded meshes: put meshes/<instance id>.obj beside its masks.png")
-    values, counts = np.unique(ids[scene.instance_ids == sighting.instance_id], return_counts=True)
+    values, counts = np.unique(ids[scene.instance_ids == view.instance_id], return_counts=True)
     instance_id = int(values[np.argmax(counts)]) if len(values) else 0
     if instance_id not in meshes:
         raise GeometryError(f"no mesh recorded for instance {instance_id}; there are {sorted(meshes)[:10]}")

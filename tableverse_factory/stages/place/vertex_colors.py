@@ -18,26 +18,26 @@ _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -
 """As seen, by half a turn about the vertical, and mirrored in the two upright planes of the object's own frame."""
 
 
-def paint_vertices(mesh: TriangleMesh, pose: Pose, sighting: ObjectView) -> TriangleMesh:
+def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> TriangleMesh:
     """The mesh with a colour per vertex.
 
     A vertex takes the colours of the observed points nearest in place and direction. The points are offered a
     second time turned by half and mirrored in the object's own upright frame, a little farther away: so the back
     looks like the front, and the outside of a cup does not run into its inside.
     """
-    step = max(1, len(sighting.points) // SOURCES)
+    step = max(1, len(view.points) // SOURCES)
     upright = Pose(pose.position, _extract_heading(pose))
     to_own = invert_pose(upright)
     turn = rotation_matrix(to_own.quaternion_wxyz)
-    points = transform_points(to_own, sighting.points[::step])
-    normals = sighting.normals[::step] @ turn.T
+    points = transform_points(to_own, view.points[::step])
+    normals = view.normals[::step] @ turn.T
     sources = np.concatenate(
         [_stack_features(points * t, normals * t, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
     )
     rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
     vertices = mesh.vertices @ rotation.T
     targets = _stack_features(vertices, compute_vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
-    colors = _mix_colors(sources, np.tile(sighting.colors[::step], (len(_TURNS), 1)), targets)
+    colors = _mix_colors(sources, np.tile(view.colors[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
 

@@ -12,7 +12,7 @@ from schemas.geometry import Picture
 from schemas.outcome import Dropped
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.client import ModelClient
-from tableverse_factory.models.remote.endpoint import endpoint_of
+from tableverse_factory.models.remote.endpoint import read_endpoint
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.replay import to_detection_result
@@ -71,7 +71,7 @@ def request_detections(color: Picture, config: PerceiveConfig, services: Service
     def read(text: str) -> PostprocessedAnswer:
         return apply_rules(parse_detections(text, order, sent))
 
-    client = ModelClient(endpoint_of(config), services)
+    client = ModelClient(read_endpoint(config), services)
     reply = client.ask_for(read, build_detection_prompt(order), [picture], build_detection_schema(order))
     origin = AnswerOrigin(model=config.model, prompt_sha256=hash_detection_prompt(order), rounds=reply.rounds)
     return DetectionRecord(origin=origin, answer=reply.value.answer, remarks=reply.value.remarks)

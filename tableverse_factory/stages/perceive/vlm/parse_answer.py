@@ -10,7 +10,7 @@ from schemas.detection import MAX_COUNT, MAX_DETECTIONS, Box, DetectionRemark
 from schemas.identity import clean_label
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.exchange import replace_lone_surrogates
-from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS, json_object
+from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS, parse_json_object
 from tableverse_factory.stages.perceive.vlm.boxes import (
     ImageSize,
     infer_scale,
@@ -115,11 +115,11 @@ def _extract_object(text: str) -> dict[str, Any]:
     if (items := _extract_list(text)) is not None:
         return items[0] if len(items) == 1 and _is_answer(items[0]) else {"detections": items}
     try:
-        return json_object(text)
+        return parse_json_object(text)
     except AnswerInvalidError:
         if "<bbox>" not in text:
             raise
-        return json_object(_TAG.sub(lambda tag: f"[{', '.join(tag[2].replace(',', ' ').split())}]", text))
+        return parse_json_object(_TAG.sub(lambda tag: f"[{', '.join(tag[2].replace(',', ' ').split())}]", text))
 
 
 def _is_answer(value: Any) -> bool:

@@ -36,13 +36,13 @@ class SolidBox(Frozen):
     misfit: float
 
 
-def fit_upright_box(sighting: ObjectView, rays: RaySample) -> SolidBox:
+def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
     """The best box that stands flat on the object's support.
 
     Raises:
         GeometryError: if the points span no area.
     """
-    fits = [_fit_upright(sighting, rays, yaw) for yaw in _propose_yaws(sighting)]
+    fits = [_fit_upright(view, rays, yaw) for yaw in _propose_yaws(view)]
     return min(fits, key=lambda box: box.misfit)
 
 
@@ -53,45 +53,45 @@ def build_box_mesh(box: SolidBox) -> TriangleMesh:
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
 
 
-def _propose_yaws(sighting: ObjectView) -> list[float]:
+def _propose_yaws(view: ObjectView) -> list[float]:
     """Headings modulo a quarter turn: of the smallest rectangle, and of the upright faces' normals."""
-    yaws = [fit_min_rectangle(sighting.points[:, :2]).yaw]
-    sideways = np.abs(sighting.normals[:, 2]) < 0.4
+    yaws = [fit_min_rectangle(view.points[:, :2]).yaw]
+    sideways = np.abs(view.normals[:, 2]) < 0.4
     if sideways.sum() > 20:
-        angle = np.arctan2(sighting.normals[sideways, 1], sighting.normals[sideways, 0])
+        angle = np.arctan2(view.normals[sideways, 1], view.normals[sideways, 0])
         yaws.append(float(np.angle(np.exp(4j * angle).mean()) / 4))
     return yaws
 
 
-def _fit_upright(sighting: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
+def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    local = sighting.points[:, :2] @ axes.T
+    local = view.points[:, :2] @ axes.T
     low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
-    top = max(float(np.quantile(sighting.points[:, 2], 0.98)), sighting.support_z + MIN_SIDE_M)
+    top = max(float(np.quantile(view.points[:, 2], 0.98)), view.support_z + MIN_SIDE_M)
     middle = axes.T @ ((low + high) / 2)
-    start = np.array([*middle, *np.log(np.maximum(high - low, MIN_SIDE_M)), np.log(top - sighting.support_z), yaw])
+    start = np.array([*middle, *np.log(np.maximum(high - low, MIN_SIDE_M)), np.log(top - view.support_z), yaw])
 
     def cost(x: Float64[np.ndarray, "6"]) -> float:
-        box_pose, half = _decode_box(x, sighting.support_z)
+        box_pose, half = _decode_box(x, view.support_z)
         sides = np.sort(half)
         prior = PRIOR_M * float(np.abs(np.log(half[:2] / sides[1])).sum())
         return (
             compute_misfit(rays, intersect_box(rays, box_pose, half))
             + prior
-            + _penalize_uncarried(sighting, box_pose, half)
+            + _penalize_uncarried(view, box_pose, half)
         )
 
     steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
     simplex = np.vstack([start, start + steps])
     options = {"initial_simplex": simplex, "maxfev": 240, "xatol": 2e-4, "fatol": 1e-6}
     found = minimize(cost, start, method="Nelder-Mead", options=options)
-    pose, half = _decode_box(found.x, sighting.support_z)
+    pose, half = _decode_box(found.x, view.support_z)
     return SolidBox(pose, half, compute_misfit(rays, intersect_box(rays, pose, half)))
 
 
-def _penalize_uncarried(sighting: ObjectView, pose: Pose, half: Vector3) -> float:
+def _penalize_uncarried(view: ObjectView, pose: Pose, half: Vector3) -> float:
     """Price of what stands on the object and is not above the box: it hides how far the box goes on [m]."""
-    carried = sighting.support.carried
+    carried = view.support.carried
     if len(carried) == 0:
         return 0.0
     local = (carried - pose.position[:2]) @ rotation_matrix(pose.quaternion_wxyz)[:2, :2]

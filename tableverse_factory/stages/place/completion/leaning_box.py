@@ -26,18 +26,18 @@ SINK_WEIGHT = 0.2
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def fit_leaning_box(sighting: ObjectView, rays: RaySample) -> SolidBox:
+def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
     """The best box in any orientation, started along the faces that the normals show.
 
     Raises:
         GeometryError: if the points span no area.
     """
-    rotation = _estimate_axes(sighting)
-    local = sighting.points @ rotation
+    rotation = _estimate_axes(view)
+    local = view.points @ rotation
     low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
     size = np.maximum(high - low, THICKNESS_M)
     # The seen face stays where it is when a thin start is made thicker: it grows away from the camera.
-    toward = np.sign(rotation.T @ (sighting.eye - rotation @ ((low + high) / 2)))
+    toward = np.sign(rotation.T @ (view.eye - rotation @ ((low + high) / 2)))
     middle = (low + high) / 2 - toward * (size - (high - low)) / 2
     center = rotation @ middle
     base = quaternion_from_matrix(rotation)
@@ -47,7 +47,7 @@ def fit_leaning_box(sighting: ObjectView, rays: RaySample) -> SolidBox:
     def cost(x: Float64[np.ndarray, "9"]) -> float:
         pose, half = _decode_box(x, base)
         heights = pose.position[2] + (_CORNERS * half) @ rotation_matrix(pose.quaternion_wxyz)[2]
-        sunk = np.clip(sighting.support_z - heights, 0.0, 0.05).mean()
+        sunk = np.clip(view.support_z - heights, 0.0, 0.05).mean()
         return compute_misfit(rays, intersect_box(rays, pose, half)) + SINK_WEIGHT * float(sunk)
 
     for scale, calls in ((1.0, 300), (0.4, 200)):
@@ -65,10 +65,10 @@ def _decode_box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> 
     return Pose(x[:3], normalize_quaternion(multiply_quaternions(base, turn))), half
 
 
-def _estimate_axes(sighting: ObjectView) -> Matrix3:
+def _estimate_axes(view: ObjectView) -> Matrix3:
     """Three orthogonal directions as columns: the normal shared by most points, then the next across it."""
-    step = max(1, len(sighting.normals) // NORMALS)
-    normals = sighting.normals[::step]
+    step = max(1, len(view.normals) // NORMALS)
+    normals = view.normals[::step]
     agreement = np.abs(normals @ normals.T) > AGREE_COS
     first = _average_direction(normals[agreement[int(np.argmax(agreement.sum(axis=1)))]])
     side = np.cross(first, [0.0, 0.0, 1.0] if abs(first[2]) < 0.9 else [1.0, 0.0, 0.0])
@@ -79,7 +79,7 @@ def _estimate_axes(sighting: ObjectView) -> Matrix3:
         angles = np.arctan2(across @ up, across @ side)
         turn = float(np.angle(np.exp(4j * angles).mean()) / 4)
     else:
-        turn = _outline_yaw(sighting.points, side, up)
+        turn = _outline_yaw(view.points, side, up)
     second = np.cos(turn) * side + np.sin(turn) * up
     return np.stack([first, second, np.cross(first, second)], axis=1)
 

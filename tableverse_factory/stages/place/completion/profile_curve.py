@@ -60,13 +60,13 @@ class _Votes(Frozen):
     band: float
 
 
-def fit_profile(sighting: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
+def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
     """The section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
-    points = transform_points(invert_pose(axis), sighting.points)
-    normals = sighting.normals @ rotation_matrix(axis.quaternion_wxyz)
+    points = transform_points(invert_pose(axis), view.points)
+    normals = view.normals @ rotation_matrix(axis.quaternion_wxyz)
     profile = np.stack([np.linalg.norm(points[:, :2], axis=1), points[:, 2]], axis=1)
     outward = (points[:, :2] * normals[:, :2]).sum(axis=1) / np.maximum(profile[:, 0], 1e-9)
-    votes = _collect_votes(sighting, axis, profile)
+    votes = _collect_votes(view, axis, profile)
     if votes is None:
         return None
     if rotation_matrix(axis.quaternion_wxyz)[2, 2] > HOLLOW_TILT_COS:
@@ -87,11 +87,11 @@ def fit_profile(sighting: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSe
     return None if section.is_empty() else (section, CrossSection())
 
 
-def _collect_votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
+def _collect_votes(view: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
     """Where each ring of the solid was seen, over all azimuths."""
     low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
     upright = axis.quaternion_wxyz[0] > 1.0 - 1e-9
-    bottom = min(sighting.support_z - axis.position[2], top - 0.003) if upright else low
+    bottom = min(view.support_z - axis.position[2], top - 0.003) if upright else low
     reach = float(np.quantile(profile[:, 0], 0.998))
     if not 0.002 < reach < 1.0 or top - bottom < 0.002:
         return None
@@ -104,9 +104,9 @@ def _collect_votes(sighting: ObjectView, axis: Pose, profile: Profile) -> _Votes
     shape = (AZIMUTHS, nr, nz)
     x, y = np.cos(angle)[:, None, None] * r[:, None], np.sin(angle)[:, None, None] * r[:, None]
     rings = np.stack([np.broadcast_to(a, shape) for a in (x, y, z[None, None, :])], axis=-1).reshape(-1, 3)
-    clearance, behind, hidden = measure_clearances(sighting, rings, axis)
+    clearance, behind, hidden = measure_clearances(view, rings, axis)
     height = rings @ rotation_matrix(axis.quaternion_wxyz)[2] + axis.position[2]
-    clearance = np.minimum(clearance, height - sighting.support_z + cell).reshape(shape)
+    clearance = np.minimum(clearance, height - view.support_z + cell).reshape(shape)
     band = max(2.0 * cell, 0.0025)
     known = (clearance < 0.0) | (behind.reshape(shape) < band)
     count = known.sum(axis=0)

@@ -1,35 +1,35 @@
-"""How well a shape explains the picture: rays that should meet it at the depth seen, and rays that should miss it."""
+"""Misfit of a shape and the picture: rays that should meet it at the observed depth, rays that should miss it."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float64
 
 from schemas.geometry import Frozen, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import rotation_matrix, transform_points
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 RAYS = 1200
 WORST_M = 0.012
-"""What one ray costs at most [m]: the price of a ray that misses though the object was seen, or the reverse."""
+"""Greatest cost of one ray [m]: of one that misses though the object was seen, or the reverse."""
 PAST_MARGIN_M = 0.004
 SILHOUETTE_M = 0.003
-"""What a ray costs at least that meets the shape although the picture shows something else there [m]: a sheet no higher
-than the depth's noise is not seen to be wrong by depth, only by its outline."""
+"""Least cost of a ray that meets the shape though the picture shows something else there [m]: a sheet no higher than
+the noise of the depth is wrong by its silhouette alone."""
 
 Depths = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaySample(Frozen):
-    """A regular sample of the window's rays, in the table frame.
+    """Regular sample of the window's rays, in the table frame.
 
     Attributes:
-        eye: Their common origin [m].
+        eye: Common origin [m].
         directions: Scaled so that a parameter along a ray is the depth of the point. Shape (n, 3).
-        end: Depth at which the picture says the ray ends [m]; 0 where it does not say.
+        end: Observed depth of the ray's end [m]; 0 where it is unknown.
         facing: Cosine of incidence where the object was seen.
         own: Rays of the object's pixels.
         past: Rays that pass the object.
@@ -43,26 +43,26 @@ class RaySample(Frozen):
     past: Bool[np.ndarray, " n"]
 
 
-def sample_rays(sighting: ObjectView, count: int = RAYS) -> RaySample:
-    """About `count` rays of the window, on a regular raster of pixels."""
-    step = max(1, int(np.ceil(np.sqrt(sighting.own.size / count))))
+def sample_rays(view: ObjectView, count: int = RAYS) -> RaySample:
+    """Sample about `count` rays of the window on a regular raster of pixels."""
+    step = max(1, int(np.ceil(np.sqrt(view.own.size / count))))
     raster = (slice(step // 2, None, step), slice(step // 2, None, step))
-    unit = backproject(np.ones(sighting.own.shape), sighting.camera)[raster].reshape(-1, 3)
+    unit = backproject(np.ones(view.own.shape), view.camera)[raster].reshape(-1, 3)
     return RaySample(
-        eye=sighting.eye,
-        directions=unit @ rotation_matrix(sighting.camera_to_table.quaternion_wxyz).T,
-        end=sighting.depth[raster].reshape(-1),
-        facing=sighting.facing[raster].reshape(-1),
-        own=sighting.own[raster].reshape(-1),
-        past=sighting.past[raster].reshape(-1),
+        eye=view.eye,
+        directions=unit @ rotation_matrix(view.camera_to_table.quaternion_wxyz).T,
+        end=view.depth[raster].reshape(-1),
+        facing=view.facing[raster].reshape(-1),
+        own=view.own[raster].reshape(-1),
+        past=view.past[raster].reshape(-1),
     )
 
 
 def compute_misfit(rays: RaySample, hit: Depths) -> float:
-    """Mean disagreement of a shape with the picture over the object's rays [m].
+    """Compute the mean disagreement of a shape with the picture over the object's rays [m].
 
     Args:
-        rays: What was seen.
+        rays: Observed rays.
         hit: Depth at which each ray meets the shape [m], infinite where it misses.
     """
     met = np.isfinite(hit)
@@ -75,18 +75,15 @@ def compute_misfit(rays: RaySample, hit: Depths) -> float:
 
 
 def cast_on_mesh(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> Depths:
-    """Depth at which each ray meets a placed mesh [m], infinite where it misses."""
-    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    vertices = transform_points(pose, mesh.vertices).astype(np.float32)
-    scene.add_triangles(o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)))
-    origins = np.broadcast_to(rays.eye, rays.directions.shape)
-    packed = np.concatenate([origins, rays.directions], axis=1).astype(np.float32)
-    hits: Depths = scene.cast_rays(o3d.core.Tensor.from_numpy(packed), nthreads=1)["t_hit"].numpy().astype(np.float64)
+    """Cast the rays on a placed mesh: the depth of each hit [m], infinite for a miss."""
+    scene = make_raycasting_scene(TriangleMesh(transform_points(pose, mesh.vertices), mesh.faces))
+    packed = pack_rays(rays.eye, rays.directions)
+    hits: Depths = scene.cast_rays(packed, nthreads=1)["t_hit"].numpy().astype(np.float64)
     return hits
 
 
 def intersect_box(rays: RaySample, pose: Pose, half_size: Vector3) -> Depths:
-    """Depth at which each ray meets a box centred on its frame [m], infinite where it misses (slab method)."""
+    """Intersect the rays with a box centred on its frame (slab method): the depths [m], infinite for a miss."""
     rotation = rotation_matrix(pose.quaternion_wxyz)
     origin = (rays.eye - pose.position) @ rotation
     directions = np.ascontiguousarray((rays.directions @ rotation).T)  # a row per axis: numpy is slow on rows of three

@@ -43,19 +43,19 @@ class Revolution(Frozen):
     price: float
 
 
-def fit_revolution(sighting: ObjectView, rays: RaySample) -> Revolution | None:
+def fit_revolution(view: ObjectView, rays: RaySample) -> Revolution | None:
     """The best over the candidate axes, or None where none gives a solid."""
     found = [
-        fit_about_axis(sighting, rays, axis, freedom)
-        for (axis, spread), freedom in zip(propose_axes(sighting), AXIS_FREEDOM_M, strict=False)
+        fit_about_axis(view, rays, axis, freedom)
+        for (axis, spread), freedom in zip(propose_axes(view), AXIS_FREEDOM_M, strict=False)
         if spread < MAX_SPREAD_M
     ]
     return min((fit for fit in found if fit is not None), key=lambda fit: fit.price, default=None)
 
 
-def fit_about_axis(sighting: ObjectView, rays: RaySample, axis: Pose, freedom: float = 0.0) -> Revolution | None:
+def fit_about_axis(view: ObjectView, rays: RaySample, axis: Pose, freedom: float = 0.0) -> Revolution | None:
     """The solid about one axis (a frame with z along it); None where free space leaves nothing of it."""
-    sections = fit_profile(sighting, axis)
+    sections = fit_profile(view, axis)
     if sections is None:
         return None
     to_table = matrix_from_pose(axis)[:3]
@@ -67,7 +67,7 @@ def fit_about_axis(sighting: ObjectView, rays: RaySample, axis: Pose, freedom: f
     hollow = not sections[1].is_empty()
     if price < WORTH_HANDLES_M:
         hole = Manifold.revolve(sections[1], SEGMENTS).transform(to_table) if hollow else None
-        whole = simplify_solid(add_handles(sighting, body, hole), MAX_FACES, TOLERANCE_M)
+        whole = simplify_solid(add_handles(view, body, hole), MAX_FACES, TOLERANCE_M)
         mesh = _to_frame(whole, axis)
         better = compute_misfit(rays, cast_on_mesh(rays, mesh, axis))
         if better < price:

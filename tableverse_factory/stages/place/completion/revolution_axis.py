@@ -25,13 +25,13 @@ KEPT_SHARE = 0.8
 """Part of the points that has to agree: the rest may be a handle."""
 
 
-def propose_axes(sighting: ObjectView) -> list[tuple[Pose, float]]:
+def propose_axes(view: ObjectView) -> list[tuple[Pose, float]]:
     """Frames with z along a possible axis: upright, lying along the object, and where the normals point.
 
     Beside each the mean spread of the points' distances from the axis within slices across it [m].
     """
-    step = max(1, len(sighting.points) // FIT_POINTS)
-    points, normals = sighting.points[::step], sighting.normals[::step]
+    step = max(1, len(view.points) // FIT_POINTS)
+    points, normals = view.points[::step], view.normals[::step]
     directions = [np.array([0.0, 0.0, 1.0]), _find_long_direction(points)]
     free = _fit_normal_line(points, normals)
     if free is not None and abs(free[2]) < UPRIGHT_COS:

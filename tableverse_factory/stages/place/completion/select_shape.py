@@ -10,12 +10,12 @@ from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
-from tableverse_factory.stages.place.completion.completion import Completion
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, cast_on_mesh, compute_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.voxel_carving import carve_columns, carve_half_turn
+from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 BOX_DISCOUNT_M = 0.0008
@@ -61,20 +61,20 @@ class _ShapeKind:
     make: Callable[[ObjectView, RaySample], Shape | None]
 
 
-def complete_by_carving(scene: PerceivedObjects, sighting: ObjectView) -> Completion:  # noqa: ARG001
+def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
     """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
 
     Raises:
         GeometryError: if the points carry no solid.
     """
-    rays = sample_rays(sighting)
+    rays = sample_rays(view)
     found: list[_ShapeCandidate] = []
     reasons: list[str] = []
     for kind in KINDS:
         if found and min(candidate.price for candidate in found) < kind.freedom + UNAVOIDABLE_M:
             continue
         try:
-            shape = kind.make(sighting, rays)
+            shape = kind.make(view, rays)
         except GeometryError as error:
             reasons.append(str(error))
             continue
@@ -83,31 +83,31 @@ def complete_by_carving(scene: PerceivedObjects, sighting: ObjectView) -> Comple
     if not found:
         raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
     best = min(found, key=lambda candidate: candidate.price)
-    if not sighting.support.leaning:
+    if not view.support.leaning:
         return Completion(best.mesh, best.pose, best.method)
-    stemmed = extend_to_floor(best.mesh, best.pose, sighting.points, sighting.support_z)
+    stemmed = extend_to_floor(best.mesh, best.pose, view.points, view.support_z)
     return Completion(stemmed, best.pose, best.method)
 
 
-def _make_upright_box(sighting: ObjectView, rays: RaySample) -> Shape:
-    return _discount_box(fit_upright_box(sighting, rays))
+def _make_upright_box(view: ObjectView, rays: RaySample) -> Shape:
+    return _discount_box(fit_upright_box(view, rays))
 
 
-def _make_leaning_box(sighting: ObjectView, rays: RaySample) -> Shape:
-    return _discount_box(fit_leaning_box(sighting, rays))
+def _make_leaning_box(view: ObjectView, rays: RaySample) -> Shape:
+    return _discount_box(fit_leaning_box(view, rays))
 
 
 def _discount_box(box: SolidBox) -> Shape:
     return build_box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
 
 
-def _make_revolution(sighting: ObjectView, rays: RaySample) -> Shape | None:
-    fit = fit_revolution(sighting, rays)
+def _make_revolution(view: ObjectView, rays: RaySample) -> Shape | None:
+    fit = fit_revolution(view, rays)
     return None if fit is None else (fit.mesh, fit.pose, fit.price - (HOLLOW_BONUS_M if fit.hollow else 0.0))
 
 
-def _make_half_turn(sighting: ObjectView, rays: RaySample) -> Shape:
-    mesh, pose = carve_half_turn(sighting)
+def _make_half_turn(view: ObjectView, rays: RaySample) -> Shape:
+    mesh, pose = carve_half_turn(view)
     return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose)) + _measure_raggedness(mesh)
 
 
@@ -120,8 +120,8 @@ def _measure_raggedness(mesh: TriangleMesh) -> float:
     return RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)
 
 
-def _make_columns(sighting: ObjectView, rays: RaySample) -> Shape:
-    mesh, pose = carve_columns(sighting)
+def _make_columns(view: ObjectView, rays: RaySample) -> Shape:
+    mesh, pose = carve_columns(view)
     return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose))
 
 

@@ -50,53 +50,53 @@ SLACK = 0.05
 """Weight of loose fit against carved-away points in the search for the axis of the half turn."""
 
 
-def fit_own_frame(sighting: ObjectView) -> tuple[Pose, Vector3, Vector3]:
+def fit_own_frame(view: ObjectView) -> tuple[Pose, Vector3, Vector3]:
     """The object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
 
     Raises:
         GeometryError: if the points span no area.
     """
-    rectangle = fit_min_rectangle(sighting.points[:, :2])
-    top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
-    height = top - sighting.support_z
-    center = np.array([*rectangle.center, sighting.support_z + height / 2])
+    rectangle = fit_min_rectangle(view.points[:, :2])
+    top = max(float(np.quantile(view.points[:, 2], 0.998)), view.support_z + MIN_THICKNESS_M)
+    height = top - view.support_z
+    center = np.array([*rectangle.center, view.support_z + height / 2])
     half = np.array([*rectangle.half_size, height / 2])
     return Pose(center, quaternion_about_z(rectangle.yaw)), -half, half
 
 
-def carve_columns(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
+def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
     """The solid below the observed points, without the space seen empty; down to the support or to its underside.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
     """
-    pose, low, high = fit_own_frame(sighting)
-    grid, stretch = _build_flat_grid(sighting, low, high)
+    pose, low, high = fit_own_frame(view)
+    grid, stretch = _build_flat_grid(view, low, high)
     local = grid.points() / np.array([1.0, 1.0, stretch])
-    free = measure_free_space(sighting, local, pose).reshape(grid.shape)
-    field = np.minimum(_compute_column_field(sighting, pose, grid, stretch, free), free)
+    free = measure_free_space(view, local, pose).reshape(grid.shape)
+    field = np.minimum(_compute_column_field(view, pose, grid, stretch, free), free)
     if _is_torn(field):
-        field = np.minimum(_compute_column_field(sighting, pose, grid, stretch, free, bridged=True), free)
+        field = np.minimum(_compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
     mesh = _extract_mesh(field, grid)
     return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, stretch]), mesh.faces), pose
 
 
-def carve_half_turn(sighting: ObjectView) -> tuple[TriangleMesh, Pose]:
+def carve_half_turn(view: ObjectView) -> tuple[TriangleMesh, Pose]:
     """What free space leaves of the object when its hidden side is its seen side, turned by half about a vertical.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
     """
-    center = _find_turn_center(sighting)
-    turned = 2 * center - sighting.points[:, :2]
-    rectangle = fit_min_rectangle(np.concatenate([sighting.points[:, :2], turned]))
-    top = max(float(np.quantile(sighting.points[:, 2], 0.998)), sighting.support_z + MIN_THICKNESS_M)
-    half = np.array([*rectangle.half_size, (top - sighting.support_z) / 2])
-    pose = Pose(np.array([*center, sighting.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
+    center = _find_turn_center(view)
+    turned = 2 * center - view.points[:, :2]
+    rectangle = fit_min_rectangle(np.concatenate([view.points[:, :2], turned]))
+    top = max(float(np.quantile(view.points[:, 2], 0.998)), view.support_z + MIN_THICKNESS_M)
+    half = np.array([*rectangle.half_size, (top - view.support_z) / 2])
+    pose = Pose(np.array([*center, view.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
     grid = _build_grid(-half, half)
     local = grid.points()
     turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
-    free = np.minimum(measure_free_space(sighting, local, pose), measure_free_space(sighting, local, turned_pose))
+    free = np.minimum(measure_free_space(view, local, pose), measure_free_space(view, local, turned_pose))
     x, y, z = grid.axes()
     bounds = np.minimum(
         np.minimum((half[0] - np.abs(x))[:, None, None], (half[1] - np.abs(y))[None, :, None]),
@@ -117,19 +117,19 @@ def _extract_mesh(field: Field, grid: VoxelGrid) -> TriangleMesh:
     return from_manifold(simplify_solid(solid, MAX_FACES, 0.08 * grid.cell))
 
 
-def _find_turn_center(sighting: ObjectView) -> Float64[np.ndarray, "2"]:
+def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
     """Where the vertical axis stands: turned points must not lie in free space, and as near to it as they can."""
-    step = max(1, len(sighting.points) // TURN_POINTS)
-    points = sighting.points[::step]
+    step = max(1, len(view.points) // TURN_POINTS)
+    points = view.points[::step]
 
     def cost(center: Float64[np.ndarray, "2"]) -> float:
         turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
-        gap = np.clip(measure_free_space(sighting, turned), -WORST_TURN_M, WORST_TURN_M)
+        gap = np.clip(measure_free_space(view, turned), -WORST_TURN_M, WORST_TURN_M)
         outside = frame.distance(center)
         return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + outside
 
     frame = fit_min_rectangle(points[:, :2])
-    away = points[:, :2].mean(axis=0) - sighting.eye[:2]
+    away = points[:, :2].mean(axis=0) - view.eye[:2]
     away /= max(float(np.linalg.norm(away)), 1e-9)
     start = frame.center
     reach = 0.25 * float(np.ptp(points[:, :2], axis=0).max())
@@ -146,10 +146,10 @@ def _is_torn(field: Field) -> bool:
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
 
 
-def _build_flat_grid(sighting: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
+def _build_flat_grid(view: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
     """A grid whose heights are stretched by the second answer: flat things need finer steps up than along."""
     size = high - low
-    pixel = float(np.linalg.norm(sighting.points.mean(axis=0) - sighting.eye)) / sighting.camera.fx
+    pixel = float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) / view.camera.fx
     cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
     cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
     stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
@@ -158,10 +158,10 @@ def _build_flat_grid(sighting: ObjectView, low: Vector3, high: Vector3) -> tuple
 
 
 def _compute_column_field(
-    sighting: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
+    view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
 ) -> Field:
     """Signed distance to the columns below the observed points [m]."""
-    local = transform_points(invert_pose(pose), sighting.points)
+    local = transform_points(invert_pose(pose), view.points)
     z = grid.axes()[2] / stretch
     index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
     index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
@@ -180,11 +180,11 @@ def _compute_column_field(
     inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
     outside = ndimage.distance_transform_edt(~closed)
     footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
-    support = sighting.support_z - pose.position[2]
+    support = view.support_z - pose.position[2]
     below = (free < -EMPTY_M) & (z < top[:, :, None] - EMPTY_M)
     empty_to = np.where(below, z, support).max(axis=2, initial=support)
     middle = (local[:, 2].min() + local[:, 2].max()) / 2
-    to_eye = transform_points(invert_pose(pose), sighting.eye[None])[0] - np.array([0.0, 0.0, middle])
+    to_eye = transform_points(invert_pose(pose), view.eye[None])[0] - np.array([0.0, 0.0, middle])
     to_eye /= float(np.linalg.norm(to_eye))
     under = estimate_underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
     top = np.maximum(top, under + MIN_THICKNESS_M)

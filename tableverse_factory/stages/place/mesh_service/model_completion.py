@@ -11,11 +11,13 @@ from schemas.geometry import Colors, TriangleMesh
 from schemas.identity import content_hash
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.mesh.meshes import bounds, box_center, read_mesh
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
+from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid
 from tableverse_factory.geometry.mesh.voxel_solids import find_largest_part, from_manifold, simplify_solid
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.place.completion.completion import Completion
+from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.mesh_service.client import Answer, MeshClient, MeshFile, MeshQuery, RgbdImage
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -26,12 +28,11 @@ MAX_FACES_TAKEN = 2_000_000
 TOLERANCE = 5e-4
 """How far simplification may move the surface at first, as a share of the longest side."""
 _SEEDS = 2**31
-_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 def complete_with_model(
     scene: PerceivedObjects,
-    sightings: Sequence[ObjectView],
+    views: Sequence[ObjectView],
     config: PlaceConfig,
     rng: np.random.Generator,
     services: Services,
@@ -45,7 +46,7 @@ def complete_with_model(
     seen = scene.observation
     view = RgbdImage(seen.color, seen.depth, seen.camera)
     draw = int(rng.integers(2**63)).to_bytes(8, "little")
-    orders = [_order(scene, sighting, draw) for sighting in sightings]
+    orders = [_order(scene, sighting, draw) for sighting in views]
     if not orders:
         return []
     maker = MeshClient(config.mesh_command, config.mesh_timeout_s, services)
@@ -61,12 +62,12 @@ def mesh_of(answer: MeshFile) -> TriangleMesh:
     mesh = read_mesh(answer.data, f"answer.{answer.format}")
     if len(mesh.faces) > MAX_FACES_TAKEN:
         raise GeometryError(f"a mesh of {len(mesh.faces)} triangles; at most {MAX_FACES_TAKEN} are taken of a model")
-    low, high = bounds(mesh)
+    low, high = aabb(mesh.vertices)
     vertices = (mesh.vertices - box_center(mesh)) / float((high - low).max())
     if answer.format == "glb" and answer.up == "z":  # reading has turned it, as the standard wants
-        vertices = vertices @ _Y_UP_TO_Z_UP
+        vertices = vertices @ Y_UP_TO_Z_UP
     if answer.format != "glb" and answer.up == "y":
-        vertices = vertices @ _Y_UP_TO_Z_UP.T
+        vertices = vertices @ Y_UP_TO_Z_UP.T
     upright = TriangleMesh(vertices, mesh.faces, _vertex_colors(mesh))
     solid, _ = make_closed_solid(upright)
     return _coloured(from_manifold(simplify_solid(find_largest_part(solid), MAX_FACES, TOLERANCE)), upright)

@@ -113,7 +113,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     )
 
 
-def measure_free_space(sighting: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
+def measure_free_space(view: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
     """How far each point lies from space seen to be empty [m]: negative inside of that space.
 
     All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
@@ -121,26 +121,26 @@ def measure_free_space(sighting: ObjectView, points: Points, frame: Pose | None 
     across it. Rays without depth say nothing. Shape (n,). `frame` is where the points are given, the table frame if
     none is.
     """
-    return measure_clearances(sighting, points, frame)[0]
+    return measure_clearances(view, points, frame)[0]
 
 
 def measure_clearances(
-    sighting: ObjectView, points: Points, frame: Pose | None = None
+    view: ObjectView, points: Points, frame: Pose | None = None
 ) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
     """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
 
     The second is infinite where the object's surface was not seen [m].
     """
-    to_camera = invert_pose(sighting.camera_to_table)
-    u, v, z = _project_columns(points, to_camera if frame is None else compose_poses(to_camera, frame), sighting.camera)
+    to_camera = invert_pose(view.camera_to_table)
+    u, v, z = _project_columns(points, to_camera if frame is None else compose_poses(to_camera, frame), view.camera)
     inside = z > MIN_DEPTH_M
-    height, width = sighting.own.shape
+    height, width = view.own.shape
     u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
-    outline = ndimage.map_coordinates(sighting.outline_px, [v, u], order=1) * z / sighting.camera.fx
+    outline = ndimage.map_coordinates(view.outline_px, [v, u], order=1) * z / view.camera.fx
     pixel = np.rint(v).astype(np.intp) * width + np.rint(u).astype(np.intp)
-    end = sighting.depth.ravel()[pixel]
-    own = sighting.own.ravel()[pixel]
-    past = sighting.past.ravel()[pixel]
+    end = view.depth.ravel()[pixel]
+    own = view.own.ravel()[pixel]
+    past = view.past.ravel()[pixel]
     # Just behind what a ray ends on beside the object there is no object either: without this slack the noise of
     # the table would grow a skirt around every foot.
     depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
