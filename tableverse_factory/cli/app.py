@@ -1,4 +1,4 @@
-"""What stands above the commands: their order, and what is said to who names none."""
+"""Order of the commands, and the text of `tableverse` without a command."""
 
 from typing import Any
 
@@ -10,13 +10,13 @@ FIRST_STEPS = """\
 TableVerse Factory {version}: table-top pictures become certified MuJoCo scenes.
 
 First steps:
-  tableverse doctor                                   is all here that is needed?
-  tableverse synth captures                           captures to try it with
-  tableverse manifest captures --out images.parquet   what can be used, and why not
-  tableverse build images.parquet out                 the dataset
+  tableverse doctor                                   check this machine
+  tableverse synth captures                           synthetic captures to try it with
+  tableverse manifest captures --out images.parquet   check the captures
+  tableverse build images.parquet out                 build the dataset
   tableverse report out                               a gallery for the browser
-  tableverse view out                                 a scene of it, to turn and to touch
-  tableverse status out                               where a build stands
+  tableverse view out                                 an interactive 3D view of a scene
+  tableverse status out                               progress of the build
 
 With pictures of your own: tableverse init FOLDER says where they belong.
 All commands: tableverse --help. One of them, with an example: tableverse build --help
@@ -24,15 +24,15 @@ All commands: tableverse --help. One of them, with an example: tableverse build 
 
 
 class OrderedGroup(TyperGroup):
-    """The commands in the order of their table, groups of commands among them."""
+    """Group of commands that lists them in the order of their table."""
 
     order: tuple[str, ...] = ()
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The names, in order."""
+        """List the names of the commands in order."""
         return sorted(super().list_commands(ctx), key=self.order.index)
 
 
 def format_first_steps() -> str:
-    """The shortest way to a dataset, for who typed `tableverse` alone."""
+    """Format the shortest way to a dataset."""
     return FIRST_STEPS.format(version=__version__)

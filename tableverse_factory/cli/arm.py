@@ -1,17 +1,17 @@
-"""`--robot`, held against what a dataset was made with, before anything is drawn, written or replayed."""
+"""Check of `--robot` against the robot of a dataset, before anything is written or replayed."""
 
 
 def check_robot_option(out: str, robot: str | None, needed: bool) -> None:
-    """Refuses an arm that has no effect or is another than that of the dataset, and none where one has to be given.
+    """Refuse a robot that has no effect or differs from the dataset's, and a missing one that is needed.
 
     Args:
         out: The dataset.
-        robot: What `--robot` says.
-        needed: Whether nothing can be done without the file of an arm that came from one.
+        robot: Value of `--robot`.
+        needed: Whether the command needs the file of a robot that came from one.
 
     Raises:
-        InputError: saying what to give; or if what the dataset was made with does not read.
-        ConfigError: if the file that is given is no MJCF.
+        InputError: saying what to give; or if the dataset's record is unreadable.
+        ConfigError: if the given file is no MJCF.
     """
     from schemas.config import Config
     from tableverse_factory.core.errors import InputError
@@ -25,7 +25,7 @@ def check_robot_option(out: str, robot: str | None, needed: bool) -> None:
     section = config.get("trajectories") if isinstance(config, dict) else None
     made_with = section.get("robot") if isinstance(section, dict) else None
     if not isinstance(made_with, str):
-        return  # another tool's dataset, whose arrays alone name their robot
+        return  # a dataset of another tool, whose arrays name their robot
     name = sanitize_line(made_with, 100)
     if robot is None:
         if needed and made_with.endswith(".xml"):
@@ -38,6 +38,6 @@ def check_robot_option(out: str, robot: str | None, needed: bool) -> None:
         given = record_robot(Config.model_validate({"trajectories": {"robot": robot}}), {})
         if given != recorded:
             raise InputError(
-                f"--robot {sanitize_line(robot, 100)}: not the arm that {out} was made with, {name}: a name or bytes among "
-                "its files differ"
+                f"--robot {sanitize_line(robot, 100)}: not the arm that {out} was made with, {name}: a name or bytes "
+                "among its files differ"
             )

@@ -56,7 +56,7 @@ def build(
     ] = None,
     stages: Annotated[
         str | None,
-        typer.Option(metavar="+trajectories", help="More stages than the usual line: motions for the tasks of every scene."),
+        typer.Option(metavar="+trajectories", help="Add trajectories for the tasks of every scene."),
     ] = None,
     limit: Limit = None,
     shards: Shards = None,

@@ -1,4 +1,4 @@
-"""Commands that make large things in passing: stopped, they take these away."""
+"""Orderly end of commands that write large temporary files."""
 
 import signal
 from collections.abc import Iterator
@@ -8,10 +8,10 @@ from types import FrameType
 
 @contextmanager
 def unwind_on_sigterm() -> Iterator[None]:
-    """While the block lasts, SIGTERM unwinds it as Ctrl-C does, once; the exit code is 143."""
+    """Let SIGTERM unwind the block as Ctrl-C does, once; the exit code is 143."""
 
     def leave(number: int, _frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_IGN)  # a second one would stop what takes things away
+        signal.signal(number, signal.SIG_IGN)  # a second one would interrupt the cleanup
         raise SystemExit(128 + number)
 
     before = signal.signal(signal.SIGTERM, leave)

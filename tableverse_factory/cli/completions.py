@@ -1,4 +1,4 @@
-"""What the shell is offered after a tab, where it costs next to nothing to know; files it completes by itself."""
+"""Words for the completion of the shell, if they are cheap to find."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 from typer import Context
 
 MAX_WORDS = 200
-"""Words that are offered at once; whoever has more scenes types another letter first."""
+"""Most words that are offered at once."""
 
 
 def complete_scene_ids(context: Context, incomplete: str) -> list[str]:
-    """The finished scenes of the dataset that stands before; none of one that is elsewhere or does not read."""
+    """List the finished scenes of the dataset on the command line, if it is local and readable."""
     from tableverse_factory.core.errors import TableverseError
     from tableverse_factory.dataset.dataset import open_dataset
 
@@ -20,12 +20,12 @@ def complete_scene_ids(context: Context, incomplete: str) -> list[str]:
     try:
         rows = open_dataset(out).scenes.to_table(columns=["scene_id", "status"]).to_pylist()
     except (TableverseError, OSError, ValueError):
-        return []  # the command says what is wrong with it
+        return []  # the command itself reports the error
     return _filter_prefix((row["scene_id"] for row in rows if row["status"] == "done"), incomplete)
 
 
 def complete_config_keys(context: Context, incomplete: str) -> list[str]:
-    """`section.key=` for every key; on a finished dataset those of trajectories."""
+    """List `section.key=` for every key; for a finished dataset those of trajectories."""
     from tableverse_factory.core.config import list_keys
 
     section = "trajectories." if context.info_name == "trajectories" else ""
@@ -33,7 +33,7 @@ def complete_config_keys(context: Context, incomplete: str) -> list[str]:
 
 
 def complete_columns(context: Context, incomplete: str) -> list[str]:
-    """The columns of the table that was asked for, after those that are written already."""
+    """List the columns of the table, after those that are already typed."""
     from schemas.arrow import TABLES
 
     table = str(context.params.get("table") or "scenes")
@@ -42,15 +42,15 @@ def complete_columns(context: Context, incomplete: str) -> list[str]:
     return [f"{written}{comma}{name}" for name in _filter_prefix([*names, "all"], last)]
 
 
-def complete_stages(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 Typer passes both by their types
-    """The sections of the configuration that are stages."""
+def complete_stages(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 Typer passes both by type
+    """List the sections of the configuration that are stages."""
     from schemas.config import Config
 
     return _filter_prefix((name for name in Config.model_fields if name != "run"), incomplete)
 
 
 def complete_textures(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 as above
-    """Families of table-tops, whose number is still to be written."""
+    """List the families of table-tops, whose number follows."""
     from tableverse_factory.sources.textures.catalogue import FAMILIES
 
     return _filter_prefix((f"{family}-" for family in FAMILIES), incomplete)

@@ -1,4 +1,4 @@
-"""`tableverse config`: the configuration, written out."""
+"""`tableverse config`: print or check the configuration."""
 
 from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides
 

@@ -1,4 +1,4 @@
-"""`tableverse doctor`: can this machine build?"""
+"""`tableverse doctor`: check of this machine."""
 
 from pathlib import Path
 
@@ -11,10 +11,10 @@ from tableverse_factory.core.cache_dir import get_cache_dir
 def doctor(
     as_json: AsJson = False,
 ) -> None:
-    """Say what this machine has and lacks, and what to do.
+    """Check this machine, and say what to do about what is missing.
 
-    It looks at rendering, system libraries, Ray, GPU, extras, cache and disk. Exit code 0 only where everything that
-    a build needs is there.
+    Checks rendering, system libraries, Ray, GPU, extras, cache and disk. Exit code 0 only if everything that a build
+    needs is present.
 
     Example: `tableverse doctor`
     """

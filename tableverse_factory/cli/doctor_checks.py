@@ -1,6 +1,6 @@
-"""What this machine has and lacks: each finding with what to do about it.
+"""Checks of this machine, each with a remedy.
 
-Whatever may hang or crash (native libraries, renderers, Ray) is tried in a process of its own, with a deadline.
+Checks that may hang or crash (native libraries, renderers, Ray) run in processes of their own, with a deadline.
 """
 
 import ctypes
@@ -28,11 +28,12 @@ SYSTEM_LIBRARIES = {
     "libgomp.so.1": "libgomp1",
     "libX11.so.6": "libx11-6",
 }
-"""What Open3D loads, and the Debian package that brings it."""
+"""Libraries that Open3D loads, with their Debian packages."""
 
 EXTRAS = {
     "cluster": (("aiohttp",), "builds as jobs of a Ray cluster, Ray's dashboard"),
     "s3": (("s3fs",), "datasets in object stores"),
+    "vlm": (("google-genai", "openai"), "detectors and judges that are models behind an address"),
     "episodes": (("av", "h5py"), "trajectories as LeRobot and robomimic datasets"),
     "robots": (("mujoco-menagerie",), "other arms, by the name menagerie:NAME"),
     "viewer": (("viser",), "tableverse view"),
@@ -43,9 +44,9 @@ EXTRAS = {
         ("torch", "transformers", "onnxruntime", "onnx"),
         "real models instead of the embedded ones, depth_anything_2 among them; tableverse train",
     ),
-    "bench": (("ompl", "pandas"), "comparisons of tableverse bench with OMPL and Ray Data"),
+    "bench": (("pandas",), "the comparison of tableverse bench with Ray Data"),
 }
-"""What each extra of pyproject.toml brings, and what for; `dev` and `docs` are for who changes this code."""
+"""Packages and purpose of each extra in pyproject.toml, without `dev` and `docs`."""
 
 _SIMULATOR = """
 import mujoco
@@ -82,12 +83,12 @@ print(ray.__version__, "starts and answers")
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding.
+    """Result of one check.
 
     Attributes:
         required: Whether a build needs it.
-        found: What is there, or what went wrong.
-        advice: What to do where it is not fine; empty where it is.
+        found: What was found, or the error.
+        advice: Remedy; empty if all is well.
     """
 
     name: str
@@ -98,7 +99,7 @@ class Check:
 
 
 def run_checks(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
-    """Findings one after another, as they come; takes some seconds, most of them for Ray."""
+    """Run the checks one after another; takes some seconds, mostly for Ray."""
     yield _check_python()
     yield from _check_libraries()
     yield _check_script("simulator (MuJoCo)", _SIMULATOR, "pip install --force-reinstall mujoco")
@@ -137,7 +138,7 @@ def _check_libraries() -> Iterator[Check]:
 def _check_script(
     name: str, code: str, advice: str, *, required: bool = True, environment: Mapping[str, str] | None = None
 ) -> Check:
-    """Whether a script ends well in a process of its own; its last words are what was found."""
+    """Run a script in a process of its own; the last line of its output is what was found."""
     try:
         ended = subprocess.run(
             [sys.executable, "-c", code],
@@ -170,7 +171,7 @@ def _check_gpu() -> Check:
 
 
 def _check_extras() -> Iterator[Check]:
-    """A line per extra: none is needed, and who wants what it gives is told how to get it."""
+    """Check the extras and other optional packages."""
     for extra, (packages, gives) in EXTRAS.items():
         found = {package: _find_version(package) for package in packages}
         ok = all(found.values())

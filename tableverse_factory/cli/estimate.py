@@ -1,4 +1,4 @@
-"""`tableverse estimate`: what a larger build will cost, from the timings of this one."""
+"""`tableverse estimate`: cost of a larger build, from the timings of this one."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,11 +29,11 @@ def estimate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say what a larger build will take, from timings of this one.
+    """Estimate the cost of a larger build from the timings of this one.
 
-    CPU and GPU hours, storage, tokens, wall time and cost, each with its interval. It stands on the scenes that are
-    accounted for in OUT, dropped and failed ones with what they took; fewer than 50 are refused. docs/monitoring.md
-    says what the intervals mean and what is not in them.
+    CPU and GPU hours, storage, tokens, wall time and cost, each with its interval. The estimate uses all scenes that
+    are accounted for in OUT, dropped and failed ones included, and needs at least 50. docs/monitoring.md explains the
+    intervals.
 
     Example: `tableverse estimate out --scenes 100000 --cluster cpus=64 --price cpu_hour=0.04`
     """
@@ -59,10 +59,10 @@ def estimate(
 
 
 def _read_config(place: "StoragePath") -> "Config":
-    """The configuration that OUT was built with.
+    """Read the configuration of the build in OUT.
 
     Raises:
-        ConfigError: if this version knows other keys.
+        ConfigError: if another version wrote it.
     """
     from pydantic import ValidationError
 
@@ -79,7 +79,7 @@ def _read_config(place: "StoragePath") -> "Config":
 
 
 def _parse_cluster(text: str | None) -> "ClusterSize | None":
-    """What `--cluster` says.
+    """Parse `--cluster`.
 
     Raises:
         ConfigError: saying what is allowed.
@@ -133,7 +133,7 @@ def _print_estimate(found: "CostEstimate", cluster: "ClusterSize | None") -> Non
 
 
 def _make_rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tuple[str, tuple[str, str, str]]]:
-    """The lines of the table; what is zero because nobody uses it is left out."""
+    """Make the lines of the table, without unused resources."""
     from workers.progress.table import format_bytes, format_duration
 
     rows = [("CPU-hours used", _format_range(found.cpu_hours)), ("CPU-hours held", _format_range(found.cpu_hours_held))]
@@ -162,7 +162,7 @@ def _format_range(figure: "IntervalEstimate") -> tuple[str, str, str]:
 
 
 def _format_number(value: float) -> str:
-    """Three digits that matter, without exponents."""
+    """Format three significant digits, without exponents."""
     if value >= 100.0 or value == 0.0:
         return f"{value:,.0f}"
     return f"{value:.1f}" if value >= 10.0 else f"{value:.2f}" if value >= 1.0 else f"{value:.3g}"

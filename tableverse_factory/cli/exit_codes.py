@@ -1,4 +1,4 @@
-"""How a command ends: its exit code, and one line or two for what went wrong."""
+"""End of a command: its exit code, and the message of an error with a link to its explanation."""
 
 import difflib
 import errno
@@ -17,6 +17,7 @@ from tableverse_factory.core.errors import TableverseError
 from tableverse_factory.core.text import sanitize_line
 
 FAILED, USAGE_ERROR, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
+TROUBLESHOOTING = "docs/troubleshooting.md"
 
 _REMEDIES = {
     errno.ENOSPC: "make room, then run the same command again",
@@ -30,7 +31,7 @@ _EXAMPLE = re.compile(r"Example: `([^`]+)`")
 
 
 def run_command(command: Callable[[], object]) -> int:
-    """Runs a command and says how it ended.
+    """Run a command and print its error, if any.
 
     Args:
         command: Raises what a Typer app raises outside its stand-alone mode; an integer that it returns is the code.
@@ -51,15 +52,18 @@ def run_command(command: Callable[[], object]) -> int:
     except Abort:
         code = FAILED
     except Exception as error:
-        if os.environ.get("TABLEVERSE_DEBUG") or (said := _describe_error(error)) is None:
+        if os.environ.get("TABLEVERSE_DEBUG") or (message := _describe_error(error)) is None:
             raise
-        print(f"error: {said}" if said else "", file=sys.stderr, end="\n" if said else "")
+        if message:
+            print(f"error: {message}", file=sys.stderr)
+        if isinstance(error, TableverseError):
+            print(f"help: {TROUBLESHOOTING}#{error.topic}", file=sys.stderr)
         code = USAGE_ERROR if isinstance(error, TyperException) else FAILED
     return code if isinstance(code, int) else 0
 
 
 def _resolve_exit(end: SystemExit | BrokenPipeError) -> object:
-    """The code where nobody reads what is printed any more, as of `… | head -1`; else what was meant."""
+    """Find the code of a process whose output may have lost its reader, as in `… | head -1`."""
     if _is_stdout_broken():
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at its end
         return BROKEN_PIPE
@@ -79,7 +83,7 @@ def _is_stdout_broken() -> bool:
 
 
 def _describe_error(error: Exception) -> str | None:
-    """What to say of an error that was to be expected; None for a fault of ours, whose traceback is wanted."""
+    """Describe an expected error; None for a defect of ours, which shows its traceback."""
     if isinstance(error, TyperException):
         return _describe_usage_error(error)
     if isinstance(error, TableverseError):
@@ -97,7 +101,7 @@ def _describe_error(error: Exception) -> str | None:
 
 
 def _describe_usage_error(error: Any) -> str:
-    """What is wrong with a command line, and what to type instead; nothing where its help was shown already."""
+    """Describe what is wrong with a command line and what to type instead; empty if its help was shown."""
     context, parameter = getattr(error, "ctx", None), getattr(error, "param", None)
     if context is None:
         return sanitize_line(error.format_message(), 500)  # such as an option without its value
@@ -123,15 +127,15 @@ def _describe_unknown_option(option: str, context: Any) -> str:
 
 
 def _list_names(parameter: Any) -> list[str]:
-    """As it is typed: of an option every name, of an argument the word in the usage."""
+    """List all names of an option, or the word of an argument in the usage."""
     if parameter.param_type_name == "option":
         return [*parameter.opts, *parameter.secondary_opts]
     return [parameter.display_name_raw.upper()]
 
 
 def _format_refused_value(error: Any) -> str:
-    """The value that was refused, where the message does not say it: numbers out of their bounds."""
-    told = getattr(error.__cause__, "errors", None)
-    if told is None or error.message.startswith("Value error, "):
+    """Format the refused value if the message lacks it: a number out of its bounds."""
+    list_errors = getattr(error.__cause__, "errors", None)
+    if list_errors is None or error.message.startswith("Value error, "):
         return ""
-    return f"{sanitize_line(str(told()[0]['input']), 80)!r} "
+    return f"{sanitize_line(str(list_errors()[0]['input']), 80)!r} "

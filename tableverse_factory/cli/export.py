@@ -1,4 +1,4 @@
-"""`tableverse export`: a dataset that may be passed on, and its trajectories in the formats of learners."""
+"""`tableverse export`: a dataset to pass on, and its trajectories in formats for training."""
 
 import difflib
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ class _DefaultCommandGroup(TyperGroup):
     """`export OUT DEST` without the name of a command is `export dataset OUT DEST`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Puts the default command in front of what names none."""
+        """Insert the default command if none is named."""
         if args and args[0] not in (*self.commands, "--help", "-h"):
             near = difflib.get_close_matches(args[0], self.commands, n=1, cutoff=0.75)
             if near and not Path(args[0]).exists():
@@ -44,7 +44,7 @@ Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are m
 
 
 class Profile(StrEnum):
-    """What the licences of the scenes must allow."""
+    """Terms that the licences of the scenes may have."""
 
     PERMISSIVE = "permissive"
     SHARE_ALIKE = "share-alike"
@@ -71,7 +71,7 @@ def export_dataset(
         Profile, typer.Option(help="permissive: credit at most; share-alike and non-commercial allow these terms too.")
     ] = Profile.PERMISSIVE,
 ) -> None:
-    """Write the scenes whose licences allow it as a dataset of their own; the rest leaves no trace in it.
+    """Write the scenes whose licences allow it as a dataset of their own, without any trace of the others.
 
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
@@ -93,7 +93,7 @@ def export_dataset(
 
 @contextmanager
 def _remove_if_unused(dest: "StoragePath") -> Iterator[None]:
-    """Takes away the folder that was made for the lock alone."""
+    """Remove the folder if it was made for the lock alone."""
     is_new = isinstance(dest, Path) and not dest.exists()
     try:
         yield
@@ -147,9 +147,7 @@ def export_robomimic(
     out: FinishedOut,
     dest: Annotated[
         Path,
-        typer.Argument(
-            metavar="DEST", callback=require_local_path, help="A new file, `….hdf5` or `….h5`; its name decides nothing."
-        ),
+        typer.Argument(metavar="DEST", callback=require_local_path, help="A new file of any name, e.g. `out.hdf5`."),
     ],
     failed: Failed = False,
     robot: Robot = None,

@@ -1,4 +1,4 @@
-"""`tableverse extract`: one scene out of its shard."""
+"""`tableverse extract`: write one scene as files."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -9,7 +9,7 @@ from tableverse_factory.cli.options import NewFolder, ReadableOut, SceneId, Text
 
 
 class FileFormat(StrEnum):
-    """What a scene can be written as (`tableverse_factory.delivery.formats.extract.FORMATS`)."""
+    """File formats of a scene (`tableverse_factory.delivery.formats.extract.FORMATS`)."""
 
     MJCF = "mjcf"
     GLB = "glb"
@@ -23,14 +23,14 @@ def extract(
     dest: NewFolder,
     file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
     texture: Texture = None,
-    lights: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="Other lamps.")] = None,
-    camera: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="A small step aside of the camera.")] = None,
+    lights: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="Other lights.")] = None,
+    camera: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="A slightly moved camera.")] = None,
 ) -> None:
     """Write one scene as MJCF, GLB, URDF or USD.
 
     MJCF has a scene.glb beside it, and loads with nothing but MuJoCo; USD has physics.
 
-    --texture, --lights and --camera change its looks alone (docs: Randomisation).
+    --texture, --lights and --camera change only its appearance (docs: Randomisation).
 
     USD needs usd-core: `pip install 'tableverse-factory[usd]'`.
 

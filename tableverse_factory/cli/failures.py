@@ -1,6 +1,6 @@
-"""`tableverse failures`: why scenes were lost, where and how often, and how to try them again."""
+"""`tableverse failures`: reasons of lost scenes, and how to retry them."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -8,14 +8,18 @@ from tableverse_factory.cli.completions import complete_stages
 from tableverse_factory.cli.options import AsJson, BuiltOut
 
 if TYPE_CHECKING:
-    from workers.progress.build_state import SceneOutcome
+    from workers.progress.build_state import SceneStatus
 
 
 def failures(
     out: BuiltOut,
     stage: Annotated[
         str | None,
-        typer.Option(metavar="STAGE", autocompletion=complete_stages, help="Only scenes lost at this stage, also dropped ones."),
+        typer.Option(
+            metavar="STAGE",
+            autocompletion=complete_stages,
+            help="Only scenes lost at this stage, also dropped ones.",
+        ),
     ] = None,
     reason: Annotated[
         str | None,
@@ -32,7 +36,6 @@ def failures(
     Example: `tableverse failures out --reason timeout --retry`
     """
     import json
-    from dataclasses import asdict
 
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.core.text import pluralize
@@ -40,72 +43,86 @@ def failures(
     from workers.progress.build_state import read_build_state
 
     place = parse_path(out)
-    found = read_build_state(place)
-    endings = [ending for ending in found.endings if ending.status != "done"]
-    chosen = [ending for ending in endings if _is_chosen(ending, stage, reason)]
-    if not chosen:
-        _check_filters(endings, [cost.stage for cost in found.costs], stage, reason)
+    state = read_build_state(place)
+    lost = [scene for scene in state.scenes if scene.status != "done"]
+    selected = [scene for scene in lost if _is_selected(scene, stage, reason)]
+    if not selected:
+        _check_filters(lost, [cost.stage for cost in state.compute_stage_costs()], stage, reason)
     if as_json:
-        print(json.dumps([asdict(ending) for ending in chosen], indent=2))
+        print(json.dumps([_to_dict(scene) for scene in selected], indent=2))
     else:
-        _print_outcomes(chosen, "none" if stage or reason else _format_none_failed(endings, out))
-    if retry and chosen:
-        shards = reopen_scenes(place, [ending.scene_id for ending in chosen])
-        where = f"{pluralize(len(chosen), 'scene')} in {pluralize(shards, 'shard')}"
+        _print_scenes(selected, "none" if stage or reason else _format_none_failed(lost, out))
+    if retry and selected:
+        shards = reopen_scenes(place, [scene.scene_id for scene in selected])
+        where = f"{pluralize(len(selected), 'scene')} in {pluralize(shards, 'shard')}"
         typer.echo(f"{where} put back: run the same `tableverse build` to try again", err=as_json)
 
 
-def _check_filters(endings: list["SceneOutcome"], ran: list[str], stage: str | None, reason: str | None) -> None:
-    """Refuses what is likely misspelt: a stage that there is not, or a reason where scenes were lost for others.
+def _to_dict(scene: "SceneStatus") -> dict[str, Any]:
+    names = ("scene_id", "status", "stage", "why", "detail", "attempts", "shard")
+    return {**{name: getattr(scene, name) for name in names}, "help": _find_help(scene.why)}
+
+
+def _find_help(why: str) -> str:
+    """Find the entry of the troubleshooting page: a reason is its own anchor, an error class has a topic."""
+    from tableverse_factory.cli.exit_codes import TROUBLESHOOTING
+    from tableverse_factory.core import errors
+
+    return f"{TROUBLESHOOTING}#{getattr(getattr(errors, why, None), 'topic', why)}"
+
+
+def _check_filters(lost: list["SceneStatus"], ran: list[str], stage: str | None, reason: str | None) -> None:
+    """Refuse a stage that does not exist, or a reason for which no scene was lost.
 
     Raises:
-        InputError: with those that there are.
+        InputError: naming the existing ones.
     """
     from schemas.config import Config
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.core.text import sanitize_line
 
     usual = [name for name in Config.model_fields if name != "run"]
-    stages, reasons = {*usual, *ran, *(ending.stage for ending in endings)}, {ending.why for ending in endings}
+    stages, reasons = {*usual, *ran, *(scene.stage for scene in lost)}, {scene.why for scene in lost}
     if stage is not None and stage not in stages:
-        there = ", ".join(ran or usual)
-        raise InputError(f"--stage {sanitize_line(stage, 60)!r}: no such stage; there are {there}")
+        raise InputError(f"--stage {sanitize_line(stage, 60)!r}: no such stage; there are {', '.join(ran or usual)}")
     if reason is not None and reasons and reason not in reasons:
-        there = ", ".join(sanitize_line(name, 60) for name in sorted(reasons)[:10])
-        raise InputError(f"--reason {sanitize_line(reason, 60)!r}: nothing was lost for that, but for {there}")
+        names = ", ".join(sanitize_line(name, 60) for name in sorted(reasons)[:10])
+        raise InputError(f"--reason {sanitize_line(reason, 60)!r}: nothing was lost for that, but for {names}")
 
 
-def _is_chosen(ending: "SceneOutcome", stage: str | None, reason: str | None) -> bool:
+def _is_selected(scene: "SceneStatus", stage: str | None, reason: str | None) -> bool:
     if stage is None and reason is None:
-        return ending.status == "failed"
-    return stage in (None, ending.stage) and reason in (None, ending.why)
+        return scene.status == "failed"
+    return stage in (None, scene.stage) and reason in (None, scene.why)
 
 
-def _format_none_failed(endings: list["SceneOutcome"], out: str) -> str:
-    if not (dropped := sum(ending.status == "dropped" for ending in endings)):
+def _format_none_failed(lost: list["SceneStatus"], out: str) -> str:
+    if not (dropped := sum(scene.status == "dropped" for scene in lost)):
         return "none"
     return f"none failed; {dropped} {'was' if dropped == 1 else 'were'} dropped: tableverse status {out}"
 
 
-def _print_outcomes(chosen: list["SceneOutcome"], nothing: str) -> None:
+def _print_scenes(selected: list["SceneStatus"], nothing: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.core.text import sanitize_line
-    from tableverse_factory.viz.gallery.words import explained_all
+    from tableverse_factory.viz.gallery.formatting import explain_reasons
 
-    if not chosen:
+    if not selected:
         print(nothing)
         return
-    groups: dict[tuple[str, str, str], list["SceneOutcome"]] = {}
-    for ending in chosen:
-        groups.setdefault((ending.status, ending.stage, ending.why), []).append(ending)
+    groups: dict[tuple[str, str, str], list["SceneStatus"]] = {}
+    for scene in selected:
+        groups.setdefault((scene.status, scene.stage, scene.why), []).append(scene)
     table = Table("status", "stage", "why", box=None, pad_edge=False)
     table.add_column("scenes", justify="right")
     table.add_column("for example", overflow="fold")
-    for (status, stage, why), endings in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
-        example = f"{endings[0].scene_id}: {sanitize_line(endings[0].detail)}"
-        table.add_row(status, stage, sanitize_line(why, 80), str(len(endings)), example)
+    for (status, stage, why), scenes in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
+        example = f"{scenes[0].scene_id}: {sanitize_line(scenes[0].detail)}"
+        table.add_row(status, stage, sanitize_line(why, 80), str(len(scenes)), example)
     Console(markup=False).print(table)
-    for line in explained_all(why for _, _, why in groups):
+    for line in explain_reasons(why for _, _, why in groups):
         print(line)
+    for why in dict.fromkeys(why for _, _, why in groups):
+        print(f"help: {sanitize_line(_find_help(why), 160)}")

@@ -1,4 +1,4 @@
-"""`tableverse init`: a folder to begin in."""
+"""`tableverse init`: a folder with a configuration and a place for captures."""
 
 from pathlib import Path
 from typing import Annotated
@@ -41,12 +41,14 @@ Next, in {folder}:
 def init(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="FOLDER", callback=require_local_path, help="Where to begin; made if it is not there."),
+        typer.Argument(
+            metavar="FOLDER", callback=require_local_path, help="Folder to write; made if it does not exist."
+        ),
     ] = Path(),
 ) -> None:
-    """Begin: a commented configuration and a folder for captures.
+    """Write a commented configuration and a folder for captures.
 
-    What is there already stays as it is: it is an error, and nothing is written.
+    Existing files are never replaced: they are an error, and nothing is written.
 
     Example: `tableverse init kitchen && cd kitchen`
     """

@@ -33,7 +33,7 @@ from tableverse_factory.cli.view import view
 from tableverse_factory.core.open3d_import import stub_plotly
 from tableverse_factory.core.version import __version__
 
-# Modules of commands import what is heavy inside their function: `tableverse --help` answers at once.
+# Commands import heavy modules inside their function, so that `tableverse --help` is fast.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
     "Make: from pictures to a dataset": {
         "init": init,
@@ -107,6 +107,6 @@ def _without_a_command(
 
 
 def main() -> None:
-    """Runs the command line; docs/command-line.md lists its exit codes."""
+    """Run the command line; docs/command-line.md lists its exit codes."""
     stub_plotly()
     raise SystemExit(run_command(lambda: app(standalone_mode=False)))

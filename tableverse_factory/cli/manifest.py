@@ -1,4 +1,4 @@
-"""`tableverse manifest`: folders of pictures become a table."""
+"""`tableverse manifest`: image manifest of folders, files and lists of addresses."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -93,10 +93,9 @@ def manifest(
 ) -> None:
     """List captures, layouts and pictures, and check each.
 
-    Each is decoded once. What cannot be used is a row too, with the reason in its column `rejected`. Of the
-    configuration, the bounds of its section `observe` count. Files that end in .csv, .jsonl or .parquet are lists of
-    addresses, with the columns url, source and licence: their pictures are fetched, and the same command goes on after
-    a kill.
+    Each is decoded once. An unusable one is a row too, with the reason in its column `rejected`. The bounds come from
+    the section `observe` of the configuration. Files that end in .csv, .jsonl or .parquet are lists of addresses, with
+    the columns url, source and licence: their pictures are fetched, and the same command resumes after a kill.
 
     Example: `tableverse manifest photos/ captures/ --out images.parquet`
     """

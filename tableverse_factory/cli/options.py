@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take: one name, one meaning, one help."""
+"""Arguments and options that several commands share."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -17,7 +17,7 @@ class ExecutorName(StrEnum):
 
 
 def require_local_path(path: Path | None) -> Path | None:
-    """Refuses an address where files are written to disk: it would become a folder named `s3:`."""
+    """Refuse a URI for local files: it would become a folder named `s3:`."""
     if path is not None and len(path.parts) > 1 and path.parts[0] in ("s3:", "gs:", "hf:", "http:", "https:", "file:"):
         raise typer.BadParameter(f"{path.parts[0]}//… is no folder of this machine: give one, and copy it there later")
     return path
@@ -47,7 +47,10 @@ ConfigFile = Annotated[
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="A key of the configuration; may repeat.", autocompletion=complete_config_keys
+        "--set",
+        metavar="KEY=VALUE",
+        help="A key of the configuration; may repeat.",
+        autocompletion=complete_config_keys,
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document, for scripts.")]

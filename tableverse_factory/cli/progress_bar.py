@@ -1,4 +1,4 @@
-"""How many are done: a bar on a terminal, a line now and then in a log; always on stderr."""
+"""Progress of a command: a bar on a terminal, a line now and then in a log; always on stderr."""
 
 import sys
 import time
@@ -6,25 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from workers.progress.console import choose_log_interval_s
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-_LINE_EVERY_S = (5.0, 300.0)
-_LINES_SHARE = 0.05
-
-
-def choose_log_interval_s(elapsed_s: float) -> float:
-    """Time between two lines in a log: the longer it runs, the rarer; ten hours are two hundred, not seven thousand.
-
-    Args:
-        elapsed_s: Since the beginning [s].
-    """
-    least, most = _LINE_EVERY_S
-    return min(max(least, _LINES_SHARE * elapsed_s), most)
-
 
 class ProgressCounter:
-    """What is called after each thing that is done."""
+    """Counter of finished items."""
 
     def __init__(self, what: str, total: int | None, bar: "Progress | None") -> None:
         self._what, self._total, self._bar, self._done = what, total, bar, 0
@@ -32,11 +21,11 @@ class ProgressCounter:
         self._started = self._shown = time.monotonic()
 
     def __call__(self) -> None:
-        """One more is done."""
+        """Count one more item."""
         self.update(self._done + 1, self._total)
 
     def update(self, done: int, total: int | None) -> None:
-        """So many are done, of so many."""
+        """Set the number of finished items and their total."""
         self._done, self._total = done, total
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, completed=done, total=total)
@@ -49,11 +38,11 @@ class ProgressCounter:
 
 @contextmanager
 def count_progress(what: str, total: int | None = None) -> Iterator[ProgressCounter]:
-    """Shows how many are done while the block lasts.
+    """Show the number of finished items while the block lasts.
 
     Args:
-        what: Of which things, in the plural.
-        total: How many there will be, where that is known before.
+        what: Name of the items, in the plural.
+        total: Their number, if known.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

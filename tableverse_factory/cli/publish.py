@@ -1,4 +1,4 @@
-"""`tableverse publish`: a dataset onto the Hugging Face Hub."""
+"""`tableverse publish`: upload of a dataset to the Hugging Face Hub."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -26,10 +26,10 @@ def publish(
 ) -> None:
     """Upload a dataset to the Hugging Face Hub.
 
-    Without --upload, say what would go, and to whom.
+    Without --upload, only print what would be uploaded.
 
-    The token comes from HF_TOKEN or from `hf auth login`. Killed in the middle, the same command goes on with what is
-    missing. Needs huggingface_hub: `pip install 'tableverse-factory[hub]'`.
+    The token comes from HF_TOKEN or from `hf auth login`. After a kill, the same command uploads what is missing. Needs
+    huggingface_hub: `pip install 'tableverse-factory[hub]'`.
 
     Example: `tableverse publish out-public --repo me/table-tops --upload`
     """

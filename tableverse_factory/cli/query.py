@@ -29,7 +29,7 @@ class TableName(StrEnum):
 
 
 class Format(StrEnum):
-    """How rows are printed."""
+    """Output format of rows."""
 
     TABLE = "table"
     JSON = "json"
@@ -99,7 +99,7 @@ def query(
 
 
 def _iter_rows(scanner: "pa.dataset.Scanner", limit: int | None) -> Iterator[dict[str, Any]]:
-    """The rows in the dataset's order, without holding all of them."""
+    """Iterate over the rows in the dataset's order, without holding all of them."""
     left = math.inf if limit is None else limit
     for batch in scanner.to_batches():
         if left <= 0:
@@ -134,7 +134,7 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
 
 
 def _format_cell(value: Any) -> str:
-    """A value for people: floats short, text on one line and without control characters."""
+    """Format a value: short floats, text on one line without control characters."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -145,7 +145,7 @@ def _format_cell(value: Any) -> str:
 
 
 def _print_json(rows: Iterable[dict[str, Any]]) -> None:
-    """An array, a row per line; what is not ASCII is escaped, so no text can drive the terminal."""
+    """Print an array, a row per line, with non-ASCII characters escaped so that no text can control the terminal."""
     separator = "[\n"
     for row in rows:
         print(separator + json.dumps({name: _replace_non_finite(value) for name, value in row.items()}), end="")

@@ -1,4 +1,4 @@
-"""`tableverse status`: where a build stands, and where its time went."""
+"""`tableverse status`: progress of a build, and the costs of its stages."""
 
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
@@ -45,19 +45,17 @@ def status(
         return
     from tableverse_factory.dataset.judge_summary import summarize_judgements
     from tableverse_factory.dataset.model_costs import read_model_costs
-    from tableverse_factory.dataset.shards import committed_shards
     from tableverse_factory.dataset.trajectory_summary import summarize_trajectories
     from workers.progress.build_state import read_build_state
     from workers.state.cost_log import sum_costs
 
-    found = read_build_state(place)
-    shards = sorted(committed_shards(place))
-    verdicts, motions = summarize_judgements(place, shards), summarize_trajectories(place, shards)
-    asked = read_model_costs(place, shards), sum_costs(place)
+    state = read_build_state(place)
+    verdicts, motions = summarize_judgements(place, state.published), summarize_trajectories(place, state.published)
+    asked = read_model_costs(place, state.published), sum_costs(place)
     if as_json:
-        print(_dump_json({**_to_dict(found, verdicts, motions), **_costs_as_dict(*asked)}))
+        print(_dump_json({**_to_dict(state, verdicts, motions), **_costs_as_dict(*asked)}))
     else:
-        _print_state(found, place)
+        _print_state(state, place)
         _print_judgements(verdicts)
         _print_costs(*asked)
         _print_trajectories(motions)
@@ -75,10 +73,10 @@ def _follow(out: "StoragePath", every_s: float) -> None:
 
     with ProgressDisplay(Console()) as progress:
         build = BuildFollower(out)
-        if build.look().committed < build.shards and describe_writer(out / WORK / LOCK) is None:
+        if build.read_tally().committed < build.shards and describe_writer(out / WORK / LOCK) is None:
             progress.note("as far as can be seen from here, no build is writing this dataset now")
         while True:
-            tally = build.look()
+            tally = build.read_tally()
             progress.show(tally)
             if tally.committed == tally.shards:
                 return
@@ -86,7 +84,7 @@ def _follow(out: "StoragePath", every_s: float) -> None:
 
 
 def _dump_json(figures: dict[str, Any]) -> str:
-    """The figures as strict JSON, which knows no infinity.
+    """Encode the figures as strict JSON, which has no infinity.
 
     Raises:
         InputError: if a table of the dataset holds one.
@@ -101,19 +99,19 @@ def _dump_json(figures: dict[str, Any]) -> str:
         raise InputError("a table of this dataset holds a figure that is no number", "bad_table") from error
 
 
-def _to_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "TrajectorySummary") -> dict[str, Any]:
+def _to_dict(state: "BuildState", verdicts: "JudgeSummary", motions: "TrajectorySummary") -> dict[str, Any]:
     return {
-        "total": found.total,
-        "done": found.done,
-        "dropped": found.dropped,
-        "failed": found.failed,
-        "remaining": found.remaining,
-        "shards": found.shards,
-        "committed": found.committed,
-        "fingerprint": found.fingerprint,
+        "total": state.total,
+        "done": state.done,
+        "dropped": state.dropped,
+        "failed": state.failed,
+        "remaining": state.remaining,
+        "shards": state.shards,
+        "committed": state.committed,
+        "fingerprint": state.fingerprint,
         "funnel": [
             {"status": status, "stage": stage, "why": why, "scenes": count}
-            for (status, stage, why), count in found.funnel().items()
+            for (status, stage, why), count in state.count_losses().items()
         ],
         "stages": [
             {
@@ -123,7 +121,7 @@ def _to_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "Trajectory
                 "cpu_s_p90": round(cost.p90_cpu_s, 3),
                 "cpu_s_total": round(cost.total_cpu_s, 3),
             }
-            for cost in found.costs
+            for cost in state.compute_stage_costs()
         ],
         "judged": asdict(verdicts),
         "trajectories": {
@@ -136,53 +134,52 @@ def _to_dict(found: "BuildState", verdicts: "JudgeSummary", motions: "Trajectory
     }
 
 
-def _print_state(found: "BuildState", out: "StoragePath") -> None:
+def _print_state(state: "BuildState", out: "StoragePath") -> None:
     from rich.console import Console
     from rich.table import Table
 
     from tableverse_factory.core.text import pluralize, sanitize_line
-    from tableverse_factory.viz.gallery.words import explained_all
+    from tableverse_factory.viz.gallery.formatting import explain_reasons
     from workers.plan.rerun import read_rerun_stage
     from workers.state.ledger import WORK
     from workers.state.lock import LOCK, describe_writer
 
     console = Console(markup=False)
     console.print(
-        f"{pluralize(found.total, 'scene')}: {found.done} done, {found.dropped} dropped, {found.failed} failed, "
-        f"{found.remaining} remaining; {found.committed} of {pluralize(found.shards, 'shard')} committed",
+        f"{pluralize(state.total, 'scene')}: {state.done} done, {state.dropped} dropped, {state.failed} failed, "
+        f"{state.remaining} remaining; {state.committed} of {pluralize(state.shards, 'shard')} committed",
         highlight=False,
     )
-    funnel = found.funnel()
-    if funnel:
+    losses = state.count_losses()
+    if losses:
         table = Table("status", "stage", "why", box=None, pad_edge=False, title="lost", title_justify="left")
         table.add_column("scenes", justify="right")
-        for (status, stage, why), count in funnel.items():
+        for (status, stage, why), count in losses.items():
             table.add_row(status, stage, sanitize_line(why, 80), str(count))
         console.print(table)
-        for line in explained_all(why for _, _, why in funnel):
+        for line in explain_reasons(why for _, _, why in losses):
             print(line)
-    if found.costs:
-        total = sum(cost.total_cpu_s for cost in found.costs) or 1.0
+    if costs := state.compute_stage_costs():
+        total = sum(cost.total_cpu_s for cost in costs) or 1.0
         table = Table("stage", box=None, pad_edge=False, title="CPU seconds", title_justify="left")
         for name in ("scenes", "median", "p90", "total", "share"):
             table.add_column(name, justify="right")
-        for cost in found.costs:
+        for cost in costs:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
     writer = describe_writer(out / WORK / LOCK)
-    if writer is not None or found.remaining:
-        print(writer or f"to go on: {_suggest_command(found, out)}")
-    if found.remaining and read_rerun_stage(out) == TRAJECTORIES:
+    if writer is not None or state.remaining:
+        print(writer or f"to go on: {_suggest_command(state, out)}")
+    if state.remaining and read_rerun_stage(out) == TRAJECTORIES:
         print("rows of trajectories appear when their shard is complete")
 
 
-def _suggest_command(found: "BuildState", out: "StoragePath") -> str:
-    """The command: what is whole but for its trajectories needs no manifest."""
-    from tableverse_factory.dataset.shards import committed_shards
+def _suggest_command(state: "BuildState", out: "StoragePath") -> str:
+    """Suggest the command to resume; a dataset that only lacks trajectories needs no manifest."""
     from workers.plan.rerun import read_rerun_stage
 
-    if read_rerun_stage(out) == TRAJECTORIES and len(committed_shards(out)) == found.shards:
+    if read_rerun_stage(out) == TRAJECTORIES and len(state.published) == state.shards:
         return f"tableverse trajectories {out} with its --set, if any"
     return f"tableverse build MANIFEST {out} with what it was begun with"
 

@@ -1,4 +1,4 @@
-"""`tableverse submit`: a build as a job of a Ray cluster; the same command again goes on."""
+"""`tableverse submit`: a build as a job of a Ray cluster; the same command again resumes."""
 
 import os
 import shutil
@@ -71,10 +71,10 @@ def submit(
 
 
 def build_command(manifest: str, out: str, options: Sequence[str]) -> list[str]:
-    """The command of the job, once the command line of `build` has accepted it.
+    """Make the command of the job, after the command line of `build` has accepted it.
 
     Raises:
-        BuildError: if it would not run on the cluster that it is submitted to.
+        BuildError: if it would run on another cluster.
         click.UsageError: if an option is wrong.
     """
     arguments = [manifest, out, "--executor", "ray", *options]
@@ -87,19 +87,19 @@ def build_command(manifest: str, out: str, options: Sequence[str]) -> list[str]:
 
 
 def parse_build(arguments: Sequence[str]) -> dict[str, Any]:
-    """What `tableverse build` would understand; nothing is run.
+    """Parse arguments as `tableverse build` would, without running it.
 
     Raises:
         click.UsageError: if it would refuse them.
     """
-    roof = typer.Typer()
-    roof.command("build")(build)
-    context = typer.main.get_command(roof).make_context("tableverse build", list(arguments))
+    app = typer.Typer()
+    app.command("build")(build)
+    context = typer.main.get_command(app).make_context("tableverse build", list(arguments))
     return dict(context.params)
 
 
 def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
-    """Reads `--config`, `--set` and `--pools` as the job will, where their files lie here: before a cluster is asked.
+    """Read `--config`, `--set` and `--pools` as the job will, if their files are here.
 
     Raises:
         ConfigError: if a key or a value is wrong.
@@ -109,7 +109,7 @@ def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
 
     config, pools = (None if parsed[name] is None else folder / parsed[name] for name in ("config", "pools"))
     if config is not None and not config.is_file():
-        return  # it is on the cluster, and decides what the others mean
+        return  # it is on the cluster
     settings = load_config(config, parsed["overrides"] or [])
     if pools is None or pools.is_file():
         load_pools(pools, settings)
@@ -117,7 +117,7 @@ def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
 
 @contextmanager
 def _stage_files(command: Sequence[str], working_dir: Path | None) -> Iterator[tuple[list[str], str | None]]:
-    """The command as it reads on the cluster, and the folder that travels, if one does."""
+    """Yield the command for the cluster and the folder of files that travel with it, if any."""
     if working_dir is not None:
         if not working_dir.is_dir():
             raise BuildError(f"--working-dir {working_dir} is no folder")
@@ -129,7 +129,7 @@ def _stage_files(command: Sequence[str], working_dir: Path | None) -> Iterator[t
 
 
 def _stage_word(word: str, folder: Path) -> str:
-    """A word of the command line; a file that it names is copied into the folder and found there by its name."""
+    """Copy the file that a word of the command line names into the folder; returns the word for the cluster."""
     option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
     source = Path(value)
     if not value or not source.is_file():

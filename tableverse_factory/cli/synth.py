@@ -1,4 +1,4 @@
-"""`tableverse synth`: synthetic captures, or layouts, with known truth."""
+"""`tableverse synth`: synthetic captures or layouts with ground truth."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -10,7 +10,7 @@ from tableverse_factory.cli.options import require_local_path
 
 
 class SynthKind(StrEnum):
-    """What is made."""
+    """Kind of synthetic scenes."""
 
     CAPTURES = "captures"
     LAYOUTS = "layouts"
@@ -40,9 +40,9 @@ def synth(
     """
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.sources.synthetic.layout import synthesize_layouts
-    from tableverse_factory.sources.synthetic.synthesize import synthesize
+    from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
     with count_progress("scenes", scenes) as done:
-        make = synthesize if kind is SynthKind.CAPTURES else synthesize_layouts
+        make = synthesize_captures if kind is SynthKind.CAPTURES else synthesize_layouts
         made = make(out, scenes, seed, lambda *_: done())
     print(f"{len(made)} {kind} in {out}")

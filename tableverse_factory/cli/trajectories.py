@@ -1,4 +1,4 @@
-"""`tableverse trajectories`: proven motions for the tasks of a dataset that is finished."""
+"""`tableverse trajectories`: proven trajectories for the tasks of a finished dataset."""
 
 from typing import Annotated
 

@@ -72,7 +72,7 @@ def test_query_takes_no_more_than_asked(tableverse, out, monkeypatch):
 def test_query_points_at_the_error(tableverse, out):
     answer = tableverse("query", out, "-t", "objects", "--where", "label = 'a' and mas_kg < 1")
     assert answer.code == 1
-    first, line, carets = answer.err.splitlines()
+    first, line, carets, _ = answer.err.splitlines()
     assert first == "error: no column 'mas_kg'; did you mean mass_kg?"
     assert line[carets.index("^") :][: carets.count("^")] == "mas_kg"
     assert "did you mean label" in tableverse("query", out, "-t", "objects", "-c", "lable").err

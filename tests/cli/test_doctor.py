@@ -33,7 +33,7 @@ def test_this_machine_is_ready(tableverse):
     ],
 )
 def test_whatever_crashes_or_hangs_is_a_finding(monkeypatch, code, found):
-    monkeypatch.setattr(doctor_checks, "TRIAL_S", 2.0)
+    monkeypatch.setattr(doctor_checks, "SCRIPT_TIMEOUT_S", 2.0)
     check = doctor_checks._check_script("trial", code, "do this")
     assert not check.ok
     assert found in check.found
@@ -67,7 +67,9 @@ def test_a_full_disk_is_a_finding(monkeypatch, tmp_path):
 
 
 def test_trials_are_run_by_this_python():
-    assert Path(doctor_checks._check_script("trial", "import sys; print(sys.executable)", "").found) == Path(sys.executable)
+    assert Path(doctor_checks._check_script("trial", "import sys; print(sys.executable)", "").found) == Path(
+        sys.executable
+    )
 
 
 def test_every_extra_is_named_with_what_it_gives(monkeypatch):
@@ -78,7 +80,7 @@ def test_every_extra_is_named_with_what_it_gives(monkeypatch):
     for extra, (packages, _) in doctor_checks.EXTRAS.items():
         required = " ".join(extras[extra])
         assert extra == "cluster" or all(package in required for package in packages), extra
-    monkeypatch.setattr(doctor_checks, "_version", lambda package: None)
+    monkeypatch.setattr(doctor_checks, "_find_version", lambda package: None)
     for extra, check in zip(doctor_checks.EXTRAS, doctor_checks._check_extras(), strict=False):
         assert (check.required, check.ok) == (False, False)
         assert f"pip install 'tableverse-factory[{extra}]'" in check.advice

@@ -33,7 +33,7 @@ def test_nothing_is_overwritten(tableverse, tmp_path, monkeypatch):
     (tmp_path / "config.yaml").write_text("run: {seed: 7}\n")
     again = tableverse("init")
     assert again.code == 1
-    assert re.fullmatch(r"error: config\.yaml is there already[^\n]+\n", again.err)
+    assert re.fullmatch(r"error: config\.yaml is there already[^\n]+\nhelp: [^\n]+\n", again.err)
     assert (tmp_path / "config.yaml").read_text() == "run: {seed: 7}\n"
     (tmp_path / "config.yaml").unlink()
     assert tableverse("init").code == 1, "the other file may have been edited"

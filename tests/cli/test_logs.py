@@ -15,11 +15,11 @@ import pytest
 from rich.console import Console
 
 from tableverse_factory.cli import progress_bar as counter_module
-from tableverse_factory.cli.progress_bar import choose_log_interval_s, count_progress
+from tableverse_factory.cli.progress_bar import count_progress
 from tests.helpers.paths import ROOT
 from tests.helpers.show_a_build import STAGES
 from workers.progress import console as progress_module
-from workers.progress.console import ProgressDisplay
+from workers.progress.console import ProgressDisplay, choose_log_interval_s
 from workers.progress.tally import Tally
 
 SCENES = 100_000

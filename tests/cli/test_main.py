@@ -61,12 +61,12 @@ def test_nothing_heavy_is_imported_before_a_command_runs():
         ("manifest", ".", "--out", "a_file/m.parquet"),
     ],
 )
-def test_an_expected_error_is_one_line_on_stderr(tableverse, tmp_path, monkeypatch, arguments):
+def test_an_expected_error_is_a_line_with_a_link_on_stderr(tableverse, tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a_file").write_text("")
     answer = tableverse(*arguments)
     assert answer.code == 1
-    assert re.fullmatch(r"error: [^\n]+\n", answer.err)
+    assert re.fullmatch(r"error: [^\n]+\nhelp: docs/troubleshooting\.md#[\w-]+\n", answer.err)
     assert answer.out == ""
 
 

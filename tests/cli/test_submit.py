@@ -47,7 +47,7 @@ def test_a_broken_connection_neither_repeats_nor_loses_a_line_of_the_log(cuts):
     for cut in (*cuts, len(log)):
         ear.begin()
         for start in range(0, cut, 2):
-            ear.take(log[start : min(start + 2, cut)])
+            ear.write(log[start : min(start + 2, cut)])
     assert "".join(said) == log
 
 
@@ -121,4 +121,6 @@ def test_what_cannot_work_is_refused_in_one_line(tableverse, tmp_path, monkeypat
 def test_without_rays_job_client_it_says_what_to_install(tableverse, monkeypatch):
     monkeypatch.setitem(sys.modules, "aiohttp", None)
     answer = tableverse("submit", "/shared/images.parquet", "/shared/out")
-    assert answer.err == "error: submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'\n"
+    error, advice = answer.err.splitlines()
+    assert error == "error: submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'"
+    assert advice.startswith("help: docs/troubleshooting.md#")

@@ -62,7 +62,7 @@ def test_a_port_in_use_is_said_in_one_line(dataset, run):
         (("scene.xml", "a-2"), "scene.xml is one scene"),
         (("{out}", "--host", "no.such.host.invalid"), "no address of this machine"),
         (("{out}", "--host", "192.0.2.1"), "cannot listen on 192.0.2.1"),
-        (("{out}", "--allow-origin", "lab"), "--allow-origin lab: no address of a page"),
+        (("{out}", "--allow-origin", "lab"), "--allow-origin lab: not the address of a page"),
     ],
 )
 def test_mistakes_are_told_in_one_line(dataset, run, arguments, said):

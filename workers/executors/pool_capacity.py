@@ -1,4 +1,4 @@
-"""Whether the pools fit into the cluster: an actor that fits on no node would wait for ever, without a word."""
+"""Check that the pools fit into the cluster: an actor that fits on no node would wait for ever, silently."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,19 +12,19 @@ _ROUNDING = 1e-9
 
 
 def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: Mapping[str, float]) -> None:
-    """Refuses pools that the cluster could never hold.
+    """Refuse pools that the cluster could never hold.
 
-    Each pool must be able to have one actor, and as many as its `min`, on single nodes; all of these together must not
-    ask for more than the build may use. Where nodes have room for that sum and not for each actor at once, the build
-    goes on all the same: it lets idle actors go, even those of `min`, so that others find a place.
+    Each pool must fit with one actor, and with its `min` of actors, on single nodes; all of these together must not
+    exceed the capacity. If the sum fits but not all actors at once, the build runs nevertheless: it retires idle
+    actors, even those of `min`, to make room for others.
 
     Args:
-        specs: What one actor holds, by the name of its pool; pools that share their actors are given once.
-        nodes: The nodes there are now; an autoscaler's future ones do not count.
+        specs: Resources of one actor, by pool; pools that share their actors are given once.
+        nodes: The present nodes; future ones of an autoscaler do not count.
         capacity: What the build may use of the whole cluster.
 
     Raises:
-        BuildError: naming the pool, what it wants, what is there, and what to change.
+        BuildError: naming the pool, what it needs, what is there, and what to change.
     """
     for name, spec in specs.items():
         needs = spec.needs()
@@ -33,14 +33,14 @@ def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: 
             raise BuildError(_explain_misfit(name, needs, nodes))
         if room < spec.min:
             raise BuildError(
-                f"pool {name} wants at least {spec.min} actors with {_format_amounts(needs)} each and the cluster has room "
-                f"for {room}: set min of {name} to {room} in --pools, or start more nodes"
+                f"pool {name} wants at least {spec.min} actors with {_format_amounts(needs)} each and the cluster has "
+                f"room for {room}: set min of {name} to {room} in --pools, or start more nodes"
             )
     _check_together(specs, capacity)
 
 
 def count_actors(resources: Mapping[str, float], needs: Mapping[str, float]) -> int:
-    """How many actors a node holds; a fraction of a GPU never spans two of them."""
+    """Count the actors that a node holds; a fraction of a GPU never spans two of them."""
     return min(_count_by_resource(resources.get(name, 0.0), name, need) for name, need in needs.items())
 
 
@@ -55,8 +55,8 @@ def _explain_misfit(name: str, needs: Mapping[str, float], nodes: Sequence[Node]
     lacking = [resource for resource, need in needs.items() if _count_by_resource(most[resource], resource, need) == 0]
     if not lacking:
         return (
-            f"pool {name} wants {_format_amounts(needs)} on one node, and no node has all of it: {_format_nodes(nodes, needs)}. "
-            f"Lower {_format_options(needs)} of {name} in --pools, or start a larger node"
+            f"pool {name} wants {_format_amounts(needs)} on one node, and no node has all of it: "
+            f"{_format_nodes(nodes, needs)}. Lower {_format_options(needs)} of {name} in --pools, or start a larger node"
         )
     wanted = _format_amounts({resource: needs[resource] for resource in lacking})
     had = _format_amounts({resource: most[resource] for resource in lacking})
@@ -75,8 +75,8 @@ def _check_together(specs: Mapping[str, PoolSpec], capacity: Mapping[str, float]
         have = capacity.get(resource, 0.0)
         if amount > have + _ROUNDING * max(1.0, have):
             raise BuildError(
-                f"the pools {', '.join(specs)} together want {_format_amount(resource, amount)} for their fewest actors and "
-                f"the build may use {_format_amount(resource, have)}: lower min or what an actor holds in --pools, "
+                f"the pools {', '.join(specs)} together want {_format_amount(resource, amount)} for their fewest actors "
+                f"and the build may use {_format_amount(resource, have)}: lower min or what an actor holds in --pools, "
                 "give more --workers, or start more nodes"
             )
 

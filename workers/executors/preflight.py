@@ -1,4 +1,4 @@
-"""What every node of a cluster is asked before work starts: its versions, and whether it sees what it must read."""
+"""Preflight of the nodes of a cluster: same versions, visible inputs, shared folder."""
 
 import secrets
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -31,12 +31,12 @@ _MAX_SHOWN = 4
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """What a node says of itself.
+    """Result of the probe of a node.
 
     Attributes:
         versions: Of Python, the packages that decide bytes, and our own code.
         missing: Inputs that it cannot see.
-        token: What it reads from the file that was left for it; empty where it cannot.
+        token: Content of the token file; empty if it cannot read it.
     """
 
     node: str
@@ -46,44 +46,44 @@ class NodeReport:
 
 
 def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: StoragePath) -> None:
-    """Asks every node whether it would compute what this machine would: same versions, same inputs, same folder.
+    """Check that every node would compute the same as this machine.
 
     Args:
-        nodes: The nodes, from `workers.executors.ray_cluster.list_alive_nodes`.
-        inputs: What the manifest points at; a few are tried.
-        shared: A folder that every node must reach, since its workers write there.
+        nodes: From `workers.executors.ray_cluster.list_alive_nodes`.
+        inputs: Of the manifest; a sample is tried.
+        shared: A folder that every node must reach, because its workers write there.
 
     Raises:
         BuildError: naming the node, what it lacks, and what would help.
     """
-    chosen = sample_inputs(inputs)
-    tried = find_visible_inputs(chosen)
-    if chosen and not tried:
+    sampled = sample_inputs(inputs)
+    visible = find_visible_inputs(sampled)
+    if sampled and not visible:
         raise BuildError(
-            f"none of {len(chosen)} inputs tried can be seen from here, the head of the build, {chosen[0]} first: put "
-            "them where the cluster reaches them, and make the manifest again from there"
+            f"none of {len(sampled)} inputs tried can be seen from here, the head of the build, {sampled[0]} first: "
+            "put them where the cluster reaches them, and make the manifest again from there"
         )
     with write_shared_token(shared) as (place, token):
-        answers = probe_nodes(nodes, tried, place)
+        answers = probe_nodes(nodes, visible, place)
     check_versions(collect_versions(), answers)
     check_shared_folder(shared, token, answers)
-    check_inputs(len(tried), answers)
+    check_inputs(len(visible), answers)
 
 
 def sample_inputs(inputs: Sequence[str]) -> tuple[str, ...]:
-    """At most `SAMPLED_INPUTS` of them, spread evenly."""
+    """Select at most `SAMPLED_INPUTS` of the inputs, spread evenly."""
     step = max(1, -(-len(inputs) // SAMPLED_INPUTS))
     return tuple(inputs[::step])
 
 
 def find_visible_inputs(inputs: Collection[str]) -> tuple[str, ...]:
-    """Those that this machine can see itself; the others become rows with their reason wherever they run."""
+    """Select the inputs that this machine can see; scenes of the others are dropped wherever they run."""
     return tuple(uri for uri in inputs if _is_visible(uri))
 
 
 @contextmanager
 def write_shared_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]:
-    """A file with a random word in the folder while the block lasts: where it is, and the word."""
+    """Write a random token into the folder for the time of the block; yields its path and the token."""
     place, token = folder / f"preflight-{secrets.token_hex(8)}", secrets.token_hex(16)
     write_atomic(place, token.encode())
     try:
@@ -93,49 +93,49 @@ def write_shared_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]
 
 
 def probe_nodes(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath) -> list[NodeReport]:
-    """The answers of the nodes; those that are lost meanwhile are left out, like any node lost later.
+    """Probe the nodes; those that are lost meanwhile are left out, like any node lost later.
 
     Raises:
         BuildError: if a node cannot run our code, or does not answer.
     """
-    look: Any = ray.remote(num_cpus=0, max_retries=0)(probe_node)
-    asked = {
-        look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
+    probe: Any = ray.remote(num_cpus=0, max_retries=0)(probe_node)
+    pending = {
+        probe.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
             node.name, tuple(inputs), str(token)
         ): node
         for node in nodes
     }
-    ready, silent = ray.wait(list(asked), num_returns=len(asked), timeout=PROBE_TIMEOUT_S)
-    if silent:
-        names = _abbreviate(sorted(asked[reference].name for reference in silent))
+    ready, late = ray.wait(list(pending), num_returns=len(pending), timeout=PROBE_TIMEOUT_S)
+    if late:
+        names = _abbreviate(sorted(pending[reference].name for reference in late))
         raise BuildError(f"no answer from {names} within {PROBE_TIMEOUT_S:g} s: look at `ray status`, or take them out")
-    return [answer for reference in ready if (answer := _collect_report(reference, asked[reference])) is not None]
+    return [answer for reference in ready if (answer := _collect_report(reference, pending[reference])) is not None]
 
 
 def probe_node(name: str, inputs: Sequence[str], token: str) -> NodeReport:
-    """Runs on the node that is asked.
+    """Probe this machine; runs on the node.
 
     Raises:
         StoreError: if an object store does not answer.
     """
     missing = tuple(uri for uri in inputs if not _is_visible(uri))
     try:
-        word = read_whole(parse_path(token)).decode()
+        content = read_whole(parse_path(token)).decode()
     except StoreError:
         raise
     except OSError:
-        word = ""
-    return NodeReport(name, collect_versions(), missing, word)
+        content = ""
+    return NodeReport(name, collect_versions(), missing, content)
 
 
 @dataclass(frozen=True, slots=True)
 class NodeExpectation:
-    """What an actor must find where it was started, for nodes that join after the build began.
+    """Requirements of an actor on its node, for nodes that join after the start of the build.
 
     Attributes:
         versions: Of Python, packages and our own code.
-        inputs: Some of what the manifest points at.
-        checked: Ray's ids of the nodes that answered before the build began: their actors are not asked again.
+        inputs: A sample of the manifest's.
+        checked: Ray's ids of the nodes that passed the preflight and need no second one.
     """
 
     versions: Mapping[str, str]
@@ -144,15 +144,16 @@ class NodeExpectation:
 
 
 def make_expectation(inputs: Sequence[str], checked: Sequence[Node]) -> NodeExpectation:
-    """What this machine has and sees, and the nodes that were asked for it."""
-    return NodeExpectation(collect_versions(), find_visible_inputs(sample_inputs(inputs)), tuple(node.node_id for node in checked))
+    """Describe this machine as what later nodes must match."""
+    visible = find_visible_inputs(sample_inputs(inputs))
+    return NodeExpectation(collect_versions(), visible, tuple(node.node_id for node in checked))
 
 
 def find_local_problem(node: str, node_id: str, expected: NodeExpectation) -> str:
-    """Why this machine would not give the same bytes, in words; empty where it would, or was asked before.
+    """Find why this machine would not give the same bytes; empty if it would, or passed the preflight.
 
     Raises:
-        StoreError: if the store of the inputs does not answer: that says nothing about the machine.
+        StoreError: if the store of the inputs does not answer, which says nothing about the machine.
     """
     if node_id in expected.checked:
         return ""
@@ -166,7 +167,7 @@ def find_local_problem(node: str, node_id: str, expected: NodeExpectation) -> st
 
 
 def check_versions(own: Mapping[str, str], answers: Sequence[NodeReport]) -> None:
-    """Refuses nodes whose results could differ from this machine's.
+    """Refuse nodes whose results could differ from this machine's.
 
     Raises:
         BuildError: naming the node and the first differences.
@@ -182,7 +183,7 @@ def check_versions(own: Mapping[str, str], answers: Sequence[NodeReport]) -> Non
 
 
 def check_inputs(n_tried: int, answers: Sequence[NodeReport]) -> None:
-    """Refuses nodes that cannot read what the manifest points at.
+    """Refuse nodes that cannot read the inputs.
 
     Raises:
         BuildError: naming the node and an input.
@@ -197,16 +198,16 @@ def check_inputs(n_tried: int, answers: Sequence[NodeReport]) -> None:
 
 
 def check_shared_folder(folder: StoragePath, token: str, answers: Sequence[NodeReport]) -> None:
-    """Refuses nodes that see another folder under this name, or none.
+    """Refuse nodes that see another folder under this name, or none.
 
     Raises:
         BuildError: naming the nodes.
     """
-    blind = [answer.node for answer in answers if answer.token != token]
-    if blind:
+    failing = [answer.node for answer in answers if answer.token != token]
+    if failing:
         raise BuildError(
-            f"{_abbreviate(blind)} cannot read what was written to {folder}: give a folder that every node mounts under "
-            "this path, or s3://bucket/prefix with credentials on every node"
+            f"{_abbreviate(failing)} cannot read what was written to {folder}: give a folder that every node mounts "
+            "under this path, or s3://bucket/prefix with credentials on every node"
         )
 
 
@@ -216,8 +217,9 @@ def _collect_report(reference: Any, node: Node) -> NodeReport | None:
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, StoreError):
             raise BuildError(f"node {node.name}: {error.cause}") from None
+        text = sanitize_error_text(f"{type(error.cause).__name__}: {error.cause}")[:300]
         raise BuildError(
-            f"node {node.name} cannot do this work: {type(error.cause).__name__}: {sanitize_error_text(str(error.cause))[:300]}. "
+            f"node {node.name} cannot do this work: {text}. "
             "Install the same tableverse-factory there, and let it read the inputs"
         ) from None
     except ray.exceptions.RayError:  # the node is gone: the build goes on with the others
@@ -226,7 +228,7 @@ def _collect_report(reference: Any, node: Node) -> NodeReport | None:
 
 
 def _is_visible(uri: str) -> bool:
-    """Whether a file or a folder is there; the web is not asked, it is the same from everywhere or slow.
+    """Whether a file or folder exists; web addresses are not requested.
 
     Raises:
         StoreError: if an object store does not answer.

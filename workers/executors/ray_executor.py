@@ -1,4 +1,4 @@
-"""Pools of actors on Ray: one generic actor class, one call in flight per actor, nothing that Ray retries itself."""
+"""Executor on Ray: pools of one generic actor class, one call in flight per actor, without Ray's own retries."""
 
 import itertools
 import time
@@ -34,12 +34,12 @@ from workers.sandbox.parent import START_TIMEOUT_S
 
 CALL_GRACE_S = 60.0
 REFRESH_S = 10.0
-"""Between two looks at the nodes of a cluster [s]."""
+"""Interval between two checks of the nodes of a cluster [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """A call under way, whose time runs out at `until`."""
+    """A call in flight with its deadline `until` [s]."""
 
     worker: int
     jobs: tuple[Job, ...]
@@ -53,12 +53,12 @@ class _Call:
 
 @dataclass(frozen=True, slots=True)
 class ClusterSpec:
-    """Which cluster, how much of it, and what its nodes must see.
+    """The cluster, the part of it to use, and what its nodes must see.
 
     Attributes:
         address: Of a running cluster; None for one on this machine that ends with the build.
         workers: CPUs that the build may use; None for all.
-        inputs: What the manifest points at.
+        inputs: Of the manifest.
         shared: A folder that all nodes must reach.
     """
 
@@ -69,28 +69,28 @@ class ClusterSpec:
 
 
 class RayExecutor:
-    """Actors in pools, made when they are first needed, replaced by the driver when they die."""
+    """Executor of actors in pools; the driver starts and replaces them."""
 
-    def __init__(self, setup: SandboxSetup, pools: Pools, where: ClusterSpec) -> None:
-        """Starts Ray on this machine, or joins a cluster.
+    def __init__(self, setup: SandboxSetup, pools: Pools, cluster: ClusterSpec) -> None:
+        """Start Ray on this machine, or join a cluster.
 
         Raises:
-            BuildError: if the cluster is not there, has not what the pools ask for, or a node would give other bytes.
+            BuildError: if the cluster is not reachable or too small for the pools, or a node would give other bytes.
         """
-        connect(where.address)
+        connect(cluster.address)
         try:
-            lines = load_pipelines(setup.pipeline).values()
-            self._shared = _group_pools(pools, {stage.pool for line in lines for stage in line})
-            specs = {name: getattr(pools, name.partition("+")[0]) for name in self._shared.values()}
-            self._specs, self._where = specs, where
-            check_workers(where.workers, list_alive_nodes())
-            self._limits = self._look()
+            pipelines = load_pipelines(setup.pipeline).values()
+            self._pool_by_stage_pool = _group_pools(pools, {stage.pool for stages in pipelines for stage in stages})
+            specs = {name: getattr(pools, name.partition("+")[0]) for name in self._pool_by_stage_pool.values()}
+            self._specs, self._cluster = specs, cluster
+            check_workers(cluster.workers, list_alive_nodes())
+            self._limits = self._refresh_limits()
             check_pools(specs, list_alive_nodes(), self._limits.capacity)
             self._expected = None
-            if where.address is not None:
+            if cluster.address is not None:
                 nodes = list_alive_nodes()
-                check_nodes(nodes, where.inputs, where.shared)
-                self._expected = make_expectation(where.inputs, nodes)
+                check_nodes(nodes, cluster.inputs, cluster.shared)
+                self._expected = make_expectation(cluster.inputs, nodes)
         except BaseException:
             ray.shutdown()
             raise
@@ -104,17 +104,17 @@ class RayExecutor:
 
     @property
     def limits(self) -> ScheduleLimits:
-        """What the pools ask for, and what the cluster has now: nodes come and go."""
-        if self._where.address is not None and time.monotonic() > self._looked + REFRESH_S:
-            self._limits = self._look()
+        """Limits of the pools with the present nodes of the cluster."""
+        if self._cluster.address is not None and time.monotonic() > self._refreshed_at + REFRESH_S:
+            self._limits = self._refresh_limits()
         return self._limits
 
     def pool_of(self, stage_pool: str) -> str:
-        """The stage's own, or the one that it shares with others which ask for the same."""
-        return self._shared[stage_pool]
+        """Return the stage's pool, or the one that it shares with pools of equal needs."""
+        return self._pool_by_stage_pool[stage_pool]
 
     def start(self, pool: str) -> int:
-        """Asks Ray for an actor."""
+        """Request an actor from Ray."""
         number = next(self._numbers)
         handle = self._classes[pool].options(name=f"{pool}-{number}").remote(self._setup)
         self._actors[number] = handle
@@ -122,33 +122,35 @@ class RayExecutor:
         return number
 
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
-        """Calls the actor."""
+        """Call the actor."""
         method = self._actors[worker].run.options(num_returns=1 + len(jobs))
         report, *values = method.remote(encode(tuple(job.chain for job in jobs)), *(job.payload for job in jobs))
-        self._running[report] = _Call(worker, jobs, values, time.monotonic() + self._longest(jobs))
+        self._running[report] = _Call(worker, jobs, values, time.monotonic() + self._compute_deadline_s(jobs))
 
     def wait(self, timeout_s: float) -> list[Event]:
-        """Actors that came, and calls that ended; an actor that died or stays silent is killed and forgotten.
+        """Return started actors and finished calls; an actor that died or exceeds its deadline is killed.
 
         Raises:
-            BuildError: if an actor says that it can never work.
+            BuildError: if an actor can never run the stages.
         """
         awaited = [*self._running, *self._starting]
         if not awaited:
             return []
         ray.wait(awaited, timeout=timeout_s)
         ready, _ = ray.wait(awaited, num_returns=len(awaited), timeout=0)
-        events = [self._greet(ref) if ref in self._starting else self._collect(ref) for ref in ready]
+        events = [
+            self._on_actor_started(ref) if ref in self._starting else self._on_call_finished(ref) for ref in ready
+        ]
         now = time.monotonic()
-        silent = [reference for reference, running in self._running.items() if now > running.until]
-        return events + [self._give_up(reference, "no answer long after its deadline") for reference in silent]
+        late = [reference for reference, running in self._running.items() if now > running.until]
+        return events + [self._drop_worker(reference, "no answer long after its deadline") for reference in late]
 
     def retire(self, worker: int) -> None:
-        """Kills the actor; its child dies with it."""
+        """Kill the actor; its child dies with it."""
         ray.kill(self._actors.pop(worker))
 
     def fetch(self, payload: Payload) -> bytes:
-        """Brings a record to this process.
+        """Fetch a record into this process.
 
         Raises:
             PayloadLostError: if the machine that held it is gone.
@@ -160,13 +162,13 @@ class RayExecutor:
         return data
 
     def close(self) -> None:
-        """Kills the actors, whose children die with them, and leaves Ray."""
+        """Kill the actors, whose children die with them, and disconnect from Ray."""
         for actor in self._actors.values():
             ray.kill(actor)
         ray.shutdown()
 
-    def _greet(self, reference: Any) -> Event:
-        """An actor is there, or died on its way.
+    def _on_actor_started(self, reference: Any) -> Event:
+        """Handle an actor that started, or died before.
 
         Raises:
             BuildError: if it is on a node that would give other bytes.
@@ -182,43 +184,43 @@ class RayExecutor:
             raise BuildError(problem)
         return WorkerReady(worker)
 
-    def _look(self) -> ScheduleLimits:
-        """The limits with the nodes that are there now."""
-        self._looked = time.monotonic()
+    def _refresh_limits(self) -> ScheduleLimits:
+        """Compute the limits with the present nodes."""
+        self._refreshed_at = time.monotonic()
         nodes = list_alive_nodes()
         pools = {name: _compute_pool_limits(spec, nodes) for name, spec in self._specs.items()}
-        return ScheduleLimits(pools, sum_capacity(nodes, self._where.workers))
+        return ScheduleLimits(pools, sum_capacity(nodes, self._cluster.workers))
 
-    def _longest(self, jobs: tuple[Job, ...]) -> float:
-        """How long a call may take: twice what its longest scene may, all attempts and new sandboxes included [s].
+    def _compute_deadline_s(self, jobs: tuple[Job, ...]) -> float:
+        """Compute the deadline of a call [s]: twice that of its longest scene, with all attempts and new sandboxes.
 
-        Only scenes that take next to nothing share a call; those of a call that is given up are called one by one.
+        Only scenes of negligible duration share a call; those of a failed call are called one by one.
         """
         longest = max(sum(call.deadline_s + START_TIMEOUT_S for call in job.chain.calls) for job in jobs)
         return START_TIMEOUT_S + CALL_GRACE_S + 2 * self._attempts * longest
 
-    def _collect(self, reference: Any) -> Event:
+    def _on_call_finished(self, reference: Any) -> Event:
         try:
             reports: tuple[StageChainReport, ...] = decode(ray.get(reference))
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
         except ray.exceptions.ObjectLostError as error:
-            return self._give_up(reference, describe_loss(error), inputs_lost=True)
+            return self._drop_worker(reference, describe_loss(error), inputs_lost=True)
         except ray.exceptions.RayError as error:
-            return self._give_up(reference, describe_loss(error))
+            return self._drop_worker(reference, describe_loss(error))
         running = self._running.pop(reference)
-        ended = zip(running.ranks, reports, running.values, strict=True)
-        return CallFinished(running.worker, tuple(JobResult(rank, report, value) for rank, report, value in ended))
+        results = zip(running.ranks, reports, running.values, strict=True)
+        return CallFinished(running.worker, tuple(JobResult(rank, report, value) for rank, report, value in results))
 
-    def _give_up(self, reference: Any, loss: str, inputs_lost: bool = False) -> WorkerLost:
-        """Forgets a worker, after making sure that it is dead: two at once would share one CPU and one scene."""
+    def _drop_worker(self, reference: Any, why: str, inputs_lost: bool = False) -> WorkerLost:
+        """Drop a worker after killing it: otherwise it could share a CPU and a scene with its successor."""
         running = self._running.pop(reference)
         ray.kill(self._actors.pop(running.worker))
-        return WorkerLost(running.worker, running.ranks, loss, inputs_lost)
+        return WorkerLost(running.worker, running.ranks, why, inputs_lost)
 
 
 def _group_pools(pools: Pools, used: Collection[str]) -> dict[str, str]:
-    """The pool of actors that runs the stages of each pool: those that ask for the same are one, `geometry+physics`."""
+    """Map each pool to its pool of actors: pools of equal needs share one, e.g. `geometry+physics`."""
     groups: dict[str, list[str]] = {}
     for name in (name for name in Pools.model_fields if name in used):
         groups.setdefault(getattr(pools, name).model_dump_json(), []).append(name)

@@ -1,4 +1,4 @@
-"""Builds as jobs of a Ray cluster: submitted under a fresh id, followed to their end, stopped."""
+"""Builds as jobs of a Ray cluster: submit, follow, stop."""
 
 import asyncio
 import logging
@@ -18,29 +18,29 @@ from workers.executors.ray_address import name_address_source, reject_secrets
 from workers.sandbox.error_text import sanitize_error_text
 
 OUT_KEY = "tableverse_out"
-"""Name in a job's metadata under which its OUT stands."""
+"""Key of OUT in a job's metadata."""
 ADDRESS_HINT = "the head's port for jobs, e.g. http://head:8265"
 STOPPED_CODE = 143
 STOP_TIMEOUT_S = 60.0
 UNREACHABLE_S = 300.0
-"""As long may the cluster be out of reach while a job is followed."""
+"""Longest outage of the cluster while a job is followed [s]."""
 _POLL_S = 1.0
 _MAX_TRIES = 20
 _SLUG_CHARS = 40
 
 
 class JobServer:
-    """The jobs of one cluster, asked through the HTTP port of its head."""
+    """Client of the jobs of one cluster, through the HTTP port of its head."""
 
     def __init__(self, address: str) -> None:
-        """Knocks at `address`, e.g. `http://head:8265`.
+        """Connect to `address`, e.g. `http://head:8265`.
 
         Raises:
             BuildError: if Ray's job client is not installed, or the cluster does not answer or wants another token.
         """
         self.address = _parse_url(address)
         try:
-            with self._asking():
+            with self._translate_errors():
                 self._client = _make_client(self.address)
         except BuildError as error:
             if not isinstance(error.__cause__, ConnectionError):
@@ -48,17 +48,17 @@ class JobServer:
             raise BuildError(f"{error}; give {ADDRESS_HINT}") from error
 
     def submit(self, out: str, command: Sequence[str], runtime_env: Mapping[str, Any]) -> str:
-        """Submits a build of `out` and returns the job's id.
+        """Submit a build of `out`; returns the job's id.
 
         Raises:
             BuildError: if one is running already, or the cluster refuses it.
         """
-        if running := self.running(out):
+        if running := self.find_running(out):
             raise BuildError(
                 f"{out} is being built by job {running} on {self.address}: give --stop to end it, or follow it with "
                 f"ray job logs --follow --address {self.address} {running}"
             )
-        with self._asking():
+        with self._translate_errors():
             for _ in range(_MAX_TRIES):
                 job = make_job_id(out, (str(job.submission_id) for job in self._client.list_jobs()))
                 try:
@@ -71,90 +71,94 @@ class JobServer:
                         )
                     )
                 except RuntimeError as error:
-                    if "already exists" not in str(error):  # somebody else was as quick: take the next number
+                    if "already exists" not in str(error):  # taken meanwhile: try the next number
                         raise
         raise BuildError(f"no free job id for {out} on {self.address} after {_MAX_TRIES} tries")
 
-    def running(self, out: str) -> str | None:
-        """Id of the job that builds `out` now, or None."""
-        with self._asking():
+    def find_running(self, out: str) -> str | None:
+        """Find the id of the job that builds `out` now, or None."""
+        with self._translate_errors():
             jobs = self._client.list_jobs()
         alive = (job for job in jobs if (job.metadata or {}).get(OUT_KEY) == out and not job.status.is_terminal())
         return next((str(job.submission_id) for job in alive), None)
 
     def follow(self, job: str, write: Callable[[str], object]) -> int:
-        """Hands the job's log to `write` as it grows, until the job ends; returns the exit code of its command.
+        """Pass the job's log to `write` as it grows, until the job ends; returns the exit code of its command.
 
         Raises:
             BuildError: if the cluster is out of reach for longer than `UNREACHABLE_S`; the job may be running on.
         """
-        log, heard = IncrementalLog(write), time.monotonic()
+        log, last_answer = IncrementalLog(write), time.monotonic()
         while True:
             try:
                 asyncio.run(self._tail(job, log))
                 details = self._client.get_job_info(job)
-                heard = time.monotonic()
+                last_answer = time.monotonic()
             except (OSError, RuntimeError) as error:  # requests' and aiohttp's are among them
-                if time.monotonic() - heard > UNREACHABLE_S:
-                    raise BuildError(f"{self.address} cannot be reached any more: {sanitize_error_text(str(error))}") from error
+                if time.monotonic() - last_answer > UNREACHABLE_S:
+                    text = sanitize_error_text(str(error))
+                    raise BuildError(f"{self.address} cannot be reached any more: {text}") from error
             else:
                 if details.status.is_terminal():
                     return get_exit_code(str(details.status), details.driver_exit_code)
             time.sleep(_POLL_S)
 
     def stop(self, out: str) -> str | None:
-        """Stops the job that builds `out` and waits until it is over; its id, or None where there is none.
+        """Stop the job that builds `out` and wait for its end; returns its id, or None if there is none.
 
         Raises:
             BuildError: if it does not end.
         """
-        job = self.running(out)
+        job = self.find_running(out)
         if job is None:
             return None
-        with self._asking():
+        with self._translate_errors():
             self._client.stop_job(job)
             until = time.monotonic() + STOP_TIMEOUT_S
             while not self._client.get_job_info(job).status.is_terminal():
                 if time.monotonic() > until:
-                    raise BuildError(f"job {job} did not end within {STOP_TIMEOUT_S:g} s: look at it with `ray job status`")
+                    raise BuildError(
+                        f"job {job} did not end within {STOP_TIMEOUT_S:g} s: look at it with `ray job status`"
+                    )
                 time.sleep(_POLL_S / 4)
         return job
 
     async def _tail(self, job: str, log: "IncrementalLog") -> None:
         log.begin()
         async for text in self._client.tail_job_logs(job):
-            log.take(text)
+            log.write(text)
 
     @contextmanager
-    def _asking(self) -> Iterator[None]:
-        """Says in one line what went wrong between here and the cluster."""
+    def _translate_errors(self) -> Iterator[None]:
+        """Translate errors of the client into one line."""
         try:
             yield
         except (OSError, RuntimeError, ValueError) as error:
-            raise BuildError(f"the jobs of {self.address} cannot be used: {sanitize_error_text(str(error))[:600]}") from error
+            text = sanitize_error_text(str(error))[:600]
+            raise BuildError(f"the jobs of {self.address} cannot be used: {text}") from error
 
 
 class IncrementalLog:
-    """A log that Ray tells from its beginning at every new connection, written once."""
+    """Log that is written once, though Ray sends it from its beginning at every connection."""
 
     def __init__(self, write: Callable[[str], object]) -> None:
         self._write = write
-        self._written = self._heard = 0
+        self._written = self._received = 0
 
     def begin(self) -> None:
-        """A new connection."""
-        self._heard = 0
+        """Start a new connection."""
+        self._received = 0
 
-    def take(self, text: str) -> None:
-        """What it tells next; what was written before is not written again."""
-        self._heard += len(text)
-        if (new := self._heard - self._written) > 0:
+    def write(self, text: str) -> None:
+        """Write the part of `text` that was not written before."""
+        self._received += len(text)
+        if (new := self._received - self._written) > 0:
             self._write(text[-new:])
-            self._written = self._heard
+            self._written = self._received
 
 
 def make_job_id(out: str, taken: Iterable[str]) -> str:
-    """`tableverse-<out>-<n>`, n being one more than any that was taken: Ray refuses an id that was ever used."""
+    """Make an id `tableverse-<out>-<n>` with an unused n: Ray refuses an id that was ever used."""
     slug = re.sub(r"[^a-z0-9]+", "-", out.lower()).strip("-")[-_SLUG_CHARS:].strip("-")
     pattern = re.compile(rf"tableverse-{re.escape(slug)}-(\d+)")
     numbers = [int(match[1]) for job in taken if (match := pattern.fullmatch(job))]
@@ -162,7 +166,7 @@ def make_job_id(out: str, taken: Iterable[str]) -> str:
 
 
 def get_exit_code(status: str, code: int | None) -> int:
-    """The exit code to end with for a job that ended so."""
+    """Return the exit code for the status of a finished job."""
     if status == "SUCCEEDED":
         return 0
     if status == "STOPPED":
@@ -173,16 +177,16 @@ def get_exit_code(status: str, code: int | None) -> int:
 
 
 def _parse_url(address: str) -> str:
-    named = name_address_source(address, "RAY_API_SERVER_ADDRESS")
-    reject_secrets(address, named, ADDRESS_HINT)
+    source = name_address_source(address, "RAY_API_SERVER_ADDRESS")
+    reject_secrets(address, source, ADDRESS_HINT)
     url = address if "://" in address else f"http://{address}"
     if not re.fullmatch(r"https?://[^/\s]+(/[^\s]*)?", url):
-        raise BuildError(f"{named} {redact_uri(address)}: give {ADDRESS_HINT}")
+        raise BuildError(f"{source} {redact_uri(address)}: give {ADDRESS_HINT}")
     return url.rstrip("/")
 
 
 def _make_client(address: str) -> Any:
-    """Ray's client. It reads the address and the token from the environment before anything that it is told."""
+    """Create Ray's client, which prefers the address and token of the environment to its arguments."""
     if find_spec("aiohttp") is None:
         raise BuildError("submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'")
     os.environ["RAY_API_SERVER_ADDRESS"] = address
@@ -202,5 +206,5 @@ def _make_client(address: str) -> Any:
 
 
 def _has_token() -> bool:
-    named = os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH")
-    return bool(named) or (Path.home() / ".ray" / "auth_token").is_file()
+    token = os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH")
+    return bool(token) or (Path.home() / ".ray" / "auth_token").is_file()

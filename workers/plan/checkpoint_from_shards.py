@@ -1,4 +1,4 @@
-"""What a stage that adds to exported scenes takes as its input, where no record of them was kept."""
+"""Checkpoints of exported scenes, made from their shards for the stages that add to them."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +18,7 @@ from workers.state.journal import find_journals, read_journal, read_result
 from workers.state.ledger import WORK, journal_path
 
 _N_THREADS = 8
-"""Writes into a store, each of which mostly waits for an answer."""
+"""Threads for writes into a store, which mostly wait for answers."""
 
 Fingerprints = Mapping[str, Mapping[str, str]]
 
@@ -26,16 +26,16 @@ Fingerprints = Mapping[str, Mapping[str, str]]
 def checkpoint_exported_scenes(
     out: StoragePath, plan: Plan, rows: Sequence[ImageRow], fingerprints: Fingerprints, scene_ids: Collection[str]
 ) -> None:
-    """Writes a record of what was exported for each of these done scenes: what is in a shard is named, not copied.
+    """Write a checkpoint of the exported scene for each of these done scenes: one in a shard is named, not copied.
 
-    It comes before they are taken back, so a kill in between only leaves records that are right.
+    This precedes the invalidation of the scenes, so a kill in between only leaves valid checkpoints.
 
     Args:
-        out: The dataset, locked; what was ready is published.
+        out: The dataset, locked and with ready shards published.
         plan: Of the build.
         rows: Of the manifest, in the plan's order.
         fingerprints: Of the stages of each kind of row, by its value.
-        scene_ids: Whose ending counts now and is `done`.
+        scene_ids: Scenes that are done.
 
     Raises:
         BuildError: if the disk or the store refuses.
@@ -57,12 +57,12 @@ def checkpoint_exported_scenes(
 
 
 def _write_tombstone(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:
-    """Says that the scene's shard holds what the record would."""
+    """Write a checkpoint that refers to the scene in its shard."""
     records.write(names[scene_id], TOMBSTONE_PREFIX + scene_id.encode())
 
 
 def _read_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
-    """Done scenes whose newest result is not in a shard yet, as they were exported."""
+    """Read done scenes whose latest result is not in a shard yet."""
     journal = journal_path(out, shard)
     for scene_id, entry in read_journal(journal).results.items():
         exported = read_result(journal, entry).exported if scene_id in scene_ids else None

@@ -1,4 +1,4 @@
-"""Taking scenes back, so that the next build computes them again and writes their shards anew."""
+"""Invalidation of scenes: the next build computes them again and rewrites their shards."""
 
 import os
 from collections.abc import Collection
@@ -14,10 +14,10 @@ from workers.state.lock import LOCK, create_writer_lock
 
 
 def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
-    """Takes scenes back; the committed shards stay as they are until the next build has all of their scenes again.
+    """Reopen scenes; their committed shards stay until the next build has all of their scenes again.
 
     Returns:
-        How many shards the next build will write.
+        Number of shards that the next build will write.
 
     Raises:
         BuildError: if there is no build, or another process is writing it.
@@ -28,7 +28,7 @@ def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
 
 
 def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) -> int:
-    """The same, for one who holds the lock and has published what is ready; survives a loss of power too.
+    """Invalidate scenes of a locked dataset whose ready shards are published; survives a loss of power.
 
     Raises:
         BuildError: if the disk refuses.
@@ -47,7 +47,7 @@ def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) 
 
 
 def _sync_journal(journal: StoragePath) -> None:
-    """Puts a journal on the disk for good: run.json, which is there at once, must not outlive what was taken back."""
+    """Flush a journal to the disk before run.json is written: a power loss must not keep only the latter."""
     if isinstance(journal, UPath):
         return
     try:

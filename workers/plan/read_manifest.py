@@ -1,4 +1,4 @@
-"""The image manifest as rows that can be planned: one row each, whatever stands in it, ids unique."""
+"""Reader of the image manifest: one valid row for each of its rows, with unique ids."""
 
 import hashlib
 import json
@@ -20,10 +20,10 @@ _MAX_TEXT = 500
 
 
 def read_manifest(path: StoragePath) -> list[ImageRow]:
-    """The manifest's rows in their order; columns that are not ours are left alone.
+    """Read the manifest's rows in their order; other columns are ignored.
 
-    A row that is no valid `ImageRow` enters as a rejected one under an id of its own (`invalid-…`), and so does a row
-    whose id stands before it already (`duplicate-…`): both end in the dataset as dropped, at stage `manifest`.
+    An invalid row becomes a rejected one with an id of its own (`invalid-…`), as does a row with a repeated id
+    (`duplicate-…`): both are dropped in the dataset at stage `manifest`.
 
     Raises:
         InputError: if the file is no Parquet file or lacks a column.

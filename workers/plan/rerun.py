@@ -1,4 +1,4 @@
-"""Computing again from a stage on: what a change of the configuration touches, and taking back what came of it."""
+"""Recomputation from a stage on: stages that a change of the configuration affects, and the scenes to recompute."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -15,142 +15,145 @@ from workers.state.checkpoint_store import CheckpointStore
 from workers.state.ledger import WORK
 
 MARKER = "again.json"
-"""In the folder of the work, from when all is taken back until the build is complete: which stage, which build."""
+"""File in the work folder that names the stage and the build, from the invalidation until the build is complete."""
 
 _STAGE_PLACEHOLDER = "STAGE"
 
 
-def find_first_affected_stage(line: Sequence[Stage], differing: Collection[str]) -> int | None:
-    """Position of the first stage of a line for which these keys of run.json make a difference.
+def find_first_affected_stage(stages: Sequence[Stage], differing: Collection[str]) -> int | None:
+    """Find the position of the first stage that differing keys of run.json affect.
 
     Args:
-        line: The stages.
+        stages: Of a pipeline.
         differing: Dotted keys, such as `config.settle.max_time_s`.
 
     Returns:
-        The position; the line's length where it makes none; None where it is not for a stage to say: another seed,
-        another manifest or other versions make another dataset. Of our own code only its user can say what it touches.
+        The position; the number of stages if none is affected; None if the whole dataset is: by another seed, manifest
+        or version of a package. Our own code counts as affecting none: its user decides.
     """
-    touched = [len(line)]
+    affected = [len(stages)]
     for key in differing:
-        readers = _find_readers(line, key)
+        readers = _find_readers(stages, key)
         if readers is None:
             return None
-        touched += readers
-    return min(touched)
+        affected += readers
+    return min(affected)
 
 
-def _find_readers(line: Sequence[Stage], key: str) -> list[int] | None:
-    """Positions of the stages that read the value at `key`; None where it concerns the build as a whole."""
+def _find_readers(stages: Sequence[Stage], key: str) -> list[int] | None:
+    """Find the positions of the stages that read the value at `key`; None if it affects the whole build."""
     if key == CODE:
         return []
     top, _, rest = key.partition(".")
     if top == AFTERWARDS:
-        return [position for position, stage in enumerate(line) if stage.is_post_export]
+        return [position for position, stage in enumerate(stages) if stage.is_post_export]
     if top in (parts := map_parts_to_stages()):
-        return [position for position, stage in enumerate(line) if stage.name == parts[top]]
+        return [position for position, stage in enumerate(stages) if stage.name == parts[top]]
     section, _, name = rest.partition(".")
     if top != "config" or section == "run":
         return None
     if name == "deadline_s":
-        return [position for position, stage in enumerate(line) if stage.section == section]
-    return [position for position, stage in enumerate(line) if {section, rest} & set(stage.reads)]
+        return [position for position, stage in enumerate(stages) if stage.section == section]
+    return [position for position, stage in enumerate(stages) if {section, rest} & set(stage.reads)]
 
 
-def find_restart_points(lines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
-    """Where each kind of line begins again, for `--from SECTION`.
+def find_restart_points(pipelines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
+    """Find the first stage to recompute of each kind of scene, for `--from SECTION`.
 
     Raises:
-        BuildError: if no stage has this name, with those that there are.
+        BuildError: if no stage has this name.
     """
-    used = {kind.value: line for kind, line in lines.items() if kind.value in kinds}
-    points = {kind: _find_position(line, section) for kind, line in used.items()}
-    if lacking := [kind for kind, position in points.items() if position is None]:
-        known = dict.fromkeys(stage.section for kind in lacking for stage in used[kind])
-        raise BuildError(f"--from {section[:80]!r}: no such stage for a {lacking[0]}; there are {', '.join(known)}")
+    used = {kind.value: stages for kind, stages in pipelines.items() if kind.value in kinds}
+    points = {kind: _find_position(stages, section) for kind, stages in used.items()}
+    if missing := [kind for kind, position in points.items() if position is None]:
+        known = dict.fromkeys(stage.section for kind in missing for stage in used[kind])
+        raise BuildError(f"--from {section[:80]!r}: no such stage for a {missing[0]}; there are {', '.join(known)}")
     return {kind: position for kind, position in points.items() if position is not None}
 
 
-def _find_position(line: Sequence[Stage], section: str) -> int | None:
-    return next((position for position, stage in enumerate(line) if section in (stage.section, stage.name)), None)
+def _find_position(stages: Sequence[Stage], section: str) -> int | None:
+    return next((position for position, stage in enumerate(stages) if section in (stage.section, stage.name)), None)
 
 
-def is_append_only(lines: Pipelines, points: Mapping[str, int]) -> bool:
-    """Whether all lines begin again at a stage that adds to exported scenes, so that those at rest are its input."""
-    return all(line[points[kind.value]].is_post_export for kind, line in lines.items() if kind.value in points)
+def is_append_only(pipelines: Pipelines, points: Mapping[str, int]) -> bool:
+    """Whether all pipelines restart at a stage that adds to exported scenes, which are then its input."""
+    return all(stages[points[kind.value]].is_post_export for kind, stages in pipelines.items() if kind.value in points)
 
 
-def suggest_restart_stage(lines: Pipelines, kinds: Collection[str], differing: Collection[str]) -> str:
-    """The stage to begin again from, for differences that have one; any, where only code differs; else nothing."""
+def suggest_restart_stage(pipelines: Pipelines, kinds: Collection[str], differing: Collection[str]) -> str:
+    """Suggest the stage to restart from; a placeholder if only code differs, nothing if no restart helps."""
     firsts = []
-    for kind, line in lines.items():
+    for kind, stages in pipelines.items():
         if kind.value in kinds:
-            position = find_first_affected_stage(line, differing)
+            position = find_first_affected_stage(stages, differing)
             if position is None:
                 return ""
-            firsts.append((len(line) - position, line[position].section if position < len(line) else ""))
+            firsts.append((len(stages) - position, stages[position].section if position < len(stages) else ""))
     earliest = max(firsts)[1] if firsts else ""
     return earliest or (_STAGE_PLACEHOLDER if CODE in differing else "")
 
 
 def check_upstream_unchanged(
-    lines: Pipelines, points: Mapping[str, int], differing: Collection[str], section: str, suggestion: str
+    pipelines: Pipelines, points: Mapping[str, int], differing: Collection[str], section: str, suggestion: str
 ) -> None:
-    """Refuses to keep what a change of the configuration has touched.
+    """Refuse to keep outputs of stages that a change of the configuration affects.
 
     Args:
-        lines: The stages of each kind.
-        points: Where each kind begins again.
+        pipelines: Stages of each kind of scene.
+        points: First stage to recompute, by kind.
         differing: Keys of run.json that differ.
-        section: What was asked for.
-        suggestion: The earliest stage that is touched; empty where it is not for a stage to say.
+        section: Argument of `--from`.
+        suggestion: Earliest affected stage; empty if the whole build is affected.
 
     Raises:
-        BuildError: naming what differs and the stage that reads it.
+        BuildError: naming the difference and the stage that reads it.
     """
-    for kind, line in lines.items():
+    for kind, stages in pipelines.items():
         if kind.value not in points:
             continue
-        position = find_first_affected_stage(line, differing)
+        position = find_first_affected_stage(stages, differing)
         if position is None:
             raise BuildError(
                 f"{', '.join(sorted(differing)[:4])} changed, which no --from can make good: give another OUT"
             )
         if position < points[kind.value]:
             raise BuildError(
-                f"{', '.join(sorted(differing)[:4])} changed, which {line[position].name} reads already: "
+                f"{', '.join(sorted(differing)[:4])} changed, which {stages[position].name} reads already: "
                 f"give --from {suggestion} instead of --from {section}, or another OUT"
             )
 
 
 def list_scenes_to_recompute(
-    plan: Plan, lines: Pipelines, points: Mapping[str, int], endings: Sequence[SceneStatus]
+    plan: Plan, pipelines: Pipelines, points: Mapping[str, int], scenes: Sequence[SceneStatus]
 ) -> list[str]:
-    """Ids of the scenes that ended at one of the stages that are computed again, or at the end of a shorter line."""
+    """List the ids of the scenes that are done, or ended at one of the stages to recompute."""
     kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))
-    again = {
-        kind.value: {stage.name for stage in line[points[kind.value] :]}
-        for kind, line in lines.items()
+    recomputed = {
+        kind.value: {stage.name for stage in stages[points[kind.value] :]}
+        for kind, stages in pipelines.items()
         if kind.value in points
     }
     return [
-        ending.scene_id
-        for ending in endings
-        if ending.status == "done" or ending.stage in again[kind_of[ending.scene_id]]
+        scene.scene_id
+        for scene in scenes
+        if scene.status == "done" or scene.stage in recomputed[kind_of[scene.scene_id]]
     ]
 
 
-def delete_checkpoints(records: CheckpointStore, plan: Plan, lines: Pipelines, points: Mapping[str, int]) -> None:
-    """Removes what the stages that are computed again gave before."""
+def delete_checkpoints(records: CheckpointStore, plan: Plan, pipelines: Pipelines, points: Mapping[str, int]) -> None:
+    """Delete the checkpoints of the stages to recompute."""
     stages = {
-        stage.name for kind, line in lines.items() if kind.value in points for stage in line[points[kind.value] :]
+        stage.name
+        for kind, stages in pipelines.items()
+        if kind.value in points
+        for stage in stages[points[kind.value] :]
     }
     for shard in range(plan.n_shards):
         records.delete(shard, stages)
 
 
 def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]) -> None:
-    """Writes down that all is taken back and run.json is this: the same command goes on from here.
+    """Write the marker that the scenes are invalidated for this run.json: the same command resumes from here.
 
     Raises:
         BuildError: if the disk or the store refuses.
@@ -159,7 +162,7 @@ def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]
 
 
 def is_rerun_under_way(out: StoragePath, section: str, record: Mapping[str, Any]) -> bool:
-    """Whether this very beginning again was marked, and no other came after it."""
+    """Whether this recomputation was started and no other came after it."""
     try:
         return read_whole(out / WORK / MARKER) == _encode_marker(section, record)
     except FileNotFoundError:
@@ -167,17 +170,17 @@ def is_rerun_under_way(out: StoragePath, section: str, record: Mapping[str, Any]
 
 
 def read_rerun_stage(out: StoragePath) -> str:
-    """The stage from which on a build is computed again; empty where none is under way."""
+    """Read the first stage of the recomputation under way; empty if there is none."""
     try:
         return str(json.loads(read_whole(out / WORK / MARKER))["from"])
     except FileNotFoundError:
         return ""
     except (ValueError, KeyError, TypeError) as error:
-        raise BuildError(f"{out / WORK / MARKER} is damaged; the command that was begun last writes it anew") from error
+        raise BuildError(f"{out / WORK / MARKER} is damaged; repeat the last command to write it anew") from error
 
 
 def clear_rerun_marker(out: StoragePath) -> None:
-    """Comes before anything is taken back: a mark never stands beside another run.json, or scenes half taken back.
+    """Delete the marker before scenes are invalidated, so that it never belongs to another run.json.
 
     Raises:
         BuildError: if the disk or the store refuses.

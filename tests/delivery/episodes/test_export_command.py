@@ -20,10 +20,10 @@ def test_both_formats_are_written_and_counted(run, out, tmp_path):
     assert (code, said) == (0, f"3 demonstrations, 103 samples, in {tmp_path / 'made.hdf5'}\n")
 
 
-def test_an_error_is_one_line(run, out, tmp_path):
+def test_an_error_is_a_line_with_a_link(run, out, tmp_path):
     code, said, error = run("export", "lerobot", out, tmp_path)
     assert (code, said) == (1, "")
-    assert error == f"error: {tmp_path}: already there; give a new name\n"
+    assert error.startswith(f"error: {tmp_path}: already there; give a new name\nhelp: ")
 
 
 def test_the_group_is_one_command_of_tableverse():

@@ -77,20 +77,20 @@ def test_a_meter_counts_what_answers_cost_and_what_was_spent_apart():
     noted = []
     meter = Meter(noted.append)
     meter.allow(Allowance(calls=2, usd=0.5))
-    meter.remember(ModelCost(1, 900, 40, 0.25))
+    meter.add_cached(ModelCost(1, 900, 40, 0.25))
     assert (meter.cost, meter.paid) == (ModelCost(1, 900, 40, 0.25), NO_COST)
-    meter.ask()
-    meter.answered(ModelCost(0, 10, 5, 0.5))
+    meter.add_request()
+    meter.add_tokens(ModelCost(0, 10, 5, 0.5))
     assert meter.cost == ModelCost(2, 910, 45, 0.75)
     assert meter.paid == sum(noted, NO_COST) == ModelCost(1, 10, 5, 0.5)
     with pytest.raises(BudgetSpentError):  # a request is left, but no money
-        meter.ask()
+        meter.add_request()
     meter.reset()
     with pytest.raises(BudgetSpentError):
-        meter.ask()
+        meter.add_request()
     meter.allow(UNLIMITED)
     for _ in range(MOST_CALLS):
-        meter.ask()
+        meter.add_request()
 
 
 def test_what_processes_wrote_down_adds_up_and_an_entry_that_was_cut_off_counts_for_nothing(tmp_path):
@@ -129,7 +129,7 @@ def test_nothing_is_spent_that_cannot_be_written_down(tmp_path):
     (tmp_path / ".spent").write_text("a file in the way")
     meter = Meter(CostLog(tmp_path).add)
     with pytest.raises(ModelAccessError, match="what is spent cannot be written down in"):
-        meter.ask()
+        meter.add_request()
     assert meter.paid == NO_COST
 
 

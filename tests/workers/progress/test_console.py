@@ -112,5 +112,5 @@ def test_watching_ends_with_the_build_and_ctrl_c_is_clean(tmp_path):
 
     gone = subprocess.run([*TABLEVERSE, "status", str(tmp_path), "--watch"], capture_output=True, text=True)
     assert gone.returncode == 1
-    assert re.fullmatch(r"error: [^\n]+holds no build[^\n]+\n", gone.stderr)
+    assert re.fullmatch(r"error: [^\n]+holds no build[^\n]+\nhelp: docs/troubleshooting\.md#[^\n]+\n", gone.stderr)
     assert subprocess.run([*TABLEVERSE, "status", out, "--watch", "--json"], capture_output=True).returncode == 2

@@ -1,0 +1,170 @@
+"""In-memory executor that plays a script, and the parts of a build around a driver: no process, no Ray, no shards."""
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from schemas.config import Config
+from schemas.manifest import ImageRow, SceneKind
+from schemas.outcome import Dropped, Failed, ModelCost
+from schemas.work import SceneResult, StageChainReport, StageReport
+from tableverse_factory.stage import Stage
+from tests.helpers.builds import Silent
+from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
+from workers.driver.driver import Driver
+from workers.driver.job_spec import BuildSpec
+from workers.executors.protocol import CallFinished, Event, Job, JobResult, WorkerLost, WorkerReady
+from workers.executors.schedule import PoolLimits, ScheduleLimits
+from workers.progress.tally import Tally
+from workers.state.checkpoint_store import CheckpointStore
+
+LOSE_WORKER, LOSE_INPUT = "lose worker", "lose input"
+Action = Dropped | Failed | ModelCost | str
+"""Outcome of a stage; a cost for one that is done; or a loss."""
+
+STAGES = (
+    Stage("look", "perception", lambda *_: None, reads=("observe",)),
+    Stage("settle", "physics", lambda *_: None, reads=("settle",)),
+    Stage("judge", "curation", lambda *_: None, reads=("curate",)),
+    Stage("pack", "curation", lambda *_: None, reads=("export",)),
+)
+
+
+def make_rows(n: int, **changes: object) -> list[ImageRow]:
+    return [ImageRow(scene_id=f"s{i}", kind="capture", uri=f"/data/{i}", name="n", **changes) for i in range(n)]
+
+
+def make_spec(
+    folder: Path,
+    rows: Sequence[ImageRow],
+    stages: Sequence[Stage] = STAGES,
+    config: Config | None = None,
+    *,
+    keep: bool = True,
+    added_only: bool = False,
+) -> BuildSpec:
+    return BuildSpec(
+        rows=rows,
+        pipelines={SceneKind.CAPTURE: stages},
+        config=config or Config(),
+        fingerprints={SceneKind.CAPTURE: {stage.name: "f" for stage in stages}},
+        records_dir=folder / ".stages",
+        keep=keep,
+        todo=range(len(rows)),
+        added_only=added_only,
+    )
+
+
+class FakeLedger:
+    """Results in memory; the only shard is whole when all scenes are recorded."""
+
+    committed = bytes_committed = 0
+
+    def __init__(self, n_scenes: int) -> None:
+        self._n_scenes = n_scenes
+        self.results: dict[str, SceneResult] = {}
+
+    def shard_of(self, scene_id: str) -> int:
+        return 0
+
+    def record(self, result: SceneResult) -> bool:
+        assert result.scene_id not in self.results, "a scene ends once"
+        self.results[result.scene_id] = result
+        return len(self.results) == self._n_scenes
+
+
+class FakeExecutor:
+    """Workers that exist by number only; every stage is done unless the script says otherwise.
+
+    Attributes:
+        runs: How often each stage ran, by (scene_id, position).
+    """
+
+    def __init__(
+        self, folder: Path, script: Mapping[tuple[str, int], Sequence[Action]] | None = None, workers: int = 1
+    ) -> None:
+        self._script = defaultdict(list, {key: list(actions) for key, actions in (script or {}).items()})
+        self._store = CheckpointStore(folder / ".stages")
+        self._events: list[Event] = []
+        self._started = 0
+        self.limits = ScheduleLimits({"all": PoolLimits({"CPU": 1.0}, batch=1)}, {"CPU": float(workers)})
+        self.runs: Counter[tuple[str, int]] = Counter()
+
+    def pool_of(self, stage_pool: str) -> str:
+        return "all"
+
+    def start(self, pool: str) -> int:
+        self._started += 1
+        self._events.append(WorkerReady(self._started))
+        return self._started
+
+    def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
+        results = []
+        for job in jobs:
+            result = self._run(job)
+            if result is None:
+                self._events.append(WorkerLost(worker, tuple(j.rank for j in jobs), "its node is gone"))
+                return
+            results.append(result)
+        self._events.append(CallFinished(worker, tuple(results)))
+
+    def wait(self, timeout_s: float) -> list[Event]:
+        events, self._events = self._events, []
+        return events
+
+    def retire(self, worker: int) -> None:
+        pass
+
+    def fetch(self, payload: bytes) -> bytes:
+        return payload
+
+    def close(self) -> None:
+        pass
+
+    def _run(self, job: Job) -> JobResult | None:
+        """Run the stages of a job; None if its worker is lost."""
+        reports: list[StageReport] = []
+        chain = job.chain
+        assert bool(chain.input_record) != bool(job.payload), "the input is a checkpoint or the payload"
+        for call, record in zip(chain.calls, chain.output_records, strict=True):
+            key = (call.scene_id, call.position)
+            self.runs[key] += 1
+            action = self._script[key].pop(0) if self._script[key] else None
+            if action == LOSE_WORKER:
+                return None
+            if action == LOSE_INPUT:
+                return JobResult(job.rank, StageChainReport(tuple(reports), input_lost=True), b"")
+            cost = action if isinstance(action, ModelCost) else ModelCost()
+            outcome = action if isinstance(action, Dropped | Failed) else None
+            attempts = 2 if isinstance(outcome, Failed) and outcome.error_kind == "crash" else 1
+            reports.append(StageReport(outcome, attempts, 0.1, 0.2, "trace" if outcome else "", cost, cost))
+            if outcome is not None:
+                return JobResult(job.rank, StageChainReport(tuple(reports)), b"")
+            if record:
+                self._store.write(record, b"output")
+        return JobResult(job.rank, StageChainReport(tuple(reports)), b"output")
+
+
+class FakeBuild:
+    """A driver on a fake executor, with everything that it writes."""
+
+    def __init__(
+        self,
+        folder: Path,
+        rows: Sequence[ImageRow],
+        script: Mapping[tuple[str, int], Sequence[Action]] | None = None,
+        limits: SpendingLimits = NO_LIMITS,
+        config: Config | None = None,
+        workers: int = 1,
+    ) -> None:
+        self.spec = make_spec(folder, rows, config=config)
+        self.ledger = FakeLedger(len(rows))
+        self.executor = FakeExecutor(folder, script, workers)
+        self.budget: Budget = resume_budget(limits, {})
+        self.tally = Tally(("manifest", *(stage.name for stage in STAGES)), len(rows), 0, 1)
+        self.display = Silent()
+        self.driver = Driver(self.spec, self.ledger, self.executor, self.budget, self.tally, self.display)
+
+    def run(self, check=lambda: None) -> dict[str, SceneResult]:
+        self.driver.run(check)
+        return self.ledger.results
