@@ -11,6 +11,9 @@ MAX_REDIRECTS = 5
 _MAX_CHARS = 8 * MAX_URI_CHARS  # signed addresses are long
 
 _PORTS = {"http": 80, "https": 443}
+_NAT64 = ipaddress.ip_network("64:ff9b::/96")
+_METADATA_HOSTS = frozenset({ipaddress.ip_address("168.63.129.16")})
+"""Public by number, yet answered by the host of a virtual machine (Azure)."""
 
 
 def resolve_redirect(first: str, here: str, location: str) -> str:
@@ -58,8 +61,8 @@ def check_peer(first: str, here: str, home: str, peer: str) -> None:
     Raises:
         StoreError: if it is in another kind of network than `home`, and not in the open one.
     """
-    kind = _classify_address(peer)
-    if kind not in ("public", _classify_address(home)):
+    kind = classify_address(peer)
+    if kind not in ("public", classify_address(home)):
         raise StoreError(f"{redact_uri(first)}: redirected to {redact_uri(here)}, a {kind} address")
 
 
@@ -83,17 +86,24 @@ def find_networks(address: str) -> frozenset[str]:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return frozenset({"public"})
-    return frozenset(_classify_address(str(entry[4][0])) for entry in found)
+    return frozenset(classify_address(str(entry[4][0])) for entry in found)
 
 
-def _classify_address(text: str) -> str:
+def classify_address(text: str) -> str:
+    """Classify an address as `public`, `private`, `loopback`, `link-local` or `special`; by the IPv4 one it may wrap."""
     address = ipaddress.ip_address(text.partition("%")[0])
-    if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
-        address = address.ipv4_mapped
+    if isinstance(address, ipaddress.IPv6Address):
+        inner = address.ipv4_mapped or address.sixtofour
+        if inner is None and address in _NAT64:
+            inner = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+        if inner is not None:
+            return classify_address(str(inner))
+        if address.is_site_local:
+            return "private"
     if address.is_loopback:
         return "loopback"
     if address.is_link_local:
         return "link-local"
-    if address.is_multicast or address.is_reserved or address.is_unspecified:
+    if address.is_multicast or address.is_reserved or address.is_unspecified or address in _METADATA_HOSTS:
         return "special"
     return "public" if address.is_global else "private"

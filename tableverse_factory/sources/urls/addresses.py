@@ -1,7 +1,6 @@
 """Checks on addresses that may be fetched: http and https, no secrets, no hosts of this machine's network."""
 
 import asyncio
-import ipaddress
 import socket
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,18 +9,12 @@ import httpcore
 import httpx
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.http_redirects import classify_address
 from tableverse_factory.core.text import sanitize_line
 
 MAX_URL_CHARS = 4096
 MAX_PORT = 65535
 _MAX_ADDRESSES = 4
-
-_METADATA_HOSTS = frozenset({ipaddress.ip_address("168.63.129.16")})
-"""Public by their number, yet answered by the host of a virtual machine (Azure)."""
-
-_NAT64 = ipaddress.ip_network("64:ff9b::/96")
-
-Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 def parse_url(text: str) -> httpx.URL:
@@ -53,20 +46,6 @@ def redact_url(text: str) -> str:
         # Nobody can say where a password ends in what is no address.
         return sanitize_line(text.partition("?")[0].partition("#")[0].rpartition("@")[2], 200)
     return sanitize_line(str(url), MAX_URL_CHARS)
-
-
-def is_public(address: Address) -> bool:
-    """Check whether an address belongs to the internet, also where it wraps an IPv4 one."""
-    if isinstance(address, ipaddress.IPv6Address):
-        inner = address.ipv4_mapped or address.sixtofour
-        if inner is None and address in _NAT64:
-            inner = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
-        if inner is not None:
-            return is_public(inner)
-        if address.is_site_local:
-            return False
-    hidden = address.is_multicast or address.is_reserved or address in _METADATA_HOSTS
-    return address.is_global and not hidden
 
 
 class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
@@ -115,7 +94,7 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
         addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
         if not self._allow_private:
             for address in addresses:
-                if not is_public(ipaddress.ip_address(address)):
+                if classify_address(address) != "public":
                     named = sanitize_line(host) if host == address else f"{sanitize_line(host)} is {address}, which"
                     raise InputError(
                         f"{named} is no address of the internet: --allow-private lets lists reach into this network",

@@ -427,5 +427,5 @@ def test_an_address_that_is_none_is_said_without_its_secrets(address):
 def test_nothing_there_and_nobody_there_are_said(server, run):
     for place, said in ((f"{server.address}/nowhere", "no such folder"), ("http://127.0.0.1:9/x", "no answer (")):
         code, _, errors = run("query", place)
-        assert (code, errors.count("\n")) == (1, 1)
+        assert (code, errors.count("\n")) == (1, 2)
         assert said in errors
