@@ -1,4 +1,4 @@
-"""What a stage may lean on besides its input: the models behind their doors, and the cache of convex pieces."""
+"""Services that stages use besides their input: access to models, and the cache folder."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,12 +9,12 @@ from tableverse_factory.models.remote.cost_meter import Meter
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Made once per process, before the first item; results never depend on what is in a cache.
+    """Services of one process, made before the first item; results never depend on the content of a cache.
 
     Attributes:
         cache_dir: Content-addressed cache on this machine, shared by processes; safe to delete at any time.
-        asking: How fast models behind an address are asked.
-        meter: Counts what that costs.
+        asking: Rate limits of requests to remote models.
+        meter: Meter of their cost.
     """
 
     cache_dir: Path

@@ -7,7 +7,7 @@ from schemas.outcome import Done, Dropped
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.remote.client import ModelClient
-from tableverse_factory.models.remote.endpoint import endpoint_of
+from tableverse_factory.models.remote.endpoint import read_endpoint
 from tableverse_factory.stage import Stage
 
 SCHEMA = {"type": "object", "properties": {"a": {"type": "integer"}}, "required": ["a"], "additionalProperties": False}
@@ -38,7 +38,7 @@ def _asked(stage, item, section, services):
     if not section.protocol:
         return Done({**item, stage: 0})
     try:
-        answer = ModelClient(endpoint_of(section), services).ask(f"{stage} {item['name']}", [], SCHEMA)
+        answer = ModelClient(read_endpoint(section), services).ask(f"{stage} {item['name']}", [], SCHEMA)
     except AnswerInvalidError as error:
         return Dropped(error.reason, str(error))
     return Done({**item, stage: answer["a"]})
@@ -50,4 +50,4 @@ _STAGES = (
     Stage("curate", "curation", judge, reads=("curate",)),
     Stage("export", "physics", pack, reads=("export",)),
 )
-LINES = {SceneKind.CAPTURE: _STAGES, SceneKind.IMAGE: _STAGES, SceneKind.LAYOUT: _STAGES}
+PIPELINES = {SceneKind.CAPTURE: _STAGES, SceneKind.IMAGE: _STAGES, SceneKind.LAYOUT: _STAGES}

@@ -9,19 +9,19 @@ from typing import Any, Protocol
 from schemas.config import CurateConfig
 from tableverse_factory.core.errors import AnswerInvalidError, ConfigError
 from tableverse_factory.core.storage.files import write_atomic
-from tableverse_factory.evaluation.methods.grid import letters
+from tableverse_factory.evaluation.methods.grid import make_letters
 from tableverse_factory.evaluation.methods.methods import MAX_METHODS
 from tableverse_factory.evaluation.methods.vlm_vote import (
     Question,
     Vote,
-    answer_schema,
-    checked_answer,
-    counted,
-    prompt,
-    read_answer,
+    build_vote_prompt,
+    build_vote_schema,
+    make_vote,
+    parse_vote,
+    validate_vote,
 )
 from tableverse_factory.models.remote.client import ModelClient
-from tableverse_factory.models.remote.endpoint import endpoint_of
+from tableverse_factory.models.remote.endpoint import read_endpoint
 from tableverse_factory.models.services import Services
 
 MAX_RECORD_BYTES = 1_000_000
@@ -43,7 +43,7 @@ class GridJudge(Protocol):
         ...
 
 
-class AskedJudge:
+class ModelGridJudge:
     """A model: the grid and the prompt go out, the marks come back, invalid ones once more with the reason."""
 
     def __init__(self, client: ModelClient) -> None:
@@ -53,12 +53,12 @@ class AskedJudge:
         """See `GridJudge`."""
         count = len(question.columns)
         reply = self._client.ask_for(
-            lambda text: read_answer(text, count), prompt(count), [grid()], answer_schema(count)
+            lambda text: parse_vote(text, count), build_vote_prompt(count), [grid()], build_vote_schema(count)
         )
-        return counted(question, reply.value)
+        return make_vote(question, reply.value)
 
 
-class ReplayedJudge:
+class ReplayedGridJudge:
     """Ballots as `record` wrote them: `<scene>-<round>.json` in a folder."""
 
     def __init__(self, folder: Path) -> None:
@@ -66,27 +66,27 @@ class ReplayedJudge:
 
     def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:  # noqa: ARG002
         """See `GridJudge`; the marks go to the methods that stood in the columns when the answer was recorded."""
-        value = _record_at(self._folder / f"{question.name}.json")
+        value = _read_record(self._folder / f"{question.name}.json")
         columns = value.get("columns")
         if not isinstance(columns, list) or sorted(map(str, columns)) != sorted(question.columns):
             raise AnswerInvalidError(f"columns {columns!r:.200} are not the methods {', '.join(question.columns)}")
         shown = Question(question.scene, question.round, tuple(map(str, columns)))
-        return counted(shown, checked_answer(value.get("answer"), len(columns)))
+        return make_vote(shown, validate_vote(value.get("answer"), len(columns)))
 
 
-def record(ballot: Vote, folder: Path) -> None:
-    """Keeps a ballot for `ReplayedJudge`."""
+def record_vote(ballot: Vote, folder: Path) -> None:
+    """Keeps a ballot for `ReplayedGridJudge`."""
     question = Question(ballot.scene, ballot.round, ballot.columns)
     marks = [ballot.marks[method].model_dump() for method in ballot.columns]
-    columns = dict(zip(letters(len(marks)), marks, strict=True))
+    columns = dict(zip(make_letters(len(marks)), marks, strict=True))
     text = json.dumps({"columns": list(ballot.columns), "answer": {"columns": columns}}, indent=1)
     write_atomic(folder / f"{question.name}.json", f"{text}\n".encode())
 
 
-def recorded_questions(folder: Path, most: int) -> tuple[int, frozenset[str]]:
+def summarize_recorded(folder: Path, most: int) -> tuple[int, frozenset[str]]:
     """How many rounds of answers lie in a folder, of `most`, and the methods that they name.
 
-    Files that are no answers name nobody: `ReplayedJudge` refuses them when they are asked for.
+    Files that are no answers name nobody: `ReplayedGridJudge` refuses them when they are asked for.
     """
     rounds, named = 0, set[str]()
     for path in sorted(folder.glob("*-[0-9]*.json")):
@@ -95,12 +95,12 @@ def recorded_questions(folder: Path, most: int) -> tuple[int, frozenset[str]]:
             continue
         rounds = max(rounds, int(number) + 1)
         with suppress(AnswerInvalidError):
-            columns = _record_at(path).get("columns")
+            columns = _read_record(path).get("columns")
             named |= set(map(str, columns)) if isinstance(columns, list) else set()
     return rounds, frozenset(named)
 
 
-def _record_at(path: Path) -> dict[str, Any]:
+def _read_record(path: Path) -> dict[str, Any]:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_RECORD_BYTES + 1)
@@ -115,7 +115,7 @@ def _record_at(path: Path) -> dict[str, Any]:
     return value
 
 
-def grid_judge(config: CurateConfig, services: Services) -> GridJudge:
+def make_grid_judge(config: CurateConfig, services: Services) -> GridJudge:
     """The judge that the section `curate` of a configuration names.
 
     Raises:
@@ -123,14 +123,14 @@ def grid_judge(config: CurateConfig, services: Services) -> GridJudge:
     """
     if config.judge == "replay":
         folder = Path(config.replay_dir)
-        if not recorded_questions(folder, MAX_METHODS)[1]:
+        if not summarize_recorded(folder, MAX_METHODS)[1]:
             what = "holds no answers" if folder.is_dir() else "is no folder"
             raise ConfigError(
                 f"curate.replay_dir: {folder} {what}; give the folder answers/ that `evaluate gpt-score` wrote"
             )
-        return ReplayedJudge(folder)
+        return ReplayedGridJudge(folder)
     if config.judge not in ("openai", "gemini"):
         raise ConfigError(
             f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
         )
-    return AskedJudge(ModelClient(endpoint_of(config), services))
+    return ModelGridJudge(ModelClient(read_endpoint(config), services))

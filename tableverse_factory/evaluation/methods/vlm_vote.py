@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, StrictInt, model_validator
 
 from tableverse_factory.core.errors import AnswerInvalidError, InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.methods.grid import letters
+from tableverse_factory.evaluation.methods.grid import make_letters
 from tableverse_factory.models.remote.json_schema import INTEGER, STRING, Schema, object_of
-from tableverse_factory.models.remote.json_text import json_object, validate_answer
+from tableverse_factory.models.remote.json_text import parse_json_object, validate_answer
 
 METRICS = ("layout_fidelity", "visual_quality", "geometry_quality", "rank")
 """What a method gets from each ballot: three scores from 1 to 10, and its place, 1 being the best."""
@@ -41,8 +41,10 @@ class GridAnswer(BaseModel):
     @model_validator(mode="after")
     def _complete(self) -> "GridAnswer":
         count = len(self.columns)
-        if sorted(self.columns) != list(letters(count)):
-            raise ValueError(f"columns {sorted(self.columns)!r:.100}: give each of {', '.join(letters(count))} once")
+        if sorted(self.columns) != list(make_letters(count)):
+            raise ValueError(
+                f"columns {sorted(self.columns)!r:.100}: give each of {', '.join(make_letters(count))} once"
+            )
         ranks = sorted(marks.rank for marks in self.columns.values())
         if ranks != list(range(1, count + 1)):
             raise ValueError(f"ranks {ranks!r:.100}: give each of 1 to {count} once")
@@ -83,7 +85,7 @@ class Vote:
     marks: Mapping[str, Marks]
 
 
-def questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> tuple[Question, ...]:
+def make_questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> tuple[Question, ...]:
     """The orders in which a scene's methods are shown.
 
     The first order is drawn from the seed and the scene's name; each further round moves every method one column on, so
@@ -102,9 +104,9 @@ def questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> t
     return tuple(Question(scene, number, tuple(order)) for number, order in enumerate(turned))
 
 
-def prompt(count: int) -> str:
+def build_vote_prompt(count: int) -> str:
     """What the judge is told; the methods have no names in it."""
-    names = letters(count)
+    names = make_letters(count)
     return f"""You compare {count} reconstructions of one real table-top scene. The picture is a grid of 2 rows and \
 {count + 1} columns, with a line of titles above.
 - First column, upper row: a photograph of the real scene. Below it: nothing.
@@ -129,7 +131,7 @@ Answer with one JSON object and nothing else:
 def build_vote_schema(count: int) -> Schema:
     """JSON schema of the answer, without bounds: servers refuse large grammars; `parse_vote` checks them."""
     marks = object_of({**dict.fromkeys(METRICS, INTEGER), "reason": STRING})
-    return object_of({"columns": object_of(dict.fromkeys(letters(count), marks))})
+    return object_of({"columns": object_of(dict.fromkeys(make_letters(count), marks))})
 
 
 def parse_vote(text: str, count: int) -> GridAnswer:
@@ -138,7 +140,7 @@ def parse_vote(text: str, count: int) -> GridAnswer:
     Raises:
         AnswerInvalidError: if it is no JSON, marks are out of bounds, columns are missing or ranks shared.
     """
-    return validate_vote(json_object(text), count)
+    return validate_vote(parse_json_object(text), count)
 
 
 def validate_vote(value: Any, count: int) -> GridAnswer:
@@ -153,8 +155,8 @@ def validate_vote(value: Any, count: int) -> GridAnswer:
     return answer
 
 
-def counted(question: Question, answer: GridAnswer) -> Vote:
+def make_vote(question: Question, answer: GridAnswer) -> Vote:
     """The marks back with the methods that stood in the columns."""
-    named = zip(letters(len(question.columns)), question.columns, strict=True)
+    named = zip(make_letters(len(question.columns)), question.columns, strict=True)
     marks = {method: answer.columns[letter] for letter, method in named}
     return Vote(question.scene, question.round, question.columns, marks)

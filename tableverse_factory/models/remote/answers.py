@@ -1,4 +1,4 @@
-"""Answers that were paid for, on disk by the hash of what was asked: a killed build asks nothing twice."""
+"""Cache of paid answers on disk, keyed by a hash of the question, so that a killed build pays nothing twice."""
 
 import json
 import tempfile
@@ -17,13 +17,13 @@ _VERSION = b"answers 1"
 
 
 class AnswerCache:
-    """A JSON file per answer. Safe to share between processes and to delete."""
+    """Folder with a JSON file per answer; safe to share between processes and to delete."""
 
     def __init__(self, cache_dir: Path) -> None:
         self._files = DiskCache(cache_dir / "answers", ".json", durable=True)
 
     def get(self, key: str) -> ChatCompletion | None:
-        """The answer kept under a key; None where there is none, or the file is damaged."""
+        """Return the answer of a key, or None if there is none or its file is damaged."""
         payload = self._files.get(key)
         if payload is None:
             return None
@@ -31,18 +31,18 @@ class AnswerCache:
         return ChatCompletion(**{**record, "usage": Usage(**record["usage"])})
 
     def put(self, key: str, completion: ChatCompletion) -> None:
-        """Keeps an answer.
+        """Store an answer.
 
         Raises:
-            ModelAccessError: if the disk refuses: going on would pay for answers that are lost.
+            ModelAccessError: if the disk refuses; further answers would be paid for and lost.
         """
         try:
             self._files.put(key, json.dumps(asdict(completion), sort_keys=True).encode())
         except OSError as error:
-            raise _cannot_keep(self._files.folder, error) from error
+            raise _describe_disk_error(self._files.folder, error) from error
 
     def check(self) -> None:
-        """Makes sure before anything is paid that answers can be kept.
+        """Check that answers can be stored, before one is paid for.
 
         Raises:
             ModelAccessError: if the folder cannot be written.
@@ -52,20 +52,20 @@ class AnswerCache:
             with tempfile.TemporaryFile(dir=self._files.folder):
                 pass
         except OSError as error:
-            raise _cannot_keep(self._files.folder, error) from error
+            raise _describe_disk_error(self._files.folder, error) from error
 
 
-def answer_key(endpoint: Endpoint, turns: tuple[Message, ...], schema: Mapping[str, Any]) -> str:
-    """Hash of what decides an answer: the model and where it runs, the prompt, the schema, the pictures."""
+def compute_answer_key(endpoint: Endpoint, messages: tuple[Message, ...], schema: Mapping[str, Any]) -> str:
+    """Hash all that determines an answer: address and model, prompt, schema and images."""
     parts = [_VERSION, endpoint.dialect.encode(), endpoint.base_url.encode(), endpoint.model.encode()]
     parts += [json.dumps(schema, sort_keys=True).encode(), b"enforced" if endpoint.enforce_schema else b"asked"]
-    for turn in turns:
-        parts += [turn.role.encode(), turn.text.encode(), str(len(turn.images)).encode(), *turn.images]
+    for message in messages:
+        parts += [message.role.encode(), message.text.encode(), str(len(message.images)).encode(), *message.images]
     return content_hash(*parts)
 
 
-def _cannot_keep(folder: Path, error: OSError) -> ModelAccessError:
+def _describe_disk_error(folder: Path, error: OSError) -> ModelAccessError:
     return ModelAccessError(
-        f"answers cannot be kept in {folder}: {error.strerror or error}. Make room, or name another folder "
-        "in TABLEVERSE_CACHE"
+        f"answers cannot be kept in {folder}: {error.strerror or error}. Free some space, or set TABLEVERSE_CACHE "
+        "to another folder"
     )

@@ -1,46 +1,54 @@
-"""Asking a model for JSON: from the cache, else over the network, with one round of repair."""
+"""Client for chat models that answer in JSON: cached, rate limited, within a budget, with one round of repair."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 from tableverse_factory.core.errors import AnswerInvalidError, ModelError
-from tableverse_factory.models.remote.answers import AnswerCache, answer_key
-from tableverse_factory.models.remote.chat import Chat
+from tableverse_factory.core.retry import TransientError
+from tableverse_factory.models.remote.answers import AnswerCache, compute_answer_key
 from tableverse_factory.models.remote.endpoint import ATTEMPTS, Endpoint
-from tableverse_factory.models.remote.exchange import ChatCompletion, ChatProtocol, Message, Usage, whole_text
-from tableverse_factory.models.remote.gemini import Gemini
-from tableverse_factory.models.remote.http import post_json
-from tableverse_factory.models.remote.http_errors import without_keys
-from tableverse_factory.models.remote.json_text import json_object
+from tableverse_factory.models.remote.exchange import ChatCompletion, Message, Usage, replace_lone_surrogates
+from tableverse_factory.models.remote.gemini_chat import complete_gemini
+from tableverse_factory.models.remote.http import BoundedClient, send_with_retries
+from tableverse_factory.models.remote.http_errors import format_host, redact_keys
+from tableverse_factory.models.remote.json_text import parse_json_object
+from tableverse_factory.models.remote.openai_chat import complete_openai
 from tableverse_factory.models.remote.rate_limiter import RateLimiter
 from tableverse_factory.models.services import Services
 
-LANGUAGES: dict[str, ChatProtocol] = {"openai": Chat(), "gemini": Gemini()}
+Complete = Callable[
+    [BoundedClient, Endpoint, tuple[Message, ...], Mapping[str, Any] | None], Awaitable[ChatCompletion | None]
+]
+PROTOCOLS: dict[str, Complete] = {"openai": complete_openai, "gemini": complete_gemini}
+_KEY_HEADERS: dict[str, Callable[[str], dict[str, str]]] = {
+    "openai": lambda key: {"Authorization": f"Bearer {key}"},
+    "gemini": lambda key: {"x-goog-api-key": key},
+}
 
 MOST_CALLS = 2 * ATTEMPTS
-"""Requests that one question may take: two rounds, with all that is sent again."""
+"""Maximum number of requests for one question: two rounds, each with all its retries."""
 
-_SHOWN_CHARS = 20_000
-"""Of an answer that is sent back to be repaired."""
+_REPAIR_CHARS = 20_000
+"""Maximum length of an answer that is sent back for repair."""
 
 _KEY_CHARS = 8
-"""A shorter key is a local server's for want of one, such as `none`, and may well be a word of an answer."""
+"""Shorter keys are placeholders for a local server, such as `none`, and may occur in an answer."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Reply(Generic[T]):
-    """An answer that could be read.
+    """A validated answer.
 
     Attributes:
-        value: As it was read.
-        text: The model's own words.
-        usage: Of every round, as the server counted when it answered.
-        rounds: 1, or 2 where the first answer had to be repaired.
+        value: Value that was read from the text.
+        text: Text of the answer.
+        usage: Tokens and requests of all rounds.
+        rounds: 1, or 2 if the first answer had to be repaired.
     """
 
     value: T
@@ -50,92 +58,88 @@ class Reply(Generic[T]):
 
 
 class ModelClient:
-    """Asks one model, at the pace and within the budget of the services, whose meter counts what it costs.
+    """Client for one model, within the rate limit and budget of the services, whose meter counts the cost.
 
-    Answers are kept in the cache folder, so the same question is paid for once.
+    Answers are kept in the cache folder, so that the same question is paid for once.
     """
 
     def __init__(self, endpoint: Endpoint, services: Services) -> None:
         self._endpoint = endpoint
-        self._language = LANGUAGES[endpoint.dialect]
         self._cache = AnswerCache(services.cache_dir)
-        self._pace = RateLimiter(services.cache_dir, services.asking)
+        self._rate_limiter = RateLimiter(services.cache_dir, services.asking)
         self._meter = services.meter
 
     def ask(self, prompt: str, images: Sequence[bytes], schema: Mapping[str, Any]) -> dict[str, Any]:
-        """The JSON object that the model gives; it may ignore the schema, so check what is in it.
+        """Ask for a JSON object; the model may ignore the schema, so validate the result.
 
         Raises:
             ModelAccessError: if a person must act: key, permission, credit, proxy, a full disk.
-            AnswerInvalidError: if there is no object in the answer, also after a round of repair, or a refusal.
+            AnswerInvalidError: if the answer holds no object, also after a round of repair, or is a refusal.
             BudgetSpentError: if nothing more may be spent.
-            ModelError: if the server does not answer, or no turn to ask comes in time.
+            ModelError: if the server does not answer, or the rate limit leaves no room in time.
         """
-        return self.ask_for(json_object, prompt, images, schema).value
+        return self.ask_for(parse_json_object, prompt, images, schema).value
 
     def ask_for(
         self, read: Callable[[str], T], prompt: str, images: Sequence[bytes], schema: Mapping[str, Any]
     ) -> Reply[T]:
-        """What `read` makes of the model's answer.
-
-        An answer that `read` refuses goes back once, with the reason.
+        """Ask, and parse the answer with `read`; an answer that it refuses goes back once, with the reason.
 
         Args:
-            read: Makes a value of the model's words, or raises AnswerInvalidError saying what is wrong.
-            prompt: What is asked.
+            read: Parses the text, or raises AnswerInvalidError with what is wrong.
+            prompt: Text of the question.
             images: PNG or JPEG files.
-            schema: JSON schema of the answer. Without bounds and lengths: servers refuse large grammars.
+            schema: JSON schema of the answer, without bounds and lengths: servers refuse large grammars.
 
         Raises:
             ModelAccessError, AnswerInvalidError, BudgetSpentError, ModelError: see `ask`.
         """
         deadline = time.monotonic() + self._endpoint.timeout_s
-        asked = (Message("user", prompt, tuple(images)),)
-        first = self._complete(asked, schema, deadline)
+        question = (Message("user", prompt, tuple(images)),)
+        first = self._complete(question, schema, deadline)
         try:
-            return Reply(_read(read, first), first.text, first.usage, 1)
+            return Reply(_parse_answer(read, first), first.text, first.usage, 1)
         except AnswerInvalidError as problem:
             if first.refusal:
                 raise
             repair = (
-                Message("model", first.text[:_SHOWN_CHARS] or "(nothing)"),
-                Message("user", _repair_prompt(problem)),
+                Message("model", first.text[:_REPAIR_CHARS] or "(nothing)"),
+                Message("user", _write_repair_prompt(problem)),
             )
-            second = self._complete((*asked, *repair), schema, deadline)
-        return Reply(_read(read, second), second.text, first.usage + second.usage, 2)
+            second = self._complete((*question, *repair), schema, deadline)
+        return Reply(_parse_answer(read, second), second.text, first.usage + second.usage, 2)
 
-    def _complete(self, turns: tuple[Message, ...], schema: Mapping[str, Any], deadline: float) -> ChatCompletion:
-        key = answer_key(self._endpoint, turns, schema)
-        kept = self._cache.get(key)
-        if kept is not None:
-            self._meter.remember(self._endpoint.cost(kept.usage))
-            return kept
+    def _complete(self, messages: tuple[Message, ...], schema: Mapping[str, Any], deadline: float) -> ChatCompletion:
+        key = compute_answer_key(self._endpoint, messages, schema)
+        cached = self._cache.get(key)
+        if cached is not None:
+            self._meter.add_cached(self._endpoint.compute_cost(cached.usage))
+            return cached
         self._cache.check()
         sent = schema if self._endpoint.enforce_schema else None
-        request = self._language.request(self._endpoint.base_url, self._endpoint.model, turns, sent)
-        headers = self._language.headers(self._endpoint.key())
+        headers = _KEY_HEADERS[self._endpoint.dialect](api_key) if (api_key := self._endpoint.read_key()) else {}
         tokens = Usage(calls=0)
         calls = self._meter.paid.calls
 
-        def lack_of(body: Mapping[str, Any]) -> str:
-            """What the answer lacks; it is paid for all the same."""
+        async def send(client: BoundedClient) -> ChatCompletion:
+            """Request a completion; its tokens are paid even if it is empty."""
             nonlocal tokens
-            completion = self._language.read(body)
+            completion = await PROTOCOLS[self._endpoint.dialect](client, self._endpoint, messages, sent)
             if completion is None:
-                return ""
-            counted = replace(completion.usage, calls=0)
-            tokens += counted
-            self._meter.answered(self._endpoint.cost(counted))
-            return completion.lack
+                host = format_host(self._endpoint.base_url)
+                raise ModelError(f"{host}: the answer is no completion; is the address right?")
+            used = replace(completion.usage, calls=0)
+            tokens += used
+            self._meter.add_tokens(self._endpoint.compute_cost(used))
+            if completion.is_empty:
+                raise TransientError("the model broke off or said nothing")
+            return completion
 
-        body = post_json(self._endpoint, request, headers, deadline, lack_of, self._turn)
-        completion = self._language.read(body)
-        if completion is None:
-            raise ModelError(f"{self._endpoint.base_url}: the answer is no completion; is the address right?")
+        completion = send_with_retries(self._endpoint, send, headers, deadline, self._turn, key.encode())
         completion = replace(
             completion,
-            text=whole_text(without_keys(completion.text, headers, least_chars=_KEY_CHARS)),
-            refusal=whole_text(without_keys(completion.refusal, headers, least_chars=_KEY_CHARS)),
+            text=replace_lone_surrogates(redact_keys(completion.text, headers, min_chars=_KEY_CHARS)),
+            refusal=replace_lone_surrogates(redact_keys(completion.refusal, headers, min_chars=_KEY_CHARS)),
             usage=replace(tokens, calls=self._meter.paid.calls - calls),
         )
         self._cache.put(key, completion)
@@ -143,13 +147,13 @@ class ModelClient:
 
     @contextmanager
     def _turn(self, deadline: float) -> Iterator[None]:
-        self._meter.check()  # nobody waits for a turn that may not be used
-        with self._pace.turn(deadline):
-            self._meter.ask()
+        self._meter.check()  # before waiting for a turn that may not be used
+        with self._rate_limiter.turn(deadline):
+            self._meter.add_request()
             yield
 
 
-def _read(read: Callable[[str], T], completion: ChatCompletion) -> T:
+def _parse_answer(read: Callable[[str], T], completion: ChatCompletion) -> T:
     if completion.refusal:
         raise AnswerInvalidError(f"the model refused to answer: {completion.refusal}", "answer_refused")
     try:
@@ -160,7 +164,7 @@ def _read(read: Callable[[str], T], completion: ChatCompletion) -> T:
         raise
 
 
-def _repair_prompt(problem: AnswerInvalidError) -> str:
+def _write_repair_prompt(problem: AnswerInvalidError) -> str:
     return (
         f"That answer cannot be used: {str(problem)[:500]}. "
         "Give the whole answer again, corrected, as one JSON object in the schema, and nothing else."

@@ -1,70 +1,70 @@
-"""What questions to models cost, counted where they are asked: stages hand nothing on."""
+"""Meter of the cost of requests to models, within an allowance."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
-from schemas.outcome import NOTHING, UNLIMITED, Allowance, Spent
+from schemas.outcome import NO_COST, UNLIMITED, Allowance, ModelCost
 from tableverse_factory.core.errors import BudgetSpentError
 
 
-def _kept_nowhere(_spent: Spent) -> None:
+def _ignore_cost(_spent: ModelCost) -> None:
     pass
 
 
 class Meter:
-    """Counts from `reset` to `reset`: of one stage on one scene.
+    """Meter of one stage on one scene, from `reset` to `reset`.
 
     Attributes:
-        cost: What the answers cost when they were first given, also those that now come from the cache.
-        paid: What was spent since the last `reset`.
+        cost: Cost of the answers when they were first given, including those from the cache.
+        paid: Cost of the requests since the last `reset`.
     """
 
-    def __init__(self, note: Callable[[Spent], None] = _kept_nowhere) -> None:
-        """Makes a meter without a limit.
+    def __init__(self, note: Callable[[ModelCost], None] = _ignore_cost) -> None:
+        """Create a meter without a limit.
 
         Args:
-            note: Told of everything that is spent: of a request before it is sent, of tokens when they are counted.
+            note: Called with every cost: of a request before it is sent, of tokens when they are counted.
         """
         self._note = note
         self._left = UNLIMITED
-        self.cost, self.paid = NOTHING, NOTHING
+        self.cost, self.paid = NO_COST, NO_COST
 
     def allow(self, allowance: Allowance) -> None:
-        """From now on no more than this may be spent."""
+        """Set how much may be spent from now on."""
         self._left = allowance
 
     def reset(self) -> None:
-        """Begins at nothing; what is left of the allowance stays."""
-        self.cost, self.paid = NOTHING, NOTHING
+        """Set the counts to zero; the rest of the allowance stays."""
+        self.cost, self.paid = NO_COST, NO_COST
 
-    def remember(self, cost: Spent) -> None:
-        """An answer came from the cache."""
+    def add_cached(self, cost: ModelCost) -> None:
+        """Count an answer from the cache."""
         self.cost += cost
 
     def check(self) -> None:
-        """Says whether a request may be sent.
+        """Check that the allowance is not spent.
 
         Raises:
-            BudgetSpentError: if none may be.
+            BudgetSpentError: if it is.
         """
         calls, usd = self._left.calls, self._left.usd
         if (calls is not None and calls <= 0) or (usd is not None and usd <= 0.0):
             raise BudgetSpentError("the budget is spent")
 
-    def ask(self) -> None:
-        """A request is about to be sent.
+    def add_request(self) -> None:
+        """Count a request that is about to be sent.
 
         Raises:
-            BudgetSpentError: if none may be.
+            BudgetSpentError: if the allowance is spent.
         """
         self.check()
-        self._spend(Spent(calls=1))
+        self._spend(ModelCost(calls=1))
 
-    def answered(self, tokens: Spent) -> None:
-        """The server counted this for a request."""
+    def add_tokens(self, tokens: ModelCost) -> None:
+        """Count the tokens that the server reports for a request."""
         self._spend(tokens)
 
-    def _spend(self, spent: Spent) -> None:
+    def _spend(self, spent: ModelCost) -> None:
         self._note(spent)
         self.cost += spent
         self.paid += spent

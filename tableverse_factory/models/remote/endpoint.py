@@ -1,37 +1,39 @@
-"""Where a model answers, and what an exchange with it may cost in time."""
+"""Address, limits and prices of a remote model."""
 
 import os
 from dataclasses import dataclass
 from typing import Literal
 
-from schemas.config import AskedSection, CurateConfig
-from schemas.outcome import Spent
+from schemas.config import CurateConfig, RemoteModelSection
+from schemas.outcome import ModelCost
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.remote.exchange import Usage
-from tableverse_factory.models.remote.gemini import PUBLIC_URL
 
-Dialect = Literal["openai", "gemini", "grasps"]
+Dialect = Literal["openai", "gemini", "grasps", "meshes"]
+GEMINI_URL = "https://generativelanguage.googleapis.com/v1beta"
 ATTEMPTS = 5
+MAX_BODY_BYTES = 4 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """One model behind one address; the key itself is never part of it.
+    """One model behind one address, without its key.
 
     Attributes:
-        dialect: Which protocol is spoken.
-        base_url: Up to and without `/chat/completions` or `/models/…`; checked by `schemas.address`.
-        model: As the server names it.
-        key_env: Name of the environment variable with the key; empty for a server that wants none.
-        enforce_schema: Whether the schema goes along for the server to enforce; some servers refuse it.
-        timeout_s: For a question with everything it takes: retries, waiting for the server, a repair round [s].
-        connect_s: For a connection [s].
+        dialect: Protocol of the server.
+        base_url: Address without `/chat/completions` or `/models/…`; checked by `schemas.address`.
+        model: Name of the model at the server.
+        key_env: Environment variable that holds the key; empty for a server without keys.
+        enforce_schema: Whether the server is asked to enforce the schema; some servers refuse to.
+        timeout_s: Limit for a question with all retries, waits and the repair round [s].
+        connect_s: Limit for a connection [s].
         read_s: Longest silence of the server; models that think first are silent for long [s].
-        attempts: Requests per exchange before it is given up.
-        backoff_s: Wait before the first retry; doubles with each further one [s].
-        usd_per_million_input: Price of a million tokens that it reads [USD].
-        usd_per_million_output: Price of a million tokens that it writes [USD].
-        section: Of the configuration that says all this, for messages; empty where none does.
+        max_body_bytes: Maximum size of an answer.
+        attempts: Maximum number of requests per exchange.
+        backoff_s: Wait before the first retry; it doubles with each further one [s].
+        usd_per_million_input: Price of a million input tokens [USD].
+        usd_per_million_output: Price of a million output tokens [USD].
+        section: Section of the configuration that this comes from, for messages; empty without one.
     """
 
     dialect: Dialect
@@ -42,22 +44,23 @@ class Endpoint:
     timeout_s: float = 240.0
     connect_s: float = 10.0
     read_s: float = 180.0
+    max_body_bytes: int = MAX_BODY_BYTES
     attempts: int = ATTEMPTS
     backoff_s: float = 1.0
     usd_per_million_input: float = 0.0
     usd_per_million_output: float = 0.0
     section: str = ""
 
-    def cost(self, usage: Usage) -> Spent:
-        """What a use of it costs, by its prices."""
+    def compute_cost(self, usage: Usage) -> ModelCost:
+        """Compute the cost of a use by the prices."""
         price = usage.input_tokens * self.usd_per_million_input + usage.output_tokens * self.usd_per_million_output
-        return Spent(usage.calls, usage.input_tokens, usage.output_tokens, price / 1e6)
+        return ModelCost(usage.calls, usage.input_tokens, usage.output_tokens, price / 1e6)
 
-    def key(self) -> str:
-        """The key, from the environment of this process; empty where none is wanted.
+    def read_key(self) -> str:
+        """Read the key from the environment; empty if none is configured.
 
         Raises:
-            ModelAccessError: if the variable is unset, or holds what no HTTP header can.
+            ModelAccessError: if the variable is unset or holds what no HTTP header can.
         """
         if not self.key_env:
             return ""
@@ -71,11 +74,11 @@ class Endpoint:
         return key
 
 
-def endpoint_of(config: AskedSection) -> Endpoint:
-    """The model that a section of the configuration asks; Google's own address where `gemini` is given none."""
+def read_endpoint(config: RemoteModelSection) -> Endpoint:
+    """Read the endpoint of a section of the configuration; `gemini` without an address means Google's own."""
     return Endpoint(
-        dialect="gemini" if config.asked == "gemini" else "openai",
-        base_url=config.base_url or PUBLIC_URL,
+        dialect="gemini" if config.protocol == "gemini" else "openai",
+        base_url=config.base_url or GEMINI_URL,
         model=config.model,
         key_env=config.key_env,
         enforce_schema=config.enforce_schema,

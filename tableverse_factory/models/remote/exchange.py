@@ -1,20 +1,22 @@
-"""What goes to a model and what comes back, whatever protocol is spoken in between."""
+"""Messages to a chat model and its completions, independent of the protocol."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from schemas.identity import content_hash
+from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.core.optional_imports import import_extra
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Something said.
+    """A message of a conversation.
 
     Attributes:
         role: `user` or `model`.
-        text: The words.
-        images: PNG or JPEG files that go with them.
+        text: Text of the message.
+        images: PNG or JPEG files that precede the text.
     """
 
     role: str
@@ -24,7 +26,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Tokens as the server counted them, 0 where it did not say, and the requests that it took."""
+    """Tokens as counted by the server, 0 where unknown, and the number of requests."""
 
     input_tokens: int = 0
     output_tokens: int = 0
@@ -40,13 +42,13 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class ChatCompletion:
-    """What a model said.
+    """Answer of a chat model.
 
     Attributes:
-        text: Its words; untrusted.
-        usage: What it cost.
-        refusal: Why it did not answer, in the server's words; empty where it did.
-        cut_off: Whether it ran out of room before it was done.
+        text: Text of the answer; untrusted.
+        usage: Tokens and requests.
+        refusal: Reason for a refusal, in the server's words; empty for an answer.
+        cut_off: Whether the answer ended at a limit of tokens.
     """
 
     text: str
@@ -55,45 +57,13 @@ class ChatCompletion:
     cut_off: bool = False
 
     @property
-    def lack(self) -> str:
-        """What is wrong with it that may pass: no words and no reason for that; empty where nothing is."""
-        is_answer = self.text.strip() or self.refusal or self.cut_off
-        return "" if is_answer else "the model broke off or said nothing"
+    def is_empty(self) -> bool:
+        """Whether there is neither text nor a reason for its absence, so that another attempt may help."""
+        return not (self.text.strip() or self.refusal or self.cut_off)
 
 
-@dataclass(frozen=True, slots=True)
-class HttpRequest:
-    """An HTTP request, less the key.
-
-    Attributes:
-        url: Where it goes.
-        body: What is posted as JSON.
-    """
-
-    url: str
-    body: Mapping[str, Any]
-
-
-class ChatProtocol(Protocol):
-    """How a kind of server is asked and understood."""
-
-    def request(
-        self, base_url: str, model: str, turns: tuple[Message, ...], schema: Mapping[str, Any] | None
-    ) -> HttpRequest:
-        """The request for a completion, in a JSON schema where one is given."""
-        ...
-
-    def headers(self, key: str) -> dict[str, str]:
-        """The headers that carry the key."""
-        ...
-
-    def read(self, body: Mapping[str, Any]) -> ChatCompletion | None:
-        """The completion in an answer; None where the answer holds none."""
-        ...
-
-
-def media_type(image: bytes) -> str:
-    """`image/png` or `image/jpeg`, by the first bytes.
+def detect_media_type(image: bytes) -> str:
+    """Return `image/png` or `image/jpeg`, by the first bytes.
 
     Raises:
         ValueError: if it is neither.
@@ -106,7 +76,7 @@ def media_type(image: bytes) -> str:
 
 
 def get_path(value: Any, *path: str | int) -> Any:
-    """What stands at a path of keys and positions in somebody else's JSON; None where the path leads nowhere."""
+    """Return the value at a path of keys and positions in untrusted JSON, or None if there is none."""
     for step in path:
         if isinstance(step, str) and isinstance(value, Mapping):
             value = value.get(step)
@@ -117,12 +87,24 @@ def get_path(value: Any, *path: str | int) -> Any:
     return value
 
 
-def count(value: Any) -> int:
-    """A count of tokens in somebody else's JSON; 0 where it is none."""
+def check_count(value: Any) -> int:
+    """Return an untrusted count of tokens, or 0 if it is no such count."""
     is_count = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
     return value if is_count else 0
 
 
-def whole_text(text: str) -> str:
-    """The text with halves of surrogate pairs replaced: JSON may hold them, files may not."""
+def replace_lone_surrogates(text: str) -> str:
+    """Replace halves of surrogate pairs, which JSON may hold and files may not."""
     return text.encode("utf-8", errors="replace").decode()
+
+
+def import_client(module: str) -> Any:
+    """Import the package of a protocol.
+
+    Raises:
+        ModelAccessError: if it is not installed.
+    """
+    try:
+        return import_extra(module, "a model behind an address", "vlm")
+    except InputError as error:
+        raise ModelAccessError(str(error)) from None

@@ -1,163 +1,208 @@
-"""One JSON posted, one JSON back: bounded in time and in bytes, retried where that can help, silent about the key."""
+"""HTTP requests to models and services: bounded in time and bytes, retried by one policy, silent about the key."""
 
 import asyncio
+import itertools
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from datetime import UTC, datetime
-from email.utils import parsedate_to_datetime
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 
 from schemas.address import is_loopback
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.retry import RetryPolicy, TransientError, parse_retry_after
 from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.models.remote.endpoint import Endpoint
-from tableverse_factory.models.remote.exchange import HttpRequest, get_path
-from tableverse_factory.models.remote.http_errors import HttpAnswer, place_of, problem_of, without_keys
+from tableverse_factory.models.remote.exchange import get_path
+from tableverse_factory.models.remote.http_errors import format_host, raise_for_answer, redact_keys
 
-MAX_BODY_BYTES = 4 * 1024 * 1024
-"""Of an answer; reading stops there."""
-
-_LONGEST_WAIT_S = 60.0
 _LEAST_S = 0.001
+_SENT_HEADERS = ("host", "content-type", "content-length", "user-agent")
+"""Headers taken over from the caller: client libraries add others, some of them from the environment."""
 
 Turn = Callable[[float], AbstractContextManager[None]]
-"""Around every request: waits until it may be sent, at most until the deadline that it is given."""
+"""Context of every request: waits until it may be sent, at most until the deadline that it is given."""
+
+T = TypeVar("T")
 
 
-def at_once(_deadline: float) -> AbstractContextManager[None]:
-    """Every request may be sent."""
+def send_at_once(_deadline: float) -> AbstractContextManager[None]:
+    """Let every request be sent without waiting."""
     return nullcontext()
 
 
-def post_json(
+class BoundedClient(httpx.AsyncClient):
+    """HTTP client for one request to one endpoint; every answer that it returns is a success with a JSON object.
+
+    It is handed to client libraries in place of their own: the key, proxies, redirects, timeouts and the size of
+    answers are decided here, and all failures are raised as errors of this package or as `TransientError`.
+    """
+
+    def __init__(self, endpoint: Endpoint, left_s: float, headers: Mapping[str, str]) -> None:
+        """Open a client.
+
+        Args:
+            endpoint: Address and times.
+            left_s: Time left for the request [s].
+            headers: Headers with the key.
+
+        Raises:
+            ModelAccessError: if the environment names an unusable proxy or certificate file.
+        """
+        self._endpoint, self._key_headers = endpoint, headers
+        timeout = httpx.Timeout(min(endpoint.read_s, left_s), connect=min(endpoint.connect_s, left_s))
+        try:
+            # `auth` keeps a netrc file from replacing our key; loopback addresses bypass proxies.
+            super().__init__(
+                auth=lambda request: request, timeout=timeout, trust_env=not is_loopback(endpoint.base_url)
+            )
+        except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
+            # Messages other than that of a missing package may quote the proxy's password.
+            why = sanitize_line(str(error)) if isinstance(error, ImportError) else type(error).__name__
+            raise ModelAccessError(
+                f"{format_host(endpoint.base_url)} cannot be reached with the settings in one of HTTPS_PROXY, "
+                f"ALL_PROXY, NO_PROXY, SSL_CERT_FILE: {why}"
+            ) from error
+
+    async def send(self, request: httpx.Request, **_options: Any) -> httpx.Response:
+        """Send a request and read its whole answer.
+
+        Raises:
+            TransientError: if another attempt may succeed.
+            AnswerInvalidError, ModelAccessError, ModelError: see `raise_for_answer`.
+        """
+        host, own = request.url.netloc, httpx.URL(self._endpoint.base_url).netloc
+        if host != own:
+            raise ModelError(f"a request for {own.decode()} was addressed to {host.decode()}; it was not sent")
+        kept = {name: request.headers[name] for name in _SENT_HEADERS if name in request.headers}
+        fixed = {"Accept": "application/json", "Accept-Encoding": "identity"}
+        request.headers = httpx.Headers({**kept, **fixed, **self._key_headers})
+        try:
+            response = await super().send(request, stream=True, follow_redirects=False)
+            try:
+                return await self._read(response)
+            finally:
+                await response.aclose()
+        except httpx.TimeoutException as error:
+            raise TransientError(f"no answer in time ({type(error).__name__})") from error
+        except httpx.TransportError as error:
+            # Keys first: half of one that was cut off would not be found.
+            message = sanitize_line(redact_keys(str(error), self._key_headers), 200)
+            raise TransientError(f"the connection failed: {type(error).__name__}: {message}") from error
+
+    async def _read(self, response: httpx.Response) -> httpx.Response:
+        is_success = response.status_code < 300
+        if is_success and response.headers.get("content-encoding", "identity") != "identity":
+            raise TransientError("the answer is compressed, which was not asked for")
+        data = bytearray()
+        async for chunk in response.aiter_raw():
+            data += chunk
+            if len(data) > self._endpoint.max_body_bytes:
+                raise ModelError(
+                    f"{format_host(self._endpoint.base_url)}: the answer is longer than "
+                    f"{self._endpoint.max_body_bytes} bytes"
+                )
+        body = _parse_json(data)
+        header = response.headers.get("retry-after")
+        wait_s = _find_retry_delay(body) if header is None else parse_retry_after(header)
+        if isinstance(body, list):  # Gemini puts some errors into a list
+            body = get_path(body, 0)
+        if is_success and not isinstance(body, Mapping):
+            raise TransientError("the answer is no whole JSON object", wait_s)
+        raise_for_answer(
+            response.status_code, body if isinstance(body, Mapping) else {}, self._endpoint, self._key_headers, wait_s
+        )
+        content = json.dumps(body).encode()
+        return httpx.Response(
+            response.status_code,
+            headers={"Content-Type": "application/json"},
+            content=content,
+            request=response.request,
+        )
+
+
+def send_with_retries(
     endpoint: Endpoint,
-    request: HttpRequest,
+    send: Callable[[BoundedClient], Awaitable[T]],
     headers: Mapping[str, str],
     deadline: float,
-    lack_of: Callable[[Mapping[str, Any]], str],
-    turn: Turn = at_once,
-) -> Mapping[str, Any]:
-    """The JSON object of a success: posts a request until there is one, or no use in asking again.
+    turn: Turn = send_at_once,
+    seed: bytes = b"",
+) -> T:
+    """Send a request until it succeeds or another attempt is of no use.
 
     Args:
-        endpoint: Its times and attempts.
-        request: What is asked, where.
-        headers: The ones with the key.
+        endpoint: Address, times and attempts.
+        send: Sends the request with the client that it is given; raises `TransientError` to be called again.
+        headers: Headers with the key.
         deadline: When to give up, on `time.monotonic` [s].
-        lack_of: What a success lacks that another attempt may bring; empty where nothing.
-        turn: Held by each request while it is under way; waiting for it counts as waiting for the server.
+        turn: Held while a request is under way; waiting for it counts as waiting for the server.
+        seed: Spreads the waits of different requests.
 
     Raises:
-        AnswerInvalidError: if the server refuses the question for what it shows.
-        ModelAccessError: if the key is refused or the credit spent: asking again is of no use.
+        AnswerInvalidError: if the server refuses the question for its content.
+        ModelAccessError: if the key is refused or the credit is spent.
         ModelError: if the server refuses the request, or does not answer in time.
     """
-    data = json.dumps(request.body, ensure_ascii=False, allow_nan=False).encode()
-    problem = "no time was left to ask"
-    for attempt in range(endpoint.attempts):
+    policy = RetryPolicy(endpoint.attempts, endpoint.backoff_s)
+    for attempt in itertools.count(1):
         if deadline <= time.monotonic():
-            break
-        with turn(deadline):
-            left = max(deadline - time.monotonic(), _LEAST_S)
-            answer = asyncio.run(_post(endpoint, request.url, data, headers, left))
-        problem = problem_of(answer, endpoint, headers) or lack_of(answer.body)
-        if not problem:
-            return answer.body
-        wait = _wait(endpoint, answer, data, attempt)
-        if attempt + 1 == endpoint.attempts or wait >= deadline - time.monotonic():
-            asked = f"; it asks to wait {answer.retry_after_s:.0f} s" if answer.retry_after_s else ""
-            problem += f" (asked {pluralize(attempt + 1, 'time')}{asked})"
-            break
-        time.sleep(wait)
-    raise ModelError(f"{place_of(request.url)}: {without_keys(problem, headers)}")
+            raise ModelError(f"{format_host(endpoint.base_url)}: no time was left to ask")
+        try:
+            with turn(deadline):
+                left_s = max(deadline - time.monotonic(), _LEAST_S)
+                return asyncio.run(_send_once(endpoint, send, headers, left_s))
+        except TransientError as error:
+            jitter = 0.75 + 0.5 * int(content_hash(seed, bytes([attempt - 1]))[:4], 16) / 0xFFFF
+            wait_s = policy.next_wait(attempt, error.wait_s, deadline - time.monotonic(), jitter)
+            if wait_s is None:
+                asked = f"; it asks to wait {error.wait_s:.0f} s" if error.wait_s else ""
+                problem = f"{redact_keys(str(error), headers)} (asked {pluralize(attempt, 'time')}{asked})"
+                raise ModelError(f"{format_host(endpoint.base_url)}: {problem}") from None
+        time.sleep(wait_s)
+    raise AssertionError("the attempts are counted without end")
 
 
-async def _post(endpoint: Endpoint, url: str, data: bytes, headers: Mapping[str, str], left: float) -> HttpAnswer:
-    """One request; what goes wrong on the way is an answer with a problem."""
-    sent = {"Content-Type": "application/json", "Accept": "application/json", "Accept-Encoding": "identity", **headers}
-    client = _client(url, httpx.Timeout(min(endpoint.read_s, left), connect=min(endpoint.connect_s, left)))
-    try:
-        async with (
-            asyncio.timeout(left),
-            client,
-            client.stream("POST", url, content=data, headers=sent) as response,
-        ):
-            return await _read(response)
-    except TimeoutError:
-        return HttpAnswer(0, {}, problem=f"no whole answer within {left:.0f} s")
-    except httpx.TimeoutException as error:
-        return HttpAnswer(0, {}, problem=f"no answer in time ({type(error).__name__})")
-    except httpx.TransportError as error:
-        said = sanitize_line(without_keys(str(error), headers), 200)  # in this order: half a key would not be found
-        return HttpAnswer(0, {}, problem=f"the connection failed: {type(error).__name__}: {said}")
-
-
-def _client(url: str, timeout: httpx.Timeout) -> httpx.AsyncClient:
-    """A client for one request, through the proxy that the environment names.
+def post_json(endpoint: Endpoint, path: str, body: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Post a JSON object to a path below the endpoint's address and return the JSON object of its answer.
 
     Raises:
-        ModelAccessError: if a proxy or a file of certificates in the environment is of no use.
+        AnswerInvalidError, ModelAccessError, ModelError: see `send_with_retries`.
     """
+    url = f"{endpoint.base_url.rstrip('/')}/{path}"
+
+    async def send(client: BoundedClient) -> Mapping[str, Any]:
+        answer: Mapping[str, Any] = (await client.post(url, json=body)).json()
+        return answer
+
+    return send_with_retries(endpoint, send, {}, time.monotonic() + endpoint.timeout_s, seed=url.encode())
+
+
+async def _send_once(
+    endpoint: Endpoint, send: Callable[[BoundedClient], Awaitable[T]], headers: Mapping[str, str], left_s: float
+) -> T:
     try:
-        # `auth` keeps a netrc file from putting its own key in place of ours; a proxy has no business on the way home.
-        return httpx.AsyncClient(auth=_unchanged, timeout=timeout, trust_env=not is_loopback(url))
-    except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
-        # Other messages than that of a missing package may quote the proxy's password.
-        why = sanitize_line(str(error)) if isinstance(error, ImportError) else type(error).__name__
-        names = "HTTPS_PROXY, ALL_PROXY, NO_PROXY, SSL_CERT_FILE"
-        raise ModelAccessError(f"{place_of(url)} cannot be asked with what one of {names} says: {why}") from error
+        async with asyncio.timeout(left_s), BoundedClient(endpoint, left_s, headers) as client:
+            return await send(client)
+    except TimeoutError:
+        raise TransientError(f"no whole answer within {left_s:.0f} s") from None
 
 
-def _unchanged(request: httpx.Request) -> httpx.Request:
-    return request
-
-
-async def _read(response: httpx.Response) -> HttpAnswer:
-    status = response.status_code
-    if status < 300 and response.headers.get("content-encoding", "identity") != "identity":
-        return HttpAnswer(status, {}, problem="the answer is compressed, which was not asked for")
-    data = bytearray()
-    async for chunk in response.aiter_raw():
-        data += chunk
-        if len(data) > MAX_BODY_BYTES:
-            raise ModelError(f"{place_of(str(response.url))}: the answer is longer than {MAX_BODY_BYTES} bytes")
+def _parse_json(data: bytes | bytearray) -> Any:
     try:
-        body = json.loads(bytes(data).decode("utf-8", errors="replace"))
+        return json.loads(data.decode("utf-8", errors="replace"))
     except (ValueError, RecursionError):
-        body = None
-    retry_after = _retry_after(response.headers.get("retry-after"), body)
-    if isinstance(body, list):  # Gemini puts some errors into a list
-        body = get_path(body, 0)
-    if isinstance(body, Mapping):
-        return HttpAnswer(status, body, retry_after)
-    return HttpAnswer(status, {}, retry_after, "" if status >= 300 else "the answer is no whole JSON object")
-
-
-def _retry_after(header: str | None, body: Any) -> float | None:
-    """What the server asks to wait [s]: the header in seconds or as a date, or Gemini's RetryInfo."""
-    try:
-        if header is not None and header.strip().isdecimal():
-            return float(header)
-        if header is not None:
-            return max(0.0, (parsedate_to_datetime(header) - datetime.now(UTC)).total_seconds())
-    except (ValueError, TypeError, OverflowError):
         return None
+
+
+def _find_retry_delay(body: Any) -> float | None:
+    """Read Gemini's RetryInfo from the body of an error [s]."""
     details = get_path(body, "error", "details")
     for detail in details if isinstance(details, list) else []:
         delay = get_path(detail, "retryDelay")
         if isinstance(delay, str) and delay.removesuffix("s").replace(".", "", 1).isdecimal():
             return float(delay.removesuffix("s"))
     return None
-
-
-def _wait(endpoint: Endpoint, answer: HttpAnswer, data: bytes, attempt: int) -> float:
-    """Seconds before the next attempt: as the server asks, else doubling, and different for different questions."""
-    if answer.retry_after_s is not None:
-        return answer.retry_after_s
-    spread = int(content_hash(data, bytes([attempt]))[:4], 16) / 0xFFFF
-    return min(endpoint.backoff_s * 2.0**attempt, _LONGEST_WAIT_S) * (0.75 + 0.5 * spread)

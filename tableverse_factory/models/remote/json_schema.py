@@ -1,7 +1,7 @@
-"""The few words of JSON schema in which answers are asked for, as strict servers take them.
+"""JSON schemas of answers, in the subset that strict servers accept.
 
-Everything in an object is required and nothing is bounded: servers compile schemas to grammars and refuse large ones.
-Whoever reads the answer bounds it.
+Every property is required and nothing is bounded: servers compile schemas to grammars and refuse large ones. Bounds
+are checked when an answer is read.
 """
 
 from typing import Any
@@ -15,20 +15,20 @@ STRING: Schema = {"type": "string"}
 
 
 def object_of(properties: Schema) -> Schema:
-    """An object with exactly these properties."""
+    """Build the schema of an object with exactly these properties."""
     return {"type": "object", "properties": properties, "required": [*properties], "additionalProperties": False}
 
 
 def list_of(items: Schema) -> Schema:
-    """Any number of these."""
+    """Build the schema of a list of any length."""
     return {"type": "array", "items": items}
 
 
 def enum_of(*values: str) -> Schema:
-    """One of these words."""
+    """Build the schema of one of these words."""
     return {"type": "string", "enum": [*values]}
 
 
 def nullable(value: Schema) -> Schema:
-    """This or null."""
+    """Build the schema of a value or null."""
     return {"anyOf": [value, {"type": "null"}]}

@@ -1,4 +1,4 @@
-"""The JSON object in what a model wrote: without fences, without prose around it, without its thoughts."""
+"""Extraction of the JSON object from the text of a model: without code fences, prose and thoughts."""
 
 import json
 from typing import Any, TypeVar
@@ -8,7 +8,7 @@ from pydantic import BaseModel, ValidationError
 from tableverse_factory.core.errors import AnswerInvalidError
 
 MAX_ANSWER_CHARS = 262_144
-"""Of an answer, thoughts in its text included. A longer one is refused: what is read is also what is kept."""
+"""Maximum length of an answer, including thoughts in its text."""
 
 T = TypeVar("T", bound=BaseModel)
 
@@ -16,16 +16,16 @@ _FENCE = "```"
 _THOUGHTS = ("<think>", "</think>")
 
 
-def json_object(text: str) -> dict[str, Any]:
-    """The object.
+def parse_json_object(text: str) -> dict[str, Any]:
+    """Parse the JSON object in a text.
 
     Raises:
         AnswerInvalidError: if there is none, or the text is longer than `MAX_ANSWER_CHARS`.
     """
     if len(text) > MAX_ANSWER_CHARS:
         raise AnswerInvalidError(f"the answer is longer than {MAX_ANSWER_CHARS} characters")
-    spoken = _without_thoughts(text.lstrip())
-    body = spoken if spoken.startswith("{") else _unfenced(spoken)
+    answer = _strip_thoughts(text.lstrip())
+    body = answer if answer.startswith("{") else _strip_fence(answer)
     start, end = body.find("{"), body.rfind("}")
     if start < 0 or end < start:
         raise AnswerInvalidError("the answer holds no JSON object")
@@ -39,10 +39,10 @@ def json_object(text: str) -> dict[str, Any]:
 
 
 def validate_answer(value: Any, model: type[T]) -> T:
-    """Validate a JSON value as a structure that bounds it.
+    """Validate a JSON value against a pydantic model.
 
     Raises:
-        AnswerInvalidError: if it does not fit; names the first place that does not, for a round of repair.
+        AnswerInvalidError: if it is invalid; names the first invalid place, for a round of repair.
     """
     try:
         return model.model_validate(value)
@@ -52,16 +52,16 @@ def validate_answer(value: Any, model: type[T]) -> T:
         raise AnswerInvalidError(f"{where}: {first['msg']}"[:500]) from error
 
 
-def _without_thoughts(text: str) -> str:
+def _strip_thoughts(text: str) -> str:
     opening, closing = _THOUGHTS
     end = text.find(closing)
     return text[end + len(closing) :].lstrip() if text.startswith(opening) and end >= 0 else text
 
 
-def _unfenced(text: str) -> str:
-    """What stands in the first fence, after the name of its language; all of it where no fence is closed.
+def _strip_fence(text: str) -> str:
+    """Return the content of the first closed code fence, with the name of its language; else all of the text.
 
-    By `find`, not by a pattern: the text is a stranger's, and patterns with two open ends take quadratic time.
+    By `find`, not by a pattern: the text is untrusted, and patterns with two open ends take quadratic time.
     """
     start = text.find(_FENCE)
     end = text.find(_FENCE, start + len(_FENCE))

@@ -3,6 +3,7 @@
 import base64
 import gzip
 import io
+import sys
 import time
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -13,9 +14,8 @@ from PIL import Image
 from schemas.config import CurateConfig, PerceiveConfig
 from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.models.remote.client import ModelClient
-from tableverse_factory.models.remote.endpoint import Endpoint, endpoint_of
-from tableverse_factory.models.remote.http import MAX_BODY_BYTES
-from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS, json_object
+from tableverse_factory.models.remote.endpoint import MAX_BODY_BYTES, Endpoint, read_endpoint
+from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS, parse_json_object
 from tableverse_factory.models.services import Services
 from tests.helpers.model_server import Scripted, chat, gemini
 
@@ -70,7 +70,7 @@ def test_gemini_gets_the_same_in_its_own_words(client, server):
     assert KEY not in str(server.paths) + str(server.asked)
     (asked,) = server.asked
     image, text = asked["contents"][0]["parts"]
-    assert image["inlineData"]["mimeType"] == "image/png"
+    assert image["inlineData"]["mime_type"] == "image/png"
     assert text == {"text": "Look."}
     assert asked["generationConfig"] == {"responseMimeType": "application/json", "responseJsonSchema": SCHEMA}
 
@@ -214,9 +214,9 @@ def test_a_refused_question_names_the_key_of_its_section(server, tmp_path):
         PerceiveConfig(detector="openai", base_url=server.url, model="m"),
         CurateConfig(judge="openai", base_url=server.url, model="m"),
     ):
-        with pytest.raises(ModelError, match=rf"configure {endpoint_of(config).section}\.enforce_schema: false"):
-            ModelClient(endpoint_of(config), Services(tmp_path)).ask("Look.", [], SCHEMA)
-    assert endpoint_of(config).section == "curate"
+        with pytest.raises(ModelError, match=rf"configure {read_endpoint(config).section}\.enforce_schema: false"):
+            ModelClient(read_endpoint(config), Services(tmp_path)).ask("Look.", [], SCHEMA)
+    assert read_endpoint(config).section == "curate"
 
 
 @pytest.mark.parametrize(
@@ -355,7 +355,7 @@ BROKEN_OFF = (
 def test_an_answer_without_words_is_asked_again(client, server, broken):
     dialect = "openai" if "choices" in broken.body else "gemini"
     server.say(broken, OK if dialect == "openai" else gemini('{"a": 1}'))
-    reply = client(dialect).ask_for(json_object, "Look.", [], SCHEMA)
+    reply = client(dialect).ask_for(parse_json_object, "Look.", [], SCHEMA)
     assert reply.value == {"a": 1}
     assert reply.rounds == 1
     assert len(server.asked) == 2
@@ -422,6 +422,31 @@ def test_a_proxy_of_no_use_stops_and_names_the_variables(tmp_path, monkeypatch, 
     assert "hidden" not in str(caught.value)
 
 
+@pytest.mark.parametrize("dialect", ["openai", "gemini"])
+def test_nothing_in_the_environment_changes_where_and_with_which_key_is_asked(client, server, monkeypatch, dialect):
+    for name in ("OPENAI_API_KEY", "OPENAI_ORG_ID", "OPENAI_PROJECT_ID", "GOOGLE_API_KEY", "GEMINI_API_KEY"):
+        monkeypatch.setenv(name, "from-the-environment")
+    for name in ("OPENAI_BASE_URL", "GOOGLE_GEMINI_BASE_URL", "HTTP_PROXY", "ALL_PROXY"):
+        monkeypatch.setenv(name, "http://127.0.0.1:9")
+    for name in ("GOOGLE_GENAI_USE_VERTEXAI", "GOOGLE_GENAI_USE_ENTERPRISE"):
+        monkeypatch.setenv(name, "true")
+    monkeypatch.setenv("GOOGLE_API_USE_MTLS_ENDPOINT", "always")
+    server.say(OK if dialect == "openai" else gemini('{"a": 1}'))
+    assert client(dialect).ask("Look.", [], SCHEMA) == {"a": 1}
+    assert "from-the-environment" not in str(server.headers)
+    assert KEY in str(server.headers)
+    assert client(dialect, key_env="").ask("Look again.", [], SCHEMA) == {"a": 1}
+    assert not {"authorization", "x-goog-api-key"} & set(server.headers[-1])
+
+
+@pytest.mark.parametrize(("dialect", "package"), [("openai", "openai"), ("gemini", "google.genai")])
+def test_a_missing_package_is_named_with_the_extra_that_brings_it(client, server, monkeypatch, dialect, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ModelAccessError, match=r"pip install 'tableverse-factory\[vlm\]'"):
+        client(dialect).ask("Look.", [], SCHEMA)
+    assert server.asked == []
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -437,7 +462,7 @@ def test_a_proxy_of_no_use_stops_and_names_the_variables(tmp_path, monkeypatch, 
 def test_a_flood_of_fences_is_read_in_no_time(text):
     started = time.process_time()
     with pytest.raises(AnswerInvalidError):
-        json_object(text)
+        parse_json_object(text)
     assert time.process_time() - started < 0.5
 
 
@@ -453,4 +478,4 @@ def test_a_flood_of_fences_is_read_in_no_time(text):
     ],
 )
 def test_the_object_is_found_wherever_a_model_puts_it(text):
-    assert json_object(text) in ({"a": 1}, {"a": "```"})
+    assert parse_json_object(text) in ({"a": 1}, {"a": "```"})

@@ -17,8 +17,8 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from schemas.config import AskingConfig
-from tableverse_factory.models.remote.rate_limiter import Pace
-with Pace(Path(sys.argv[1]), AskingConfig(max_parallel=1)).turn(time.monotonic() + 60):
+from tableverse_factory.models.remote.rate_limiter import RateLimiter
+with RateLimiter(Path(sys.argv[1]), AskingConfig(max_parallel=1)).turn(time.monotonic() + 60):
     print("here", flush=True)
     time.sleep(60)
 """
