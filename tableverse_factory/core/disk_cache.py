@@ -15,9 +15,9 @@ class DiskCache:
     """Files in a folder under keys, which are hashes.
 
     Attributes:
-        folder: Where they lie; made when the first is written.
-        suffix: Of their names, with the dot.
-        durable: Whether `put` waits until a file would survive a loss of power.
+        folder: Made when the first file is written.
+        suffix: Suffix of file names, with the dot.
+        durable: Flush each file to the disk, so that it survives a loss of power.
     """
 
     folder: Path

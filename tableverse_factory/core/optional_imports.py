@@ -10,9 +10,9 @@ def import_extra(module: str, what: str, extra: str) -> ModuleType:
     """Import a module of an optional package.
 
     Args:
-        module: To import.
-        what: That cannot be done without it: `the viewer`.
-        extra: Of this project, which brings it.
+        module: Dotted name.
+        what: Feature that needs it, for the error: `the viewer`.
+        extra: Extra of this project that installs it.
 
     Raises:
         InputError: `no_extra`, saying what to type, if it is not installed.

@@ -20,7 +20,7 @@ def load_pools(path: Path | None, config: Config) -> Pools:
 
     Args:
         path: YAML with a section per pool; None for none.
-        config: Of the build: a detector or a judge that asks a model waits more than it works.
+        config: Of the build: pools that ask a remote model take fewer CPUs.
 
     Raises:
         ConfigError: naming the key, its value and what is allowed.

@@ -37,9 +37,9 @@ def parallel_map(
 
     Args:
         work: A function that other processes can import, or a `partial` of one.
-        items: What it is called with.
+        items: Arguments of the calls.
         jobs: Processes; with 1, all is done in this one.
-        doing: What a process does, for the error: `draws scenes`.
+        doing: Predicate for the error: `draws scenes`.
         chunk: Items that a process is given at a time.
 
     Raises:

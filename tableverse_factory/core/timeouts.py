@@ -14,9 +14,9 @@ def call_with_timeout(seconds: float, question: Callable[[], T], late: Exception
     What waits in a library without end, or in its native part, ends neither by itself nor on Ctrl-C.
 
     Args:
-        seconds: How long it may take [s].
-        question: What is asked; it goes on in vain where it takes longer.
-        late: Raised then.
+        seconds: Longest wait [s].
+        question: Function to call; it goes on in its thread after a timeout.
+        late: Raised after a timeout.
     """
     answer: Future[T] = Future()
 

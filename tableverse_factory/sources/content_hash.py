@@ -29,9 +29,9 @@ def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str
     """Hash the files of an entry (sha256).
 
     Args:
-        kind: Which files to expect.
-        uri: Where they lie.
-        bounds: On what is read.
+        kind: Kind of the entry.
+        uri: Its uri.
+        bounds: Bounds on files.
         known: Digests of meshes by uri, to be read from and added to: many layouts name the same mesh.
 
     Raises:

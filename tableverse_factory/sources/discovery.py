@@ -36,7 +36,7 @@ class ManifestEntry:
 
     Attributes:
         uri: Absolute path, or fsspec URI; printable where `problem` says that it cannot be opened.
-        name: Its own name, made printable.
+        name: Last part of the uri, printable.
         problem: Code and detail of the reason why it cannot even be opened; else None.
     """
 
@@ -52,7 +52,7 @@ class Discovery:
 
     Attributes:
         entries: Sorted by uri, each once.
-        ignored: How many files and hidden folders were left alone, by what they are.
+        ignored: Numbers of ignored files and hidden folders, by kind.
     """
 
     entries: tuple[ManifestEntry, ...]

@@ -11,10 +11,10 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import decode_image, open_image, read_bytes
 
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
-"""Of Pillow: what becomes 8-bit sRGB without a guess. CMYK needs its printer's profile; grey of 16 bits would clip."""
+"""Pillow's modes that convert to 8-bit sRGB. CMYK needs its printer's profile; 16-bit grey would clip."""
 
 _ORIENTATION = 0x0112
-"""Tag of EXIF."""
+"""EXIF tag."""
 
 _TRANSPOSE_BY_ORIENTATION = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -25,7 +25,7 @@ _TRANSPOSE_BY_ORIENTATION = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What undoes each value of the tag."""
+"""Transposes that undo each value of the tag."""
 
 
 def read_image(uri: str, bounds: ObserveConfig) -> Picture:

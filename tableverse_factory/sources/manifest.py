@@ -49,9 +49,9 @@ def make_manifest(
 
     Args:
         paths: Folders and files.
-        bounds: On what is decoded.
-        listed: What lists of addresses led to.
-        criteria: What bare pictures must have; None takes all that decode.
+        bounds: Bounds on what is decoded.
+        listed: Entries of lists of addresses.
+        criteria: Criteria for bare pictures; None accepts all that decode.
         on_checked: Called with how many entries are checked, of how many.
 
     Raises:
@@ -129,8 +129,8 @@ class _EntryChecker:
     """Checks of entries, with results for files that several entries name.
 
     Attributes:
-        bounds: On what is read.
-        digests: Of meshes, by uri.
+        bounds: Bounds on what is read.
+        digests: Digests of meshes, by uri.
         refused: Why a mesh cannot be used, empty where it can, by uri.
     """
 

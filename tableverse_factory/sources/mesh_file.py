@@ -16,17 +16,11 @@ _MATERIAL_FILE = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 _DIFFUSE_MAP = re.compile(rb"^[ \t]*map_Kd[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 
 Locate = Callable[[str], str]
-"""From a path relative to the file that names the mesh, to a URI; it raises where the path leads too far."""
+"""Resolves a path, relative to the file that names the mesh, to a URI; raises where the path leads too far."""
 
 
 def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> TriangleMesh:
     """Read a mesh with its materials and pictures.
-
-    Args:
-        name: Path of the mesh, as it was given.
-        data: The file.
-        locate: Where other paths of this kind lie.
-        bounds: On bytes and pixels.
 
     Raises:
         GeometryError: as `read_mesh`.

@@ -22,7 +22,7 @@ def resolve_redirect(first: str, here: str, location: str) -> str:
     Args:
         first: The address that a person named.
         here: The one that answered.
-        location: What it answered.
+        location: Its Location header, untrusted.
 
     Raises:
         StoreError: if it is no address on the web, leaves https, or leads to another kind of network than `first` is
@@ -90,7 +90,7 @@ def find_networks(address: str) -> frozenset[str]:
 
 
 def classify_address(text: str) -> str:
-    """Classify an address as `public`, `private`, `loopback`, `link-local` or `special`; by the IPv4 one it may wrap."""
+    """Classify an address, or the IPv4 one it wraps: `public`, `private`, `loopback`, `link-local`, `special`."""
     address = ipaddress.ip_address(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address):
         inner = address.ipv4_mapped or address.sixtofour

@@ -21,10 +21,10 @@ from tableverse_factory.core.storage.files import StoragePath, read_whole
 
 ROW_GROUP = 64 * 1024
 PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
-"""What decides the bytes of a Parquet file besides its rows and pyarrow."""
+"""Options that affect the bytes of a Parquet file."""
 
 _READ_AHEAD_BYTES = 64 * 1024
-"""At most so much more is read than Arrow asks for, where a file system reads ahead; s3fs would read 50 MB."""
+"""Read-ahead beyond what Arrow asks for; s3fs would read 50 MB."""
 
 _MAX_WAIT_S = 1.0
 _OPEN_FILES: WeakSet[Any] = WeakSet()
@@ -70,8 +70,8 @@ def read_remote_table(
     """Read a small remote Parquet file in one request.
 
     Args:
-        filesystem: Where it lies.
-        path: Of the file.
+        filesystem: File system of the path.
+        path: The file.
         schema: Columns that the file lacks are null.
         columns: Some of them; all without.
 

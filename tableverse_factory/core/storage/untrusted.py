@@ -26,14 +26,14 @@ MAX_JSON_BYTES = 16 * 1024 * 1024
 MAX_JSON_DEPTH = 64
 _HTTP_SCHEMES = ("http://", "https://")
 _ABSENT_STATUSES = (403, 410)
-"""Besides 404: public buckets that may not be listed answer 403 for what is not there."""
+"""Besides 404: public buckets that may not be listed answer 403 for missing files."""
 _BAD_NAME_ERRNOS = (errno.ENAMETOOLONG, errno.ELOOP)
-"""Of the disk: nothing can lie there."""
+"""Errors of names that cannot exist on a disk."""
 IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
-"""Of what is decoded by its content; the last two are for textures alone, and folders and lists leave them out."""
+"""Formats that are decoded; the last two serve textures alone."""
 
 LARGE_IMAGE_BOUNDS = ObserveConfig(max_pixels=100_000_000)
-"""Of a map: 8K by 8K and a little more."""
+"""Bounds on texture maps: 8K by 8K and a little more."""
 
 _DECODE_ERRORS = (
     OSError,

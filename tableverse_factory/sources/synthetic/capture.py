@@ -19,12 +19,7 @@ MIN_VISIBLE_FRACTION = 0.01
 
 
 def encode_capture(scene: SyntheticScene, origin: dict[str, Any]) -> dict[str, bytes]:
-    """Encode every file of the capture, by its path within the folder.
-
-    Args:
-        scene: What was drawn.
-        origin: Where it comes from (generator, seed, scene), for `truth.json`.
-    """
+    """Encode every file of the capture, by its path within the folder."""
     ids = make_instance_ids(scene)
     camera = scene.camera
     intrinsics = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}

@@ -19,9 +19,9 @@ class Category:
     """A category of objects.
 
     Attributes:
-        make: Draws a specimen.
-        roles: What recipes may use it for.
-        weight: How often it stands alone, relative to the others.
+        make: Generator of one object.
+        roles: Uses in recipes.
+        weight: Relative frequency of standing alone.
         may_lie: Whether it is also found on its side.
     """
 

@@ -31,7 +31,7 @@ GENERATOR = "tableverse-synth-layout-1"
 LAYOUTS, MESHES, TRUTH = "layouts", "meshes", "truth"
 
 POSITION_NOISE_M = (0.007, 0.007, 0.0035)
-"""Standard deviation of the box centre's place along x, y and z: heights are known better, the table is seen."""
+"""Standard deviation of the box centre along x, y and z; the visible table makes heights more accurate."""
 HEADING_NOISE = float(np.deg2rad(4.0))
 TILT_NOISE = float(np.deg2rad(1.0))
 """About each horizontal axis."""
@@ -47,7 +47,7 @@ def synthesize_layouts(
 
     Args:
         out: A new or empty folder, or one that an earlier call with the same seed filled.
-        scenes: How many there shall be.
+        scenes: Number of layouts.
         seed: Not negative.
         on_scene: Called after each layout with its file and whether it was made now.
 
@@ -77,13 +77,7 @@ def synthesize_layouts(
 
 
 def encode_layout(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str, bytes]:
-    """Encode every file of one layout by its path, the layout last: where it exists, the others do.
-
-    Args:
-        scene_id: Name of the layout.
-        seed: Not negative.
-        origin: Where it comes from, written into the layout.
-    """
+    """Encode every file of one layout by its path, the layout last: where it exists, the others do."""
     placed, _ = arrange_scene(make_rng(seed, scene_id, "synth"), scene_id)
     rng = make_rng(seed, scene_id, "synth-registration")
     files, objects, truth = {}, [], {}
@@ -113,12 +107,7 @@ def encode_layout(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str,
 
 
 def perturb_pose(item: PlacedModel, rng: np.random.Generator) -> tuple[Pose, float]:
-    """Perturb pose and scale as a registration would, about the centre of the mesh's box.
-
-    Args:
-        item: An object at its true pose, at scale 1.
-        rng: Of the noise.
-    """
+    """Perturb pose and scale as a registration would, about the centre of the mesh's box."""
     center = box_center(item.model.mesh)
     tilt, heading = rng.normal(0.0, TILT_NOISE, 2), float(rng.normal(0.0, HEADING_NOISE))
     turn = multiply_quaternions(quaternion_about_z(heading), np.array([1.0, tilt[0] / 2, tilt[1] / 2, 0.0]))

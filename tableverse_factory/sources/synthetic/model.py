@@ -51,7 +51,7 @@ class GeneratedObject(Frozen):
     """One generated object, z up, resting on z = 0 as it naturally does, its foot about the origin.
 
     Attributes:
-        label: What a person calls it: `bowl`, `cereal box`.
+        label: Common name: `bowl`, `cereal box`.
         description: Label with its colour: `a red bowl`.
         mesh: Closed surface [m], without colours.
         pieces: Corners of convex bodies whose union is the object, cavities left open. Each of shape (k, 3) [m].

@@ -30,7 +30,7 @@ class SyntheticObject(Frozen):
     Attributes:
         placed: The model and its pose in the table frame.
         contained_in: Index of its container among the scene's objects, or None.
-        visible_pixels: How many pixels of the picture show it.
+        visible_pixels: Number of pixels that show it.
         visible_fraction: Their share of its silhouette, 0 to 1.
     """
 
@@ -109,10 +109,6 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
 
 def arrange_scene(rng: np.random.Generator, scene_id: str) -> tuple[list[PlacedModel], tuple[float, float]]:
     """Arrange objects at rest on a table, in its frame; returns them and the half extents of the table [m].
-
-    Args:
-        rng: All the chance there is.
-        scene_id: For the message of an error.
 
     Raises:
         GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.

@@ -23,7 +23,7 @@ class DepthSensor:
         baseline_m: From the camera to the projector, which stands to its left.
         disparity_sigma: Error of the disparity [px]; half of it is shared by neighbouring pixels.
         disparity_step: Smallest difference of disparity that is told apart [px].
-        wobble: How far a reading may come from beside its pixel [px], at depth edges.
+        wobble: Displacement of readings at depth edges [px].
         dropout: Share of pixels without a reading for no reason.
         depth_scale: Metres per unit of the depth image.
     """
@@ -65,7 +65,7 @@ def sense_depth(
 
     Args:
         rng: Draws the noise.
-        sensor: Which specimen.
+        sensor: Its parameters.
         camera: Intrinsics of the depth image.
         truth: Depth along the optical axis [m], 0 for none.
         facing: Cosine between the surface's normal and the line of sight.

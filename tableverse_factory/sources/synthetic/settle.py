@@ -30,10 +30,10 @@ class SyntheticRest(Frozen):
     """Result of settling.
 
     Attributes:
-        poses: Of every object, in the table frame, in the order given.
-        fallen: Indices of what is no longer on the table.
-        at_rest: Whether all that is left lay still at the end.
-        penetration_m: Deepest contact among what is left.
+        poses: Object to table, in the order given.
+        fallen: Indices of objects that fell off the table.
+        at_rest: Whether the others were still at the end.
+        penetration_m: Depth of the deepest contact [m].
     """
 
     poses: tuple[Pose, ...]

@@ -98,7 +98,7 @@ def choose_viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, p
         rng: Draws height, distance and a slight roll.
         camera: Intrinsics.
         azimuth: Direction in which the camera looks, over the table [rad].
-        points: What the picture should hold, in the table frame [m]. Shape (n, 3).
+        points: Points to show, in the table frame [m]. Shape (n, 3).
     """
     elevation = rng.uniform(LOWEST_RAD, HIGHEST_RAD)
     back = np.array([-np.cos(elevation) * np.cos(azimuth), -np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

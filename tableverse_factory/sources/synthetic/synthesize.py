@@ -27,7 +27,7 @@ def synthesize_captures(
 
     Args:
         out: A new or empty folder, or one that an earlier call with the same seed filled.
-        scenes: How many there shall be, 1 to `MAX_SCENES`.
+        scenes: Number of scenes, 1 to `MAX_SCENES`.
         seed: Not negative.
         on_scene: Called after each scene with its folder and whether it was made now.
 

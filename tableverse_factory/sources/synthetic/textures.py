@@ -28,7 +28,7 @@ def make_lattice_noise(
         rng: Draws the lattice values.
         size: Width and height [px].
         cells: Lattice cells of the coarsest octave along width and height.
-        octaves: How many.
+        octaves: Number of octaves.
     """
     total = np.zeros((size[1], size[0]), dtype=np.float32)
     for octave in range(octaves):

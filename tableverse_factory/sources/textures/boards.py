@@ -14,11 +14,11 @@ class BoardLayout(Frozen):
 
     Attributes:
         ids: Number of the board.
-        count: How many there are.
+        count: Number of boards.
         along: Place along the board, 0–1.
         across: Place across it, 0–1.
         edge: Distance to the nearest edge of the board, over the side of the square.
-        upright: Where boards run downwards.
+        upright: Whether the board runs downwards.
     """
 
     ids: Ids

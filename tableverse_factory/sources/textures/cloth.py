@@ -19,7 +19,7 @@ from tableverse_factory.sources.textures.fields import (
 )
 
 THREADS = (96, 128, 160)
-"""How many threads cross the square."""
+"""Threads across the square."""
 
 
 def linen(draw: TextureSampler) -> Raster:

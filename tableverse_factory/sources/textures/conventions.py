@@ -23,10 +23,10 @@ MAPS: dict[str, tuple[str, ...]] = {
     "specular": ("specular", "spec", "reflection"),
     "emission": ("emission", "emissive"),
 }
-"""Kinds of maps and what they are called. A `normal` does not say which way its green goes."""
+"""Kinds of maps and their names. A `normal` does not say which way its green points."""
 
 LICENCES: dict[str, str] = {"ambientcg": "CC0-1.0", "cc0-textures": "CC0-1.0", "sharetextures": "CC0-1.0"}
-"""What each source gives its maps away under, at the time of writing."""
+"""Licence of each source's maps, at the time of writing."""
 
 _SOURCES = {"ambientcg": "ambientcg", "cc0textures": "cc0-textures", "sharetextures": "sharetextures"}
 _KINDS = {alias: kind for kind, aliases in MAPS.items() for alias in aliases}

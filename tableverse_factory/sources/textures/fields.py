@@ -26,7 +26,7 @@ Ids = Int32[np.ndarray, "n n"]
 
 _SHADES = 1024
 _SPLINE_GAIN = np.float32(3.6)
-"""Brings values between -1 and 1, smoothed by the spline, to a standard deviation of about 1."""
+"""Scales values in -1 to 1, smoothed by the spline, to a standard deviation of about 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class Cells(Frozen):
         nearest: Distance to it, in cells.
         second: Distance to the second nearest.
         ids: Its number.
-        count: How many points there are.
+        count: Number of points.
     """
 
     nearest: Field
@@ -75,7 +75,7 @@ def make_noise(
         rng: Draws the lattice.
         size: Pixels of a side.
         cells: Lattice cells of the coarsest octave to the right and downwards.
-        octaves: How many, each twice as fine.
+        octaves: Number of octaves, each twice as fine.
         gain: Weight of each against the one before.
     """
     total = np.zeros((size, size), dtype=np.float32)

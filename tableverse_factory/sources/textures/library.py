@@ -86,7 +86,7 @@ def open_library(path: Path, root: Path | None = None) -> TextureLibrary:
 
     Args:
         path: The Parquet file.
-        root: Where the repository lies now; where it lay when it was indexed, by default.
+        root: Folder of the repository; by default the one at the time of indexing.
 
     Raises:
         InputError: if the file is no index.

@@ -72,7 +72,7 @@ def index_textures(root: Path, source: str = "") -> pa.Table:
 
     Args:
         root: The folder.
-        source: Where all of it comes from, where no sidecar says otherwise: a key of `LICENCES`, or any other name.
+        source: Source of sets without a sidecar: a key of `LICENCES`, or any other name.
 
     Returns:
         Rows of `INDEX_SCHEMA`, by folder and name; `root` stands in its metadata.

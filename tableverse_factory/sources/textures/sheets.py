@@ -27,7 +27,7 @@ METALS: tuple[tuple[float, float], ...] = (
     (0.08, 0.10),  # anodised red
     (0.30, 0.05),  # champagne
 )
-"""Hue and the most chroma."""
+"""Hue and greatest chroma."""
 
 
 def brushed_metal(draw: TextureSampler) -> Raster:

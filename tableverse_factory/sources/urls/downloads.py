@@ -49,7 +49,7 @@ def download_images(
     Args:
         urls: Each once, untrusted.
         store: Where pictures are kept.
-        bounds: On fetching.
+        bounds: Bounds on fetching.
         pictures: Bounds on pictures that are stored.
         on_done: Called with the numbers of finished and of all addresses.
 

@@ -94,9 +94,9 @@ async def fetch_bytes(
     """Fetch the bytes behind an address.
 
     Args:
-        pool: Of connections.
+        pool: Connection pool.
         text: The address, untrusted.
-        bounds: On the answer.
+        bounds: Bounds on the answer.
         turns: A slot is held during each request, and none during waits.
 
     Raises:

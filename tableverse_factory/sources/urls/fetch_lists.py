@@ -29,7 +29,7 @@ class Origin:
 
 
 NO_ORIGIN = Origin("", "", "")
-"""Of what lies in a folder: a sidecar may say more."""
+"""Origin of entries from folders: a sidecar may state another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +37,8 @@ class FetchedLists:
     """Entries of lists.
 
     Attributes:
-        entries: One for each row, in the order of the rows, with where it came from.
-        ignored: What was left alone in the lists, by what it is.
+        entries: An entry for each row, in order, with its origin.
+        ignored: Numbers of ignored columns, by list.
         fetched: Pictures that came now.
         earlier: Pictures that an earlier run had fetched.
     """
@@ -65,7 +65,7 @@ def fetch_lists(
         lists: Paths or URIs.
         pictures: Folder of what was fetched.
         fetching: Bounds on fetching.
-        bounds: On what is kept.
+        bounds: Bounds on pictures that are stored.
         on_done: Called with how many addresses are done, of how many.
 
     Raises:

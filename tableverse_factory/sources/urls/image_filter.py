@@ -23,10 +23,10 @@ class FilterCriteria:
     """Criteria for bare pictures; docs/sourcing.md derives the defaults.
 
     Attributes:
-        min_side_px: Of the shorter side [px].
-        max_aspect: Longer side over shorter.
-        min_contrast: Standard deviation of its grey, of 255.
-        min_sharpness: Variance of the Laplacian over the variance of the grey.
+        min_side_px: Least length of the shorter side [px].
+        max_aspect: Greatest ratio of the longer to the shorter side.
+        min_contrast: Least standard deviation of the grey values, of 255.
+        min_sharpness: Least variance of the Laplacian over the variance of the grey values.
         near_bits: Pictures whose hashes differ in at most this many of 64 bits are duplicates; -1 for never.
     """
 
@@ -89,13 +89,7 @@ def find_rejection(stats: ImageStats, criteria: FilterCriteria) -> tuple[str, st
 def filter_rows(
     rows: Sequence[ImageRow], stats: Mapping[str, ImageStats], criteria: FilterCriteria
 ) -> tuple[ImageRow, ...]:
-    """Reject the rows of pictures that fail the criteria.
-
-    Args:
-        rows: Of a manifest; ids are unique.
-        stats: Of the bare pictures among them, by scene id. Nothing else is checked.
-        criteria: What they must have.
-    """
+    """Reject the rows of pictures that fail the criteria."""
     checked = [_apply_criteria(row, stats.get(row.scene_id), criteria) for row in rows]
     remaining = [number for number, row in enumerate(checked) if not row.rejected and row.scene_id in stats]
     if criteria.near_bits < 0:

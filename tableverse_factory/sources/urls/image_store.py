@@ -9,7 +9,7 @@ from tableverse_factory.core.storage.files import write_atomic, write_error
 
 INDEX_NAME = "index.jsonl"
 SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp"}
-"""Endings of the formats that are kept, by Pillow's name."""
+"""File suffixes by Pillow's name of the format."""
 
 
 class ImageStore:

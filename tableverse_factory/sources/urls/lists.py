@@ -24,7 +24,7 @@ MAX_ROWS = 1_000_000
 MAX_SOURCE_CHARS = 2048
 MAX_LICENCE_CHARS = 512
 _COLUMN_ALIASES = {"url": "url", "source": "source", "licence": "licence", "license": "licence"}
-"""What a column is called, in small letters, and what it is."""
+"""Columns by their lower-case names."""
 
 _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
@@ -38,7 +38,7 @@ class ListRow:
 
     Attributes:
         url: As it stands there, at most `MAX_URL_CHARS` characters; it may hold a secret and is never shown as it is.
-        source: Where the picture comes from, printable.
+        source: Source of the picture, printable.
         licence: Its licence, printable.
         problem: Code and detail of the reason why the row cannot be used; else None.
     """

@@ -7,7 +7,7 @@ import numpy as np
 from tableverse_factory.sources.urls.phash import HASH_BITS
 
 MAX_BITS = 7
-"""Beyond it different scenes look alike; and up to it, of four words one differs in at most one bit."""
+"""Beyond, different scenes look alike; up to it, one of four words differs in at most one bit."""
 
 _WORDS = 4
 _WORD_BITS = HASH_BITS // _WORDS
@@ -64,8 +64,8 @@ def find_near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int)
     unless one that is kept already lies within `bits`. What is kept depends on this order alone.
 
     Args:
-        hashes: Of the pictures.
-        worth: Of each.
+        hashes: Perceptual hashes of the pictures.
+        worth: Rank of each picture; the higher one is kept.
         bits: Within which two pictures are the same; at most `MAX_BITS`.
 
     Returns:
