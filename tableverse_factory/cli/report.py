@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.arm import check_arm
+from tableverse_factory.cli.arm import check_robot_option
 
 
 def report(
@@ -38,20 +38,21 @@ def report(
 
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
-    from tableverse_factory.cli.cleanup_on_sigterm import orderly_end
-    from tableverse_factory.cli.progress_bar import counter
-    from tableverse_factory.core.process_pool import available_cpus
+    from tableverse_factory.cli.cleanup_on_sigterm import unwind_on_sigterm
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
-    from tableverse_factory.viz.gallery.gallery import default_dest, write_gallery
+    from tableverse_factory.viz.gallery.gallery import write_gallery
+    from tableverse_factory.viz.output_folder import choose_destination
 
     dataset = open_dataset(out)
-    check_arm(out, robot, needed=False)
-    with orderly_end(), counter("drawn") as count:
+    check_robot_option(out, robot, needed=False)
+    with unwind_on_sigterm(), count_progress("drawn") as count:
         index = write_gallery(
             dataset,
-            dest or default_dest(out),
-            jobs or available_cpus(),
-            count.at,
+            dest or choose_destination(out, "gallery"),
+            jobs or count_available_cpus(),
+            count.update,
             renders=renders,
             films=films,
             robot=robot,

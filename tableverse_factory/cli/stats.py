@@ -5,17 +5,17 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, Built, on_this_machine
+from tableverse_factory.cli.options import AsJson, BuiltOut, require_local_path
 
 
 def stats(
-    out: Built,
+    out: BuiltOut,
     dest: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="FOLDER",
-            callback=on_this_machine,
+            callback=require_local_path,
             help="For the files; OUT-statistics, beside the dataset, by default.",
         ),
     ] = None,
@@ -30,11 +30,12 @@ def stats(
     import json
 
     from tableverse_factory.dataset.dataset import open_dataset
-    from tableverse_factory.viz.overview.write import default_dest, figures, write_statistics
+    from tableverse_factory.viz.output_folder import choose_destination
+    from tableverse_factory.viz.overview.write import make_report, write_statistics
 
     dataset = open_dataset(out)
     if as_json:
-        print(json.dumps(figures(dataset), indent=1, sort_keys=True, allow_nan=False))
+        print(json.dumps(make_report(dataset), indent=1, sort_keys=True, allow_nan=False))
         return
-    for path in write_statistics(dataset, dest or default_dest(out)):
+    for path in write_statistics(dataset, dest or choose_destination(out, "statistics")):
         print(path)

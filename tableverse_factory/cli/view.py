@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.arm import check_arm
+from tableverse_factory.cli.arm import check_robot_option
 
 
 def view(
@@ -37,21 +37,21 @@ def view(
 
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.dataset.dataset import open_dataset
-    from tableverse_factory.viz.viewer.loaded_scene import scene_file
+    from tableverse_factory.viz.viewer.loaded_scene import load_scene_file
     from tableverse_factory.viz.viewer.scene_cache import SceneCache
-    from tableverse_factory.viz.viewer.server import Viewer, need_viser
+    from tableverse_factory.viz.viewer.server import Viewer, import_viser
 
-    need_viser()
+    import_viser()
     alone = out.endswith(".xml")
     if alone and scene_id is not None:
         raise InputError(f"{out} is one scene: give no other beside it")
     if not alone:
-        check_arm(out, robot, needed=False)
-    shelf = SceneCache(scene_file(Path(out)) if alone else open_dataset(out))
+        check_robot_option(out, robot, needed=False)
+    shelf = SceneCache(load_scene_file(Path(out)) if alone else open_dataset(out))
     first = scene_id or shelf.first()
     if first is None:
         raise InputError(f"{out}: no scene is committed yet")
-    if alone or shelf.lost(first) is None:
+    if alone or shelf.find_dropped_row(first) is None:
         shelf.open(first)
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())

@@ -14,7 +14,7 @@ from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Scene, open_dataset
 from tableverse_factory.dataset.shards import TarShard, shard_path
 from tableverse_factory.dataset.trajectory_files import add_digests
-from tests.helpers.recorded_dataset import CAMERA, X_ID, Y_ID, arrays_bytes, recording, scene_members, trajectory_row
+from tests.helpers.recorded_dataset import CAMERA, X_ID, Y_ID, encode_recording, recording, scene_members, trajectory_row
 
 HOSTILE = "</div><script>alert(1)</script>\"'><img src=x onerror=alert(2)> **b** &amp;"
 ASIDE_M, ABOVE_M = 0.1, 0.05
@@ -49,8 +49,8 @@ def write_viewed_dataset(out: Path, more: Sequence[str] = ()) -> Path:
     """A scene with a success and a failure, one without a camera, one that was dropped; more like the second."""
     lost = {"scene_id": "c-3", "status": "dropped", "stage": "settle", "reason": "not_at_rest", "detail": HOSTILE}
     moved = [
-        (trajectory_row("a-1", "task_000", True), arrays_bytes(recording())),
-        (trajectory_row("a-1", "task_001", False), arrays_bytes(recording(31, swing=-0.5))),
+        (trajectory_row("a-1", "task_000", True), encode_recording(recording())),
+        (trajectory_row("a-1", "task_001", False), encode_recording(recording(31, swing=-0.5))),
         (trajectory_row("a-1", "task_002", False, arrays=None, reason="no_grasp", failed_phase=None), None),
     ]
     scenes, files = [{**lost, "shard": 0}], {"a-1": members("a-1"), "b-2": members("b-2", photographed=False)}

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import msgspec.msgpack
@@ -45,7 +46,8 @@ class Looker:
         self._uuids: dict[tuple[str, str], str] = {}
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
-        self._send(_CAMERA)  # viser takes a browser for there once it says where its camera is
+        with suppress(ConnectionClosed):  # the server may have refused the connection
+            self.send(_CAMERA)  # viser counts a browser as connected after its first camera message
 
     def __enter__(self) -> "Looker":
         return self
@@ -57,7 +59,7 @@ class Looker:
     def set(self, label: str, value: Any, kind: str = "") -> None:
         """Does what a hand does: nothing waits for the answer."""
         (uuid,) = (uuid for (name, which), uuid in self._uuids.items() if name == label and kind in which)
-        self._send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
+        self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
 
     def options(self, label: str) -> list[str]:
         """Of a dropdown, as they are now."""
@@ -69,7 +71,8 @@ class Looker:
         """Whether a scene with motions is shown."""
         return any(name == "Task" for name, _ in self._uuids) and len(self.options("Task")) > 1
 
-    def _send(self, message: dict[str, Any]) -> None:
+    def send(self, message: dict[str, Any]) -> None:
+        """Sends a message of viser's protocol."""
         self._socket.send(msgspec.msgpack.encode(message))
 
     def _listen(self) -> None:

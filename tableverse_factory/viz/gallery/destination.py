@@ -1,4 +1,4 @@
-"""The folder of a gallery: what may be replaced by a new one, and how, so that nothing of anybody's is lost."""
+"""Destination folder of a gallery: check that a new gallery may replace its content, and replace it safely."""
 
 import json
 import os
@@ -7,35 +7,35 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import filesystem_at
+from tableverse_factory.core.storage.files import resolve_filesystem
 
-MARK = "tableverse-gallery.json"
-"""Lies in every gallery, and lists its files."""
+MARKER = "tableverse-gallery.json"
+"""File in every gallery that lists its files."""
 
 _LOCAL = ("file://", "local://")
 _ELSE = "give a new or an empty folder"
 
 
-def folder_of(path: str) -> Path | None:
-    """Where a dataset lies on the disk; None where it lies elsewhere."""
+def find_local_folder(path: str) -> Path | None:
+    """Return the folder of a dataset on the disk; None if it is elsewhere."""
     if "://" in path and not path.startswith(_LOCAL):
         return None
-    return Path(os.path.abspath(filesystem_at(path)[1]))  # noqa: PTH100 keeps the name of a link, drops `..`
+    return Path(os.path.abspath(resolve_filesystem(path)[1]))  # noqa: PTH100 keeps the name of a link, drops `..`
 
 
-def checked_dest(dest: Path, dataset: Path | None) -> Path:
-    """The folder itself, where `dest` is a link to it.
+def resolve_destination(dest: Path, dataset: Path | None) -> Path:
+    """Check a destination and resolve its links.
 
     Args:
-        dest: May be new, empty, or an earlier gallery.
-        dataset: Its folder, on the disk.
+        dest: New or empty folder, or an earlier gallery.
+        dataset: Folder of the dataset, if it is on the disk.
 
     Raises:
         InputError: if it holds anything but an earlier gallery, lies within the dataset, or holds it.
     """
     try:
         folder = dest.resolve()
-    except RuntimeError:  # Python's word for a link that leads to itself
+    except RuntimeError:  # a link that leads to itself
         raise InputError(f"{dest}: a link that leads nowhere; {_ELSE}") from None
     if dataset is not None:
         root = dataset.resolve()
@@ -50,38 +50,38 @@ def checked_dest(dest: Path, dataset: Path | None) -> Path:
 
 
 def check_replaceable(folder: Path, name: str) -> None:
-    """Whether all that lies in a folder was put there by a gallery.
+    """Check that a folder is absent, empty, or holds nothing but a gallery.
 
     Args:
-        folder: May be absent.
-        name: For errors.
+        folder: The folder.
+        name: Its name in errors.
 
     Raises:
-        InputError: if it is a file, or something in it is no part of the gallery there.
+        InputError: if it is a file, or holds something that is not part of a gallery.
     """
     if not folder.exists():
         return
     if not folder.is_dir():
         raise InputError(f"{name}: a file; {_ELSE}")
-    found = list(_entries(folder))
+    found = list(_list_entries(folder))
     if not found:
         return
-    if not (folder / MARK).is_file():
+    if not (folder / MARKER).is_file():
         raise InputError(f"{name}: holds something that is no gallery; {_ELSE}")
-    own = _listed(folder / MARK, name)
+    own = _read_marker(folder / MARKER, name)
     foreign = [entry for entry in found if entry not in own]
     if foreign:
         more = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         raise InputError(f"{name}: holds {foreign[0]!r:.200}{more}, no part of the gallery there: move it, or {_ELSE}")
 
 
-def _entries(folder: Path) -> Iterator[str]:
-    """Whatever lies below, by name; folders end in a slash. Links are not followed.
+def _list_entries(folder: Path) -> Iterator[str]:
+    """List everything below a folder by relative name; folders end in a slash. Links are not followed.
 
     Raises:
-        OSError: if a folder cannot be looked into.
+        OSError: if a folder cannot be read.
     """
-    for base, folders, files in os.walk(folder, onerror=_raised):
+    for base, folders, files in os.walk(folder, onerror=_reraise):
         above = Path(base).relative_to(folder)
         for name in sorted(files):
             yield (above / name).as_posix()
@@ -89,46 +89,46 @@ def _entries(folder: Path) -> Iterator[str]:
             yield (above / name).as_posix() + ("" if (Path(base) / name).is_symlink() else "/")
 
 
-def _raised(error: OSError) -> None:
+def _reraise(error: OSError) -> None:
     raise error
 
 
-def _listed(mark: Path, name: str) -> frozenset[str]:
-    """The mark itself, the files that it lists, and their folders."""
+def _read_marker(mark: Path, name: str) -> frozenset[str]:
+    """Return the marker itself, the files that it lists, and their folders."""
     try:
         known: Any = json.loads(mark.read_text(encoding="utf-8"))
         files = [str(file) for file in known["files"]]
         folders = [str(folder) for folder in known["folders"]]
     except (KeyError, TypeError, ValueError, RecursionError):
         raise InputError(
-            f"{name}: a gallery whose {MARK} does not list its files, as of an earlier version: delete it, or {_ELSE}"
+            f"{name}: a gallery whose {MARKER} does not list its files, as of an earlier version: delete it, or {_ELSE}"
         ) from None
-    return frozenset([MARK, *files, *folders])
+    return frozenset([MARKER, *files, *folders])
 
 
-def write_mark(folder: Path, made_by: str, scenes: int) -> None:
-    """Lists all that lies in a finished gallery."""
-    entries = sorted(entry for entry in _entries(folder) if entry != MARK)
+def write_marker(folder: Path, made_by: str, scenes: int) -> None:
+    """Write the marker of a finished gallery, which lists its files."""
+    entries = sorted(entry for entry in _list_entries(folder) if entry != MARKER)
     mark = {
         "made_by": made_by,
         "scenes": scenes,
         "folders": [entry for entry in entries if entry.endswith("/")],
         "files": [entry for entry in entries if not entry.endswith("/")],
     }
-    (folder / MARK).write_text(json.dumps(mark, indent=1) + "\n", encoding="utf-8")
+    (folder / MARKER).write_text(json.dumps(mark, indent=1) + "\n", encoding="utf-8")
 
 
-def put_in_place(new: Path, folder: Path, aside: Path, name: str) -> None:
-    """Renames what was there aside, and the finished gallery to its folder. A kill between the two leaves both.
+def replace_folder(new: Path, folder: Path, aside: Path, name: str) -> None:
+    """Rename the earlier gallery aside and the finished one to its folder; a kill between the two keeps both.
 
     Args:
-        new: Beside `folder`, on the same file system.
-        folder: As `checked_dest` gave it.
-        aside: Absent, on the same file system.
-        name: Of the folder, for errors.
+        new: The finished gallery, on the same file system.
+        folder: The destination from `resolve_destination`.
+        aside: Absent path on the same file system.
+        name: Name of the folder in errors.
 
     Raises:
-        InputError: if somebody has put something into the folder meanwhile; it is back in its place then.
+        InputError: if something was added to the folder meanwhile; the folder is restored.
     """
     if not folder.exists():
         new.rename(folder)

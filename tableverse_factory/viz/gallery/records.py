@@ -1,4 +1,4 @@
-"""The rows of a dataset as the gallery tells them: what entered, what was lost where, what is in each scene."""
+"""Rows of a dataset for the gallery: finished scenes, lost ones, and charts."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -8,23 +8,17 @@ from typing import Any
 from schemas.identity import check_id
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.viz.funnel import SceneLoss
 
 Row = Mapping[str, Any]
 
 _MOST_REASONS = 60
-"""That are offered; free text finds the others."""
+"""Most reasons that the filter lists; free text finds the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneRecord:
-    """One scene with its rows.
-
-    Attributes:
-        row: Of scenes/.
-        objects: Its rows of objects/, in order.
-        tasks: Its rows of tasks/, in order.
-        trajectories: Its rows of trajectories/, in order.
-    """
+    """A scene: its row of scenes/ and, in order, its rows of objects/, tasks/ and trajectories/."""
 
     row: Row
     objects: Sequence[Row]
@@ -33,74 +27,55 @@ class SceneRecord:
 
     @property
     def scene_id(self) -> str:
-        """Safe as a file name: `schemas.identity.check_id`."""
+        """Id, safe as a file name (`schemas.identity.check_id`)."""
         return str(self.row["scene_id"])
 
     @property
     def title(self) -> str:
-        """Its own name, where it has one."""
+        """Name of the scene, else its id."""
         return str(self.row["name"] or self.row["scene_id"])
 
     @property
-    def why(self) -> str:
-        """Code of the drop or kind of the failure; empty where the scene is done."""
+    def reason(self) -> str:
+        """Code of the drop or kind of the failure; empty for a finished scene."""
         return str(self.row["reason"] or self.row["error_kind"] or "")
 
     @property
     def n_succeeded(self) -> int:
-        """Trajectories that succeed in simulation."""
+        """Number of trajectories that succeed in simulation."""
         return sum(bool(row["success"]) for row in self.trajectories)
 
     @property
     def n_tasks(self) -> int:
-        """Tasks that are possible."""
+        """Number of accepted tasks."""
         return sum(bool(task["accepted"]) for task in self.tasks)
 
     @property
     def penetration_m(self) -> float | None:
-        """The deepest overlap of two objects in the exported scene, of their meshes or of their pieces [m]."""
+        """Deepest overlap of two objects in the exported scene, on meshes or pieces [m]."""
         known = [self.row[key] for key in ("piece_penetration_m", "mesh_penetration_m")]
         return max((float(depth) for depth in known if depth is not None), default=None)
 
     @property
     def is_certified(self) -> bool:
-        """Whether the exported scene was measured."""
+        """Whether the scene has a certificate."""
         return None not in (self.row["at_rest"], self.row["colliding"], self.row["epsilon_m"])
 
     @property
     def labels(self) -> list[str]:
-        """The name of each of its objects."""
+        """Name of each object."""
         return [str(item["relabel_name"] or item["label"]) for item in self.objects]
 
     @property
     def names(self) -> list[str]:
-        """Names of its objects, those that repeat with their number, the most frequent first."""
+        """Names of the objects with their number where they repeat, the most frequent first."""
         counts = Counter(self.labels)
         return [name if n == 1 else f"{n} × {name}" for name, n in sorted(counts.items(), key=lambda c: (-c[1], c[0]))]
 
 
 @dataclass(frozen=True, slots=True)
-class GalleryLoss:
-    """Scenes that one stage lost for one reason."""
-
-    status: str
-    stage: str
-    why: str
-    count: int
-
-
-@dataclass(frozen=True, slots=True)
-class StageStep:
-    """A stage of the funnel: how many scenes left it, and whom it lost."""
-
-    stage: str
-    left: int
-    losses: tuple[GalleryLoss, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Bar:
-    """One bar of a chart; `share` of the longest."""
+    """A bar of a chart; `share` is its count over the largest one."""
 
     name: str
     count: int
@@ -109,7 +84,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Counts to draw: a histogram stands upright, a ranking lies."""
+    """A chart: an upright histogram or a horizontal ranking."""
 
     title: str
     bars: tuple[Bar, ...]
@@ -118,75 +93,60 @@ class Chart:
 
 @dataclass(slots=True)
 class Records:
-    """Everything that the gallery shows besides pictures.
-
-    Attributes:
-        done: Scenes with files, in the dataset's order.
-        lost: Dropped and failed scenes.
-    """
+    """Finished scenes, and dropped or failed ones, in the order of the dataset."""
 
     done: list[SceneRecord] = field(default_factory=list)
     lost: list[SceneRecord] = field(default_factory=list)
 
     @property
     def entered(self) -> int:
-        """Scenes of the manifest whose shard is committed."""
+        """Number of scenes of committed shards."""
         return len(self.done) + len(self.lost)
 
     @property
-    def moves(self) -> bool:
+    def has_trajectories(self) -> bool:
         """Whether any scene has trajectories."""
         return any(scene.trajectories for scene in self.done)
 
     @property
     def certified(self) -> list[SceneRecord]:
-        """The done scenes that were measured after they were exported."""
+        """Finished scenes with a certificate."""
         return [scene for scene in self.done if scene.is_certified]
 
     @property
     def n_sound(self) -> int:
-        """Of these, those that are at rest and do not collide."""
+        """Number of certified scenes that are at rest and free of collisions."""
         return sum(scene.row["at_rest"] and not scene.row["colliding"] for scene in self.certified)
 
     @property
     def epsilon_m(self) -> float:
-        """The deepest penetration that no certificate calls a collision [m]."""
+        """Deepest penetration that no certificate counts as a collision [m]."""
         return max((scene.row["epsilon_m"] for scene in self.certified), default=0.0)
 
     def count(self, status: str) -> int:
-        """Scenes of one status."""
+        """Count the scenes of a status."""
         return len(self.done) if status == "done" else sum(scene.row["status"] == status for scene in self.lost)
 
-    def reasons(self, unusable: Sequence[str]) -> tuple[tuple[str, int], ...]:
-        """Why scenes were lost, or are not usable, with how many there are of each; the most frequent first.
-
-        Args:
-            unusable: The judge's codes of the scenes that are done.
-        """
-        counts = Counter([*(scene.why for scene in self.lost if scene.why), *unusable])
+    def count_reasons(self, unusable: Sequence[str]) -> tuple[tuple[str, int], ...]:
+        """Count the reasons of lost scenes and the judge's codes of finished ones, the most frequent first."""
+        counts = Counter([*(scene.reason for scene in self.lost if scene.reason), *unusable])
         return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:_MOST_REASONS])
 
-    def funnel(self, stages: Sequence[str]) -> tuple[StageStep, ...]:
-        """How many scenes left each stage; stages that lost scenes and are not listed come first."""
-        losses = Counter((str(s.row["stage"]), str(s.row["status"]), s.why) for s in self.lost)
-        by_stage: dict[str, list[GalleryLoss]] = defaultdict(list)
-        for (stage, status, why), count in sorted(losses.items(), key=lambda item: (-item[1], item[0])):
-            by_stage[stage].append(GalleryLoss(status, stage, why, count))
-        left, steps = self.entered, []
-        for stage in (*sorted(set(by_stage) - set(stages)), *stages):
-            left -= sum(loss.count for loss in by_stage[stage])
-            steps.append(StageStep(stage, left, tuple(by_stage[stage])))
-        return tuple(steps)
+    def list_losses(self) -> list[SceneLoss]:
+        """List the losses by stage, status and reason, the largest first."""
+        losses = Counter((str(s.row["stage"]), str(s.row["status"]), s.reason) for s in self.lost)
+        ordered = sorted(losses.items(), key=lambda item: (-item[1], item[0]))
+        return [SceneLoss(*key, count) for key, count in ordered]
 
 
 @dataclass(frozen=True, slots=True)
 class SceneFacts:
-    """What the gallery takes from a scene's meta.json.
+    """Facts of meta.json.
 
     Attributes:
-        reason_codes: Why it is not usable.
+        reason_codes: The judge's reasons why the scene is not usable.
         criteria: The judge's points by criterion.
-        left_out: Objects that were seen but could not be placed, with the reason.
+        left_out: Objects that could not be placed, with the reason.
     """
 
     reason_codes: tuple[str, ...] = ()
@@ -194,11 +154,11 @@ class SceneFacts:
     left_out: tuple[tuple[str, str], ...] = ()
 
 
-def scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
-    """The facts, as text.
+def read_scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
+    """Read the facts of meta.json as text.
 
     Raises:
-        ValueError: if meta.json is not of the form that export gives it.
+        ValueError: if meta.json is not as export writes it.
     """
     try:
         assessment = meta["assessment"]
@@ -212,77 +172,81 @@ def scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
 
 
 def read_records(dataset: Dataset) -> Records:
-    """All rows of a dataset.
+    """Read all rows of a dataset.
 
     Raises:
         InputError: if the id of a done scene is not safe as a file name.
     """
-    objects, tasks, tried = (_by_scene(table) for table in (dataset.objects, dataset.tasks, dataset.trajectories))
+    objects, tasks, tried = (_group_by_scene(table) for table in (dataset.objects, dataset.tasks, dataset.trajectories))
     records = Records()
     for row in dataset.scenes.to_table().to_pylist():
         scene_id = row["scene_id"]
         if row["status"] == "done" and row["tar_offset"] is not None:
-            _check(scene_id)
-            things, asked, done = (table.get(scene_id, []) for table in (objects, tasks, tried))
-            records.done.append(SceneRecord(row, things, asked, done))
+            _check_scene_id(scene_id)
+            rows = (table.get(scene_id, []) for table in (objects, tasks, tried))
+            records.done.append(SceneRecord(row, *rows))
         else:
             records.lost.append(SceneRecord(row, (), (), ()))
     return records
 
 
-def _check(scene_id: str) -> None:
+def _check_scene_id(scene_id: str) -> None:
     try:
         check_id(scene_id)
     except ValueError as error:
         raise InputError(f"the dataset is damaged: scene {error}") from error
 
 
-def _by_scene(table: Any) -> dict[str, list[Row]]:
+def _group_by_scene(table: Any) -> dict[str, list[Row]]:
     rows: dict[str, list[Row]] = defaultdict(list)
     for row in table.to_table().to_pylist():
         rows[row["scene_id"]].append(row)
     return rows
 
 
-def bars(counts: Mapping[str, int], most: int, by_count: bool = True) -> tuple[Bar, ...]:
-    """The `most` largest counts as bars, or the first ones in their own order."""
+def make_bars(counts: Mapping[str, int], most: int, by_count: bool = True) -> tuple[Bar, ...]:
+    """Make bars of the `most` largest counts, or of the first ones in their order."""
     items = sorted(counts.items(), key=lambda item: (-item[1], item[0])) if by_count else list(counts.items())
     top = max((count for _, count in items), default=0) or 1
     return tuple(Bar(name, count, count / top) for name, count in items[:most])
 
 
-def charts(records: Records) -> tuple[Chart, ...]:
-    """Those of the overview."""
+def make_charts(records: Records) -> tuple[Chart, ...]:
+    """Make the charts of the first page."""
     objects = [item for scene in records.done for item in scene.objects]
     tasks = [task for scene in records.done for task in scene.tasks if task["accepted"]]
     names = Counter(name for scene in records.done for name in scene.labels)
     return (
-        Chart("Objects per scene", _histogram([scene.row["n_objects"] for scene in records.done]), upright=True),
-        Chart("Quality score", _histogram([scene.row["quality_score"] for scene in records.done], 1, 10), upright=True),
-        Chart("Mass of an object, up to", _masses([item["mass_kg"] for item in objects]), upright=True),
-        Chart("Most frequent objects", bars(names, 10), upright=False),
-        Chart("Relations asked for", bars(Counter(str(task["relation"]) for task in tasks), 10), upright=False),
+        Chart("Objects per scene", _count_integers([scene.row["n_objects"] for scene in records.done]), upright=True),
+        Chart(
+            "Quality score",
+            _count_integers([scene.row["quality_score"] for scene in records.done], 1, 10),
+            upright=True,
+        ),
+        Chart("Mass of an object, up to", _count_masses([item["mass_kg"] for item in objects]), upright=True),
+        Chart("Most frequent objects", make_bars(names, 10), upright=False),
+        Chart("Relations asked for", make_bars(Counter(str(task["relation"]) for task in tasks), 10), upright=False),
     )
 
 
 _MASS_EDGES_G = (10, 30, 100, 300, 1000, 3000)
 
 
-def _masses(masses_kg: Sequence[float | None]) -> tuple[Bar, ...]:
-    names = [*(_grams(edge) for edge in _MASS_EDGES_G), "more"]
+def _count_masses(masses_kg: Sequence[float | None]) -> tuple[Bar, ...]:
+    names = [*(_format_grams(edge) for edge in _MASS_EDGES_G), "more"]
     counts = dict.fromkeys(names, 0)
     for mass in masses_kg:
         if mass is not None:
             counts[names[sum(1000 * mass >= edge for edge in _MASS_EDGES_G)]] += 1
-    return bars(counts, len(names), by_count=False)
+    return make_bars(counts, len(names), by_count=False)
 
 
-def _grams(grams: int) -> str:
+def _format_grams(grams: int) -> str:
     return f"{grams} g" if grams < 1000 else f"{grams // 1000} kg"
 
 
-def _histogram(values: Sequence[int | None], low: int | None = None, high: int | None = None) -> tuple[Bar, ...]:
-    """A bar per whole number, at most 16: longer ranges are put together by twos, fours, …."""
+def _count_integers(values: Sequence[int | None], low: int | None = None, high: int | None = None) -> tuple[Bar, ...]:
+    """Make a bar per integer, at most 16: bins of longer ranges hold two, four, … integers."""
     known = [int(value) for value in values if value is not None]
     if not known:
         return ()
@@ -295,4 +259,4 @@ def _histogram(values: Sequence[int | None], low: int | None = None, high: int |
     for start in range(first, last + 1, width):
         name = str(start) if width == 1 else f"{start}–{start + width - 1}"
         counts[name] = sum(start <= value < start + width for value in known)
-    return bars(counts, len(counts), by_count=False)
+    return make_bars(counts, len(counts), by_count=False)

@@ -1,4 +1,4 @@
-"""The overview as one figure of panels (paper, figure 2), the same bytes for the same dataset."""
+"""Overview figure of a dataset (paper, figure 2), the same bytes for the same dataset."""
 
 import io
 import re
@@ -16,8 +16,8 @@ from matplotlib.ft2font import FT2Font
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.viz.overview.funnel import FunnelStep
-from tableverse_factory.viz.overview.gather import Histogram, Ranking, Statistics
+from tableverse_factory.viz.funnel import FunnelStep
+from tableverse_factory.viz.overview.dataset_statistics import Histogram, Ranking, Statistics
 
 INK, FAINT, GRID = "#1f2933", "#66727f", "#e4e8ec"
 BLUE, TEAL, AMBER, RED, PURPLE = "#2f6db3", "#2a9d8f", "#e0a030", "#c8503c", "#7a5ea8"
@@ -49,46 +49,42 @@ _STYLE: dict[Any, Any] = {
 _METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
 
 
-def overview(statistics: Statistics, steps: Sequence[FunnelStep], kind: Literal["png", "svg"]) -> bytes:
-    """The figure as a file.
-
-    Args:
-        statistics: What there is to show.
-        steps: The funnel.
-        kind: Of file.
-    """
-    with _styled():
+def draw_overview(statistics: Statistics, steps: Sequence[FunnelStep], kind: Literal["png", "svg"]) -> bytes:
+    """Draw the figure as the bytes of a PNG or SVG file."""
+    with _use_style():
         figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
-        _headline(figure, statistics)
+        _draw_headline(figure, statistics)
         grid = figure.add_gridspec(3, 3, left=0.105, right=0.985, top=0.86, bottom=0.055, hspace=0.42, wspace=0.44)
         panels: tuple[Callable[[Axes], None], ...] = (
-            lambda axes: _funnel(axes, statistics.scenes["entered"], steps),
-            lambda axes: _counts(axes, "Objects per scene", statistics.objects_per_scene, BLUE),
-            lambda axes: _counts(axes, "Quality score", statistics.quality_scores, TEAL),
-            lambda axes: _ranking(axes, "Most frequent categories", statistics.labels, BLUE, "objects"),
-            lambda axes: _long_tail(axes, statistics),
-            lambda axes: _ranking(axes, "Relations asked for", statistics.relations, PURPLE, "tasks"),
-            lambda axes: _logarithmic(axes, "Mass of an object", statistics.masses_kg, AMBER, _grams),
-            lambda axes: _logarithmic(axes, "Longest side of an object", statistics.sizes_m, TEAL, _millimetres),
-            lambda axes: _losses(axes, statistics),
+            lambda axes: _draw_funnel(axes, statistics.scenes["entered"], steps),
+            lambda axes: _draw_histogram(axes, "Objects per scene", statistics.objects_per_scene, BLUE),
+            lambda axes: _draw_histogram(axes, "Quality score", statistics.quality_scores, TEAL),
+            lambda axes: _draw_ranking(axes, "Most frequent categories", statistics.labels, BLUE, "objects"),
+            lambda axes: _draw_long_tail(axes, statistics),
+            lambda axes: _draw_ranking(axes, "Relations asked for", statistics.relations, PURPLE, "tasks"),
+            lambda axes: _draw_log_histogram(axes, "Mass of an object", statistics.masses_kg, AMBER, _format_mass),
+            lambda axes: _draw_log_histogram(
+                axes, "Longest side of an object", statistics.sizes_m, TEAL, _format_length
+            ),
+            lambda axes: _draw_losses(axes, statistics),
         )
         for index, draw in enumerate(panels):
             draw(figure.add_subplot(grid[index // 3, index % 3]))
         out = io.BytesIO()
         figure.savefig(out, format=kind, metadata=_METADATA[kind])
-    # Matplotlib repeats each text in a comment; foreign text stays in the outlines of its letters alone.
+    # Matplotlib repeats each text in a comment; untrusted text must stay glyph outlines only.
     return re.sub(rb" *<!--.*?-->\n?", b"", out.getvalue(), flags=re.DOTALL) if kind == "svg" else out.getvalue()
 
 
 @contextmanager
-def _styled() -> Iterator[None]:
+def _use_style() -> Iterator[None]:
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(_STYLE)
         yield
 
 
-def _headline(figure: Figure, statistics: Statistics) -> None:
+def _draw_headline(figure: Figure, statistics: Statistics) -> None:
     scenes, objects = statistics.scenes, statistics.objects
     per_scene = objects["total"] / scenes["done"] if scenes["done"] else 0.0
     numbers = (
@@ -105,53 +101,53 @@ def _headline(figure: Figure, statistics: Statistics) -> None:
         figure.text(x, 0.912, name, fontsize=10, color=FAINT)
 
 
-def _funnel(axes: Axes, entered: int, steps: Sequence[FunnelStep]) -> None:
+def _draw_funnel(axes: Axes, entered: int, steps: Sequence[FunnelStep]) -> None:
     axes.set_title("From pictures to scenes")
     names = ["entered", *(step.stage for step in steps)]
     left = np.array([entered, *(step.left for step in steps)])
-    dropped = np.array([0, *(step.dropped for step in steps)])
-    failed = np.array([0, *(step.failed for step in steps)])
+    dropped = np.array([0, *(step.count_lost("dropped") for step in steps)])
+    failed = np.array([0, *(step.count_lost("failed") for step in steps)])
     rows = np.arange(len(names))
     axes.barh(rows, left, color=BLUE, height=0.72)
     axes.barh(rows, dropped, left=left, color=AMBER, height=0.72, label="dropped")
     axes.barh(rows, failed, left=left + dropped, color=RED, height=0.72, label="failed")
     for row, count in enumerate(left.tolist()):
         axes.text(0.01 * max(entered, 1), row, f"{count:,}", va="center", fontsize=7.5, color="white")
-    _named_rows(axes, names)
+    _label_rows(axes, names)
     if entered:
         axes.legend(
             loc="lower right", bbox_to_anchor=(1.02, 0.98), ncols=2, frameon=False, fontsize=7.5, handlelength=1.0,
             columnspacing=1.0,
         )  # fmt: skip
-    _whole_numbers(axes, "x")
+    _use_integer_ticks(axes, "x")
 
 
-def _counts(axes: Axes, title: str, histogram: Histogram, color: str) -> None:
-    """Bars of whole numbers."""
+def _draw_histogram(axes: Axes, title: str, histogram: Histogram, color: str) -> None:
+    """Draw bars of integers."""
     axes.set_title(title)
-    if _empty(axes, sum(histogram.counts)):
+    if _mark_empty(axes, sum(histogram.counts)):
         return
     edges, counts = np.array(histogram.edges), np.array(histogram.counts)
     axes.bar(edges[:-1], counts, width=0.86 * np.diff(edges), align="edge", color=color)
     if edges[1] - edges[0] == 1:
-        axes.set_xticks(*_whole_ticks(edges[:-1]))
+        axes.set_xticks(*_choose_ticks(edges[:-1]))
     axes.set_ylabel("scenes")
     axes.grid(axis="y", color=GRID)
-    _whole_numbers(axes, "y")
+    _use_integer_ticks(axes, "y")
     middle = np.average(edges[:-1] + (edges[1] - edges[0] - 1) / 2, weights=counts)
-    _note(axes, f"mean {middle:.1f}")
+    _add_note(axes, f"mean {middle:.1f}")
 
 
-def _whole_ticks(values: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """At most 15 numbers, each below the middle of its bar."""
+def _choose_ticks(values: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Choose at most 15 ticks, each below the middle of its bar."""
     step = -(-len(values) // 15)
     shown = values[::step]
     return shown + 0.43, [f"{value:g}" for value in shown]
 
 
-def _ranking(axes: Axes, title: str, ranking: Ranking, color: str, unit: str, most: int = 12) -> None:
+def _draw_ranking(axes: Axes, title: str, ranking: Ranking, color: str, unit: str, most: int = 12) -> None:
     axes.set_title(title)
-    if _empty(axes, ranking.total):
+    if _mark_empty(axes, ranking.total):
         return
     shown = ranking.top[:most]
     counts = np.array([count for _, count in shown])
@@ -159,14 +155,14 @@ def _ranking(axes: Axes, title: str, ranking: Ranking, color: str, unit: str, mo
     for row, count in enumerate(counts):
         axes.text(count + 0.01 * counts.max(), row, f"{count:,}", va="center", fontsize=7.5, color=FAINT)
     axes.set_xlim(0, 1.14 * counts.max())
-    _named_rows(axes, [name for name, _ in shown], most)
+    _label_rows(axes, [name for name, _ in shown], most)
     axes.set_xlabel(unit)
-    _whole_numbers(axes, "x")
+    _use_integer_ticks(axes, "x")
 
 
-def _long_tail(axes: Axes, statistics: Statistics) -> None:
+def _draw_long_tail(axes: Axes, statistics: Statistics) -> None:
     axes.set_title("Long tail of categories")
-    if _empty(axes, len(statistics.long_tail)):
+    if _mark_empty(axes, len(statistics.long_tail)):
         return
     ranks, counts = np.array(statistics.long_tail, dtype=np.float64).T
     axes.set_xscale("log")
@@ -181,24 +177,24 @@ def _long_tail(axes: Axes, statistics: Statistics) -> None:
     axes.set_xlabel("rank of the category")
     axes.set_ylabel("objects")
     axes.grid(color=GRID)
-    half = _names_of_half(statistics.labels)
+    half = _count_names_of_half(statistics.labels)
     if half:
-        _note(axes, f"{half:,} of {statistics.labels.names:,} make half")
+        _add_note(axes, f"{half:,} of {statistics.labels.names:,} make half")
 
 
-def _names_of_half(labels: Ranking) -> int:
-    """How many of the most frequent names make half of all; 0 where more than are told."""
+def _count_names_of_half(labels: Ranking) -> int:
+    """Count the most frequent names that make half of all; 0 if the ranking lists too few."""
     reached = np.cumsum([count for _, count in labels.top]) >= labels.total / 2
     return int(np.argmax(reached)) + 1 if reached.any() else 0
 
 
-def _logarithmic(axes: Axes, title: str, histogram: Histogram, color: str, unit: Callable[[float], str]) -> None:
-    """Bars between edges that grow by one factor; ends gather what lies beyond."""
+def _draw_log_histogram(axes: Axes, title: str, histogram: Histogram, color: str, unit: Callable[[float], str]) -> None:
+    """Draw bars with logarithmic edges; the first and the last bin include the values beyond them."""
     axes.set_title(title)
     counts = np.array(histogram.counts)
     counts[0] += histogram.below
     counts[-1] += histogram.above
-    if _empty(axes, int(counts.sum())):
+    if _mark_empty(axes, int(counts.sum())):
         return
     places = np.log10(histogram.edges)
     axes.bar(places[:-1], counts, width=0.9 * np.diff(places), align="edge", color=color)
@@ -209,13 +205,13 @@ def _logarithmic(axes: Axes, title: str, histogram: Histogram, color: str, unit:
     axes.set_xticks(shown := ticks[(ticks >= low) & (ticks <= high)], [unit(10**tick) for tick in shown])
     axes.set_ylabel("objects")
     axes.grid(axis="y", color=GRID)
-    _whole_numbers(axes, "y")
+    _use_integer_ticks(axes, "y")
 
 
-def _losses(axes: Axes, statistics: Statistics) -> None:
+def _draw_losses(axes: Axes, statistics: Statistics) -> None:
     axes.set_title("Why scenes were lost")
     shown = statistics.losses[:12]
-    if _empty(axes, len(shown), "none was"):
+    if _mark_empty(axes, len(shown), "none was"):
         return
     counts = np.array([loss.count for loss in shown])
     colors = [RED if loss.status == "failed" else AMBER for loss in shown]
@@ -223,17 +219,17 @@ def _losses(axes: Axes, statistics: Statistics) -> None:
     for row, count in enumerate(counts):
         axes.text(count + 0.01 * counts.max(), row, f"{count:,}", va="center", fontsize=7.5, color=FAINT)
     axes.set_xlim(0, 1.14 * counts.max())
-    _named_rows(axes, [f"{loss.stage}: {loss.reason}" for loss in shown], 12)
+    _label_rows(axes, [f"{loss.stage}: {loss.reason}" for loss in shown], 12)
     axes.set_xlabel("scenes")
-    _whole_numbers(axes, "x")
+    _use_integer_ticks(axes, "x")
 
 
-def _note(axes: Axes, text: str) -> None:
-    """Beside the title."""
+def _add_note(axes: Axes, text: str) -> None:
+    """Add a note beside the title."""
     axes.set_title(text, loc="right", fontsize=8, fontweight="normal", color=FAINT)
 
 
-def _empty(axes: Axes, count: int, text: str = "nothing yet") -> bool:
+def _mark_empty(axes: Axes, count: int, text: str = "nothing yet") -> bool:
     if not count:
         axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=FAINT)
         axes.set_xticks([])
@@ -241,40 +237,40 @@ def _empty(axes: Axes, count: int, text: str = "nothing yet") -> bool:
     return not count
 
 
-def _named_rows(axes: Axes, names: Sequence[str], least: int = 0) -> None:
-    """Names from the top downwards; few rows are no thicker than many."""
-    axes.set_yticks(np.arange(len(names)), [drawable(name) for name in names])
+def _label_rows(axes: Axes, names: Sequence[str], least: int = 0) -> None:
+    """Label rows from the top; `least` keeps few rows as thin as many."""
+    axes.set_yticks(np.arange(len(names)), [sanitize_label(name) for name in names])
     axes.set_ylim(max(len(names), least) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0, labelcolor=INK)
     axes.grid(axis="x", color=GRID)
 
 
-def drawable(text: str) -> str:
-    """Foreign text on one short line, in letters that the font has: another is shown as an empty box."""
-    known = _letters()
+def sanitize_label(text: str) -> str:
+    """Cut untrusted text to one short line; characters that the font lacks become empty boxes."""
+    known = _load_glyphs()
     return "".join(c if ord(c) in known else "\u25a1" for c in sanitize_line(text, LABEL_CHARS))
 
 
 @cache
-def _letters() -> frozenset[int]:
+def _load_glyphs() -> frozenset[int]:
     return frozenset(FT2Font(findfont(FontProperties(family="DejaVu Sans"))).get_charmap())
 
 
-def _whole_numbers(axes: Axes, which: Literal["x", "y"]) -> None:
+def _use_integer_ticks(axes: Axes, which: Literal["x", "y"]) -> None:
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(MaxNLocator(nbins=5, integer=True))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: _format_count(value)))
 
 
-def _short(value: float) -> str:
+def _format_count(value: float) -> str:
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:,.0f}"
 
 
-def _grams(kilograms: float) -> str:
+def _format_mass(kilograms: float) -> str:
     return f"{kilograms:g} kg" if kilograms >= 0.99 else f"{1000 * kilograms:.3g} g"
 
 
-def _millimetres(metres: float) -> str:
+def _format_length(metres: float) -> str:
     return f"{metres:g} m" if metres >= 0.99 else f"{100 * metres:.3g} cm"

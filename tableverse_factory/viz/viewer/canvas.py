@@ -1,4 +1,4 @@
-"""One browser's 3D view: meshes are sent once, then only where they are."""
+"""The 3D view of one browser: meshes are sent once, then only their poses."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,18 +8,18 @@ import numpy as np
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.geometry.math.transforms import identity_pose
-from tableverse_factory.viz.viewer.glb import look_glb
+from tableverse_factory.viz.viewer.glb import encode_visuals
 from tableverse_factory.viz.viewer.layouts import Poses
-from tableverse_factory.viz.viewer.loaded_scene import OpenedScene, Still, VisualBody
-from tableverse_factory.viz.viewer.motion import MotionPlayback
+from tableverse_factory.viz.viewer.loaded_scene import LoadedScene, StaticVisuals, VisualBody
+from tableverse_factory.viz.viewer.motion_playback import MotionPlayback
+from tableverse_factory.viz.viewer.orbit_camera import OrbitCamera
 from tableverse_factory.viz.viewer.simulation import Contacts
-from tableverse_factory.viz.viewer.viewpoint import Viewpoint
 
 GHOST_COLORS = {"observed": (226, 125, 30), "rectified": (150, 80, 200), "settled": (40, 130, 90)}
 CONTACT_COLOR = (190, 0, 40)
 _GHOST_OPACITY = 0.38
 _LIGHT = {"hdri": "studio", "environment_intensity": 0.3}
-"""Of the surroundings: viser brings the picture along, and what is white does not drown in light."""
+"""Environment map of viser, dim enough for white objects."""
 
 _SKY = np.linspace((206, 214, 222), (240, 242, 244), 64).astype(np.uint8)[:, None].repeat(2, axis=1)
 _ARM_COLOR = (200, 200, 200)
@@ -27,113 +27,106 @@ _ARROW = {"shaft_radius": 0.0016, "head_radius": 0.004, "head_length": 0.009}
 
 
 class Canvas:
-    """What one client sees of a scene. Names of nodes are numbers: no text from a dataset is part of one."""
+    """The scene nodes of one client. Nodes are named by numbers, never by text from a dataset."""
 
     def __init__(self, client: Any) -> None:
-        """Begins with nothing.
-
-        Args:
-            client: A `viser.ClientHandle`.
-        """
+        """Begin with an empty view of a `viser.ClientHandle`."""
         self._client = client
-        self._viewpoint: Viewpoint | None = None
+        self._orbit_camera: OrbitCamera | None = None
         self._aspect = 0.0
-        client.camera.on_update(self._resized)
+        client.camera.on_update(self._on_camera_update)
         client.scene.configure_environment_map(**_LIGHT)
         self._clear()
 
     def _clear(self) -> None:
-        self._figures: tuple[VisualBody, ...] = ()
+        self._bodies: tuple[VisualBody, ...] = ()
         self._frames: dict[str, Any] = {}
         self._looks: list[Any] = []
         self._pieces: list[Any] = []
-        self._still: list[Any] = []
+        self._static: list[Any] = []
         self._labels: list[Any] = []
         self._ghosts: dict[str, list[Any]] = {}
         self._arm: list[Any] = []
         self._contacts: Any = None
 
-    def open(self, opened: OpenedScene) -> None:
-        """Shows another scene, in its settled layout."""
+    def open(self, loaded: LoadedScene) -> None:
+        """Show a scene in its settled layout."""
         self.close()
-        scene, self._figures = self._client.scene, opened.figures
+        scene, self._bodies = self._client.scene, loaded.bodies
         scene.set_background_image(_SKY)
-        for number, figure in enumerate(opened.figures):
+        for number, body in enumerate(loaded.bodies):
             name = f"/objects/{number}"
-            self._frames[figure.name] = scene.add_frame(name, show_axes=False, **_placed(opened.settled[figure.name]))
-            if figure.look:
-                self._looks.append(scene.add_glb(f"{name}/look", figure.look))
-        self.lay(opened.still)
+            self._frames[body.name] = scene.add_frame(
+                name, show_axes=False, **_pose_arguments(loaded.settled[body.name])
+            )
+            if body.look:
+                self._looks.append(scene.add_glb(f"{name}/look", body.look))
+        self.set_static(loaded.static)
 
     def close(self) -> None:
-        """Shows nothing."""
+        """Remove all nodes."""
         self._client.scene.reset()
         self._clear()
 
-    def lay(self, still: Still) -> None:
-        """Shows what stands still, in place of what did: the table."""
-        for handle in self._still:
+    def set_static(self, static: StaticVisuals) -> None:
+        """Replace the static bodies, such as the table."""
+        for handle in self._static:
             handle.remove()
-        self._still = [
-            self._client.scene.add_glb(f"/still/{number}", data, **_placed(pose))
-            for number, (data, pose) in enumerate(still)
+        self._static = [
+            self._client.scene.add_glb(f"/static/{number}", data, **_pose_arguments(pose))
+            for number, (data, pose) in enumerate(static)
         ]
 
-    def place(self, poses: Poses) -> None:
-        """Moves objects; one without a pose is not there."""
+    def set_poses(self, poses: Poses) -> None:
+        """Set the poses of the objects; hide those without one."""
         with self._client.atomic():
             for name, frame in self._frames.items():
                 if frame.visible != (name in poses):
                     frame.visible = name in poses
                 if name in poses:
-                    _move(frame, poses[name])
+                    _set_pose(frame, poses[name])
 
-    def show(self, looks: bool, pieces: bool) -> None:
-        """Shows what is seen, what collides, both or neither. Pieces are sent when they are first wanted."""
+    def set_visibility(self, looks: bool, pieces: bool) -> None:
+        """Show or hide visual meshes and collision pieces; pieces are sent when they are first shown."""
         if pieces and not self._pieces:
             scene = self._client.scene
             self._pieces = [
-                scene.add_glb(f"/objects/{number}/pieces", figure.pieces)
-                for number, figure in enumerate(self._figures)
-                if figure.pieces
+                scene.add_glb(f"/objects/{number}/pieces", body.pieces)
+                for number, body in enumerate(self._bodies)
+                if body.pieces
             ]
         for handles, wanted in ((self._looks, looks), (self._pieces, pieces)):
             for handle in handles:
                 handle.visible = wanted
 
-    def label(self, names: Mapping[str, str], shown: bool) -> None:
-        """Writes the names of the objects beside them.
-
-        Args:
-            names: By object; one line each.
-            shown: Whether they are seen.
-        """
+    def show_names(self, names: Mapping[str, str], shown: bool) -> None:
+        """Show or hide the display names of the objects."""
         if shown and not self._labels:
             self._labels = [
                 self._client.scene.add_label(
                     f"/objects/{number}/name",
-                    names.get(figure.name, figure.name),
-                    position=figure.shape.vertices.mean(axis=0) if len(figure.shape.vertices) else (0.0, 0.0, 0.0),
+                    names.get(body.name, body.name),
+                    position=body.shape.vertices.mean(axis=0) if len(body.shape.vertices) else (0.0, 0.0, 0.0),
                     anchor="bottom-center",
                 )
-                for number, figure in enumerate(self._figures)
+                for number, body in enumerate(self._bodies)
             ]
         for handle in self._labels:
             handle.visible = shown
 
-    def ghost(self, layout: str | None, poses: Poses) -> None:
-        """Shows the objects once more, transparent, as they stand in another layout; None shows none."""
+    def show_ghost(self, layout: str | None, poses: Poses) -> None:
+        """Show the objects transparently at the poses of another layout; None hides them."""
         if layout is not None and layout not in self._ghosts:
             self._ghosts[layout] = [
-                self._ghost(f"/ghosts/{layout}/{number}", figure.shape, poses[figure.name], layout)
-                for number, figure in enumerate(self._figures)
-                if figure.name in poses and len(figure.shape.faces)
+                self._add_ghost(f"/ghosts/{layout}/{number}", body.shape, poses[body.name], layout)
+                for number, body in enumerate(self._bodies)
+                if body.name in poses and len(body.shape.faces)
             ]
         for name, handles in self._ghosts.items():
             for handle in handles:
                 handle.visible = name == layout
 
-    def _ghost(self, name: str, mesh: TriangleMesh, pose: Pose, layout: str) -> Any:
+    def _add_ghost(self, name: str, mesh: TriangleMesh, pose: Pose, layout: str) -> Any:
         return self._client.scene.add_mesh_simple(
             name,
             mesh.vertices,
@@ -142,56 +135,58 @@ class Canvas:
             opacity=_GHOST_OPACITY,
             cast_shadow=False,
             receive_shadow=False,
-            **_placed(pose),
+            **_pose_arguments(pose),
         )
 
-    def touch(self, contacts: Contacts | None) -> None:
-        """Shows where things touch, an arrow along each normal, as long as the force is strong; None shows nothing."""
+    def show_contacts(self, contacts: Contacts | None) -> None:
+        """Show an arrow per contact along its normal, its length by the force; None hides them."""
         if self._contacts is not None:
             self._contacts.remove()
             self._contacts = None
         if contacts is not None and len(contacts):
-            self._contacts = self._client.scene.add_arrows("/contacts", contacts.arrows(), CONTACT_COLOR, **_ARROW)
+            self._contacts = self._client.scene.add_arrows(
+                "/contacts", contacts.compute_arrows(), CONTACT_COLOR, **_ARROW
+            )
 
-    def staff(self, motion: MotionPlayback | None) -> None:
-        """Shows the arm of a motion in place of any other."""
+    def show_arm(self, motion: MotionPlayback | None) -> None:
+        """Show the arm of a motion, or none."""
         for handle in self._arm:
             handle.remove()
         self._arm = []
         if motion is not None:
-            meshes = [_arm_glb(mesh) for mesh in (*motion.meshes, motion.pedestal)]
+            meshes = [_encode_arm_part(mesh) for mesh in (*motion.meshes, motion.pedestal)]
             self._arm = [self._client.scene.add_glb(f"/arm/{k}", data) for k, data in enumerate(meshes)]
 
-    def pose_arm(self, poses: Sequence[Pose]) -> None:
-        """Moves the arm's parts; the pedestal stands."""
+    def set_arm_poses(self, poses: Sequence[Pose]) -> None:
+        """Set the poses of the parts of the arm; the pedestal does not move."""
         with self._client.atomic():
             for handle, pose in zip(self._arm, (*poses, identity_pose()), strict=True):
-                _move(handle, pose)
+                _set_pose(handle, pose)
 
-    def look_from(self, viewpoint: Viewpoint) -> None:
-        """Puts the camera there."""
+    def set_camera(self, orbit_camera: OrbitCamera) -> None:
+        """Move the camera."""
         camera = self._client.camera
-        self._viewpoint, self._aspect = viewpoint, camera.aspect
+        self._orbit_camera, self._aspect = orbit_camera, camera.aspect
         with self._client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
-            camera.position = viewpoint.position
-            camera.look_at = viewpoint.target
-            camera.fov = viewpoint.field_of_view(camera.aspect)
+            camera.position = orbit_camera.position
+            camera.look_at = orbit_camera.target
+            camera.fov = orbit_camera.field_of_view(camera.aspect)
 
-    def _resized(self, camera: Any) -> None:
-        """Keeps the whole picture in view when the canvas gets another shape."""
-        if self._viewpoint is not None and abs(camera.aspect - self._aspect) > 1e-3:
+    def _on_camera_update(self, camera: Any) -> None:
+        """Keep the whole picture in view after a change of the aspect."""
+        if self._orbit_camera is not None and abs(camera.aspect - self._aspect) > 1e-3:
             self._aspect = camera.aspect
-            camera.fov = self._viewpoint.field_of_view(camera.aspect)
+            camera.fov = self._orbit_camera.field_of_view(camera.aspect)
 
 
-def _placed(pose: Pose) -> dict[str, np.ndarray]:
+def _pose_arguments(pose: Pose) -> dict[str, np.ndarray]:
     return {"position": np.array(pose.position), "wxyz": np.array(pose.quaternion_wxyz)}
 
 
-def _move(handle: Any, pose: Pose) -> None:
+def _set_pose(handle: Any, pose: Pose) -> None:
     handle.position, handle.wxyz = pose.position, pose.quaternion_wxyz
 
 
-def _arm_glb(mesh: TriangleMesh) -> bytes:
-    return look_glb([VisualMesh(mesh, _ARM_COLOR)])
+def _encode_arm_part(mesh: TriangleMesh) -> bytes:
+    return encode_visuals([VisualMesh(mesh, _ARM_COLOR)])

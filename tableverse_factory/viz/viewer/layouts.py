@@ -1,10 +1,10 @@
-"""Where the objects of a scene were at each step of the pipeline: as seen, as rectified, as settled."""
+"""Poses of the objects of a scene after each step of the pipeline: observed, rectified, settled."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from schemas.geometry import Pose
-from tableverse_factory.dataset.meta_poses import pose_in_meta
+from tableverse_factory.dataset.meta_poses import read_meta_pose
 
 SETTLED, RECTIFIED, OBSERVED = "settled", "rectified", "observed"
 LAYOUTS = (OBSERVED, RECTIFIED, SETTLED)
@@ -15,17 +15,17 @@ _KEYS = {OBSERVED: "placed", RECTIFIED: "rectified"}
 Poses = Mapping[str, Pose]
 
 
-def layouts_of(meta: Mapping[str, Any], settled: Poses) -> dict[str, Poses]:
-    """The layouts that a scene has, the settled one always.
+def read_layouts(meta: Mapping[str, Any], settled: Poses) -> dict[str, Poses]:
+    """Read the layouts of a scene; the settled one always exists.
 
-    An object that was counted and not seen by itself (`copy_of`) is in no observed layout.
+    Copies that were added by `count` (`copy_of`) are in no observed layout.
 
     Args:
-        meta: `meta.json`; a scene of other origin has no poses in it.
-        settled: Of the objects, as the exported model has them.
+        meta: `meta.json`; scenes of other origin have no poses in it.
+        settled: Poses of the objects in the exported model.
 
     Raises:
-        InputError: `bad_meta` for a pose that is none.
+        InputError: `bad_meta` for an invalid pose.
     """
     found: dict[str, Poses] = {}
     for layout, key in _KEYS.items():
@@ -35,7 +35,7 @@ def layouts_of(meta: Mapping[str, Any], settled: Poses) -> dict[str, Poses]:
             value = known.get(key) if isinstance(known, Mapping) else None
             name = str(item["object_id"])
             if value is not None and name in settled:
-                poses[name] = pose_in_meta(value, name)
+                poses[name] = read_meta_pose(value, name)
         if poses:
             found[layout] = poses
     return {**found, SETTLED: dict(settled)}

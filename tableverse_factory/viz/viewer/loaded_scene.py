@@ -1,4 +1,4 @@
-"""A scene made ready to be looked at: meshes to send once, layouts, camera, photograph, facts; nothing of a browser."""
+"""A scene loaded for the viewer: meshes, layouts, camera, photograph and rows, independent of any browser."""
 
 import io
 from collections.abc import Mapping
@@ -16,18 +16,18 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH, read_photograph
 from tableverse_factory.dataset.randomize import TableTexture
-from tableverse_factory.delivery.episodes.cameras import scene_eye
-from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, contents_of
+from tableverse_factory.delivery.episodes.cameras import load_scene_camera
+from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, read_model_contents
 from tableverse_factory.geometry.math.transforms import transform_points
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes
 from tableverse_factory.physics.mjcf.file_check import check_files
-from tableverse_factory.physics.simulate.model_solids import joined
-from tableverse_factory.viz.viewer.glb import look_glb, pieces_glb
-from tableverse_factory.viz.viewer.layouts import SETTLED, Poses, layouts_of
-from tableverse_factory.viz.viewer.motion import MotionPlayback
-from tableverse_factory.viz.viewer.viewpoint import Viewpoint, front_viewpoint, viewpoint_of
+from tableverse_factory.viz.viewer.glb import encode_pieces, encode_visuals
+from tableverse_factory.viz.viewer.layouts import SETTLED, Poses, read_layouts
+from tableverse_factory.viz.viewer.motion_playback import MotionPlayback
+from tableverse_factory.viz.viewer.orbit_camera import OrbitCamera, make_front_camera, make_orbit_camera
 
-Still = tuple[tuple[bytes, Pose], ...]
-"""GLB of what is seen of each thing that never moves, in its own frame, and that frame in the table frame."""
+StaticVisuals = tuple[tuple[bytes, Pose], ...]
+"""GLB of each static body in its own frame, and its pose in the table frame."""
 
 PHOTOGRAPH_PX = 640
 _QUALITY = 85
@@ -35,15 +35,15 @@ _QUALITY = 85
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisualBody(Frozen):
-    """One object, in its own frame.
+    """An object in its own frame.
 
     Attributes:
-        name: Of the object, as in the model.
-        look: GLB of what is seen; empty where nothing is.
-        pieces: GLB of its convex pieces.
-        n_pieces: How many there are.
-        shape: All of it as triangles, for ghosts [m].
-        mass_kg: In the simulation.
+        name: Name in the model.
+        look: GLB of the visual meshes; empty without any.
+        pieces: GLB of the convex pieces.
+        n_pieces: Number of pieces.
+        shape: Mesh of the whole object, for ghosts [m].
+        mass_kg: Mass in the simulation [kg].
     """
 
     name: str
@@ -54,40 +54,40 @@ class VisualBody(Frozen):
     mass_kg: float
 
 
-class OpenedScene:
-    """One scene, shared by all who look at it: nobody changes anything in it."""
+class LoadedScene:
+    """An immutable scene, shared by all browsers that show it."""
 
     def __init__(self, scene: Scene) -> None:
-        """Compiles the model and reads all that is shown.
+        """Compile the model and read the scene.
 
         Args:
-            scene: From a dataset, or from `scene_file`.
+            scene: A scene of a dataset, or of `load_scene_file`.
 
         Raises:
-            InputError: if its model or its meta.json does not load, or it has joints that exported scenes do not have.
+            InputError: if the model or meta.json cannot be loaded, or the model has other joints than free ones.
         """
         self.scene = scene
         self.meta: Mapping[str, Any] = scene.meta if "meta.json" in scene.files() else {}
         self.model = scene.model()
         _check_joints(self.model)
-        contents = contents_of(self.model)
-        self.figures = tuple(_figure(content, number) for number, content in enumerate(contents.objects))
-        self.still = _still(contents)
+        contents = read_model_contents(self.model)
+        self.bodies = tuple(_encode_body(content, number) for number, content in enumerate(contents.objects))
+        self.static = _encode_static(contents)
         settled = {content.name: content.pose for content in contents.objects}
-        self.layouts: dict[str, Poses] = layouts_of(self.meta, settled)
-        self.viewpoint, self.has_camera = self._viewpoint()
+        self.layouts: dict[str, Poses] = read_layouts(self.meta, settled)
+        self.viewpoint, self.has_camera = self._make_camera()
 
     @property
     def settled(self) -> Poses:
-        """Where the objects stand as exported."""
+        """Exported poses of the objects."""
         return self.layouts[SETTLED]
 
     @cached_property
     def photograph(self) -> bytes | None:
-        """The photograph as JPEG, at most `PHOTOGRAPH_PX` wide; None where there is none.
+        """The photograph as JPEG, at most `PHOTOGRAPH_PX` wide; None without one.
 
         Raises:
-            InputError: if it does not decode.
+            InputError: if it cannot be decoded.
         """
         data = self.scene.files().get(PHOTOGRAPH)
         if data is None:
@@ -98,55 +98,54 @@ class OpenedScene:
 
     @property
     def motion_rows(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of trajectories/, in the order of the tasks; these and the next are read whenever somebody asks."""
+        """Rows of trajectories/ in the order of the tasks, read at each call."""
         return tuple(self.scene.trajectory_rows())
 
     @property
     def object_rows(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of objects/; from the scene's own files where it lies in no dataset."""
+        """Rows of objects/; made from the files of the scene if it belongs to no dataset."""
         labels = {str(item["object_id"]): item.get("label") for item in self.meta.get("objects", [])}
         return tuple(self.scene.object_rows()) or tuple(
-            {"object_id": figure.name, "label": labels.get(figure.name), "mass_kg": figure.mass_kg}
-            for figure in self.figures
+            {"object_id": body.name, "label": labels.get(body.name), "mass_kg": body.mass_kg} for body in self.bodies
         )
 
     @property
     def task_rows(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of tasks/; none where the scene lies in no dataset."""
+        """Rows of tasks/; none if the scene belongs to no dataset."""
         return tuple(self.scene.task_rows())
 
     def motion(self, task_id: str, robot: str | None) -> MotionPlayback:
-        """The recorded motion of a task.
+        """Load the recorded motion of a task.
 
         Raises:
-            InputError: if there is none, its file is damaged, or the arm has to be given.
+            InputError: if there is none, its file is damaged, or the arm must be given.
         """
         trajectory = self.scene.trajectory(task_id)
         return MotionPlayback(trajectory.recording(), str(trajectory.row["x_id"]), robot)
 
-    def retextured(self, texture: TableTexture | None) -> Still:
-        """What stands still with another texture on the table, as in `still`.
+    def retexture_table(self, texture: TableTexture | None) -> StaticVisuals:
+        """Encode the static bodies with another texture on the table.
 
         Raises:
-            InputError: if there is no such texture, or no table to lay it on.
+            InputError: if there is no such texture, or no table.
         """
         if texture is None:
-            return self.still
-        return _still(contents_of(self.scene.model(texture=texture)))
+            return self.static
+        return _encode_static(read_model_contents(self.scene.model(texture=texture)))
 
-    def _viewpoint(self) -> tuple[Viewpoint, bool]:
-        eye = scene_eye(dict(self.meta), *_size(self.meta))
+    def _make_camera(self) -> tuple[OrbitCamera, bool]:
+        eye = load_scene_camera(dict(self.meta), *_read_image_size(self.meta))
         if eye is not None:
-            return viewpoint_of(eye), True
-        points = [transform_points(self.settled[each.name], each.shape.vertices) for each in self.figures]
-        return front_viewpoint(np.concatenate([*points, np.zeros((1, 3))])), False
+            return make_orbit_camera(eye), True
+        points = [transform_points(self.settled[each.name], each.shape.vertices) for each in self.bodies]
+        return make_front_camera(np.concatenate([*points, np.zeros((1, 3))])), False
 
 
-def scene_file(path: Path) -> Scene:
-    """One exported scene that lies in a folder, `scene.xml` with its assets and what else export wrote beside it.
+def load_scene_file(path: Path) -> Scene:
+    """Load an exported scene from its folder: `scene.xml`, its assets, `meta.json` and the photograph.
 
     Raises:
-        InputError: if there is none, or it names what is not below its folder.
+        InputError: if there is none, or it names files outside its folder.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the scene.xml of an exported scene, or a dataset")
@@ -161,8 +160,8 @@ def scene_file(path: Path) -> Scene:
     return Scene(sanitize_line(root.name or "scene", 100), {}, files)
 
 
-def _size(meta: Mapping[str, Any]) -> tuple[int, int]:
-    """Of the picture that the camera was calibrated for [px]; what makes no sense is told by `scene_eye`."""
+def _read_image_size(meta: Mapping[str, Any]) -> tuple[int, int]:
+    """Read the image size of the calibrated camera [px]; `load_scene_camera` reports values out of range."""
     camera = meta.get("camera")
     width, height = (camera.get(key) if isinstance(camera, Mapping) else None for key in ("width", "height"))
     known = isinstance(width, int) and isinstance(height, int) and 0 < width <= 10**5 and 0 < height <= 10**5
@@ -171,25 +170,27 @@ def _size(meta: Mapping[str, Any]) -> tuple[int, int]:
 
 def _check_joints(model: mujoco.MjModel) -> None:
     if (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE).any():
-        raise InputError("it has joints besides free ones, and exported scenes have none; python -m mujoco.viewer")
+        raise InputError(
+            "it has joints besides free ones, which exported scenes do not have; view it with python -m mujoco.viewer"
+        )
 
 
-def _still(contents: ModelContents) -> Still:
-    return tuple((look_glb(content.looks), content.pose) for content in contents.still if content.looks)
+def _encode_static(contents: ModelContents) -> StaticVisuals:
+    return tuple((encode_visuals(content.looks), content.pose) for content in contents.still if content.looks)
 
 
-def _figure(content: ModelObject, number: int) -> VisualBody:
+def _encode_body(content: ModelObject, number: int) -> VisualBody:
     meshes = [look.mesh for look in content.looks] or list(content.hulls)
     return VisualBody(
         content.name,
-        look_glb(content.looks),
-        pieces_glb(content.hulls, number),
+        encode_visuals(content.looks),
+        encode_pieces(content.hulls, number),
         len(content.hulls),
-        joined([*meshes, *content.unseen]),
+        concatenate_meshes([*meshes, *content.unseen]),
         content.mass_kg,
     )
 
 
-def poses_with(base: Poses, moved: Poses) -> dict[str, Pose]:
-    """The base, with some objects elsewhere."""
+def merge_poses(base: Poses, moved: Poses) -> dict[str, Pose]:
+    """Return the base poses with some objects moved."""
     return {**base, **{name: pose for name, pose in moved.items() if name in base}}

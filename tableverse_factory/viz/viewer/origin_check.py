@@ -1,4 +1,4 @@
-"""Who may come in. A web page from anywhere may knock on a port of this machine; only our own page is let in."""
+"""Origin check of WebSocket connections: any web page may connect to a local port; only our own page is allowed."""
 
 import logging
 import socket
@@ -11,7 +11,7 @@ from tableverse_factory.core.text import sanitize_line
 
 _MAX_PATH = 2000
 _MAX_REFUSED = 100
-"""So many origins that were turned away are told; who knocks with more of them only fills the terminal."""
+"""Most refused origins that are logged."""
 
 _PORTS = {"http": 80, "https": 443}
 
@@ -19,78 +19,78 @@ _log = logging.getLogger(__name__)
 
 
 class OriginPolicy:
-    """Lets in pages of this server, and those that whoever started it names."""
+    """Allows pages of this server, and the origins that the user names."""
 
     def __init__(self, bound: str, allowed: Sequence[str] = ()) -> None:
-        """Knows the names of this machine.
+        """Collect the names of this machine.
 
         Args:
             bound: Address that this server listens on.
             allowed: Addresses of this server as browsers see it behind a proxy: `https://NAME.github.dev`, with a path
-                where the proxy puts one.
+                if the proxy adds one.
 
         Raises:
-            InputError: `bad_origin` for an address that is none.
+            InputError: `bad_origin` for an invalid address.
         """
         self._names = {"localhost", bound.lower(), socket.gethostname().lower()}
         self._pages: dict[tuple[str, str, int], str] = {}
         for address in allowed:
-            origin = _parts(address)
+            origin = _split_origin(address)
             if origin is None:
-                said = sanitize_line(address, 100)
-                raise InputError(f"--allow-origin {said}: no address of a page: give https://HOST", "bad_origin")
+                shown = sanitize_line(address, 100)
+                raise InputError(f"--allow-origin {shown}: not the address of a page; give https://HOST", "bad_origin")
             self._pages[origin] = address.partition("?")[0].partition("#")[0].rstrip("/")
         self._refused: set[str] = set()
 
-    def lets_in(self, origin: str | None, asked: str | None) -> bool:
-        """Whether a browser that opens a socket shows the page that this server gave it; a refusal is logged.
+    def allows(self, origin: str | None, host: str | None) -> bool:
+        """Check that a browser that opens a socket shows a page of this server; log a refusal.
 
-        A page whose name was made to point here shows its own name as both: only addresses in numbers, which nobody can
-        make point elsewhere, and names of this machine count.
+        A foreign name that points here (DNS rebinding) sends itself as both headers: only numeric addresses and names
+        of this machine count.
 
         Args:
-            origin: Header `Origin`: the page that asks. Programs that are no browsers send none.
-            asked: Header `Host`: what it took this server for.
+            origin: Header `Origin`, the page that connects; programs other than browsers send none.
+            host: Header `Host`, the name under which it reached this server.
         """
         if origin is None:
             return True
-        page, host = _parts(origin), _parts(f"http://{asked}")
+        page, server = _split_origin(origin), _split_origin(f"http://{host}")
         if page is not None and page in self._pages:
             return True
-        same = page is not None and host is not None and origin.partition("://")[2].lower() == str(asked).lower()
-        if same and page is not None and (page[1] in self._names or _is_number(page[1])):
+        same = page is not None and server is not None and origin.partition("://")[2].lower() == str(host).lower()
+        if same and page is not None and (page[1] in self._names or _is_ip_address(page[1])):
             return True
-        self._tell(sanitize_line(origin, 100))
+        self._log_refusal(sanitize_line(origin, 100))
         return False
 
-    def link_to(self, scene_id: str, origin: str | None, asked: str) -> str:
-        """The address, relative to the page, that opens a scene; what the page shows is in the socket's address.
+    def make_link(self, scene_id: str, origin: str | None, host: str) -> str:
+        """Make the address, relative to the page, that opens a scene; the address of the socket names the scene.
 
         Args:
-            scene_id: Which.
-            origin: Header `Origin` of a browser that was let in.
-            asked: Its header `Host`.
+            scene_id: The scene.
+            origin: Header `Origin` of an allowed browser.
+            host: Its header `Host`.
         """
-        parts = _parts(origin) if origin is not None else None
+        parts = _split_origin(origin) if origin is not None else None
         page = self._pages.get(parts, "") if parts is not None else ""
-        scheme, _, rest = (page or origin or f"http://{asked}").partition("://")
+        scheme, _, rest = (page or origin or f"http://{host}").partition("://")
         socket_scheme = "wss" if scheme.lower() == "https" else "ws"  # a page over TLS may open no other
         return f"?websocket={socket_scheme}://{quote(rest, safe='/:[].')}/?scene={quote(scene_id, safe='')}"
 
-    def _tell(self, origin: str) -> None:
+    def _log_refusal(self, origin: str) -> None:
         if origin not in self._refused and len(self._refused) < _MAX_REFUSED:
             self._refused.add(origin)
-            _log.warning("a page of %s was turned away; if it is yours: --allow-origin %s", origin, origin)
+            _log.warning("refused a page of %s; if it is yours: --allow-origin %s", origin, origin)
 
 
-def wanted_scene(path: str) -> str | None:
-    """The scene that the address of a socket names, if any: `/?scene=ID`."""
+def parse_scene_id(path: str) -> str | None:
+    """Parse the scene that the address of a socket names, if any: `/?scene=ID`."""
     values = parse_qs(urlsplit(path[:_MAX_PATH]).query).get("scene")
     return values[0] if values else None
 
 
-def _parts(address: str) -> tuple[str, str, int] | None:
-    """Scheme, host and port of a page's address; None if it is none."""
+def _split_origin(address: str) -> tuple[str, str, int] | None:
+    """Split the address of a page into scheme, host and port; None for an invalid one."""
     try:
         parts = urlsplit(address)
         port = parts.port
@@ -101,7 +101,7 @@ def _parts(address: str) -> tuple[str, str, int] | None:
     return parts.scheme, parts.hostname.lower(), port or _PORTS[parts.scheme]
 
 
-def _is_number(host: str) -> bool:
+def _is_ip_address(host: str) -> bool:
     try:
         ip_address(host)
     except ValueError:  # a name

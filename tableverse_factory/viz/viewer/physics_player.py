@@ -1,66 +1,61 @@
-"""The physics that one browser plays: run, pushed, put back, and what touches."""
+"""Physics playback of one browser: run, push, reset, contacts."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.viz.viewer.facts import said_html
 from tableverse_factory.viz.viewer.layouts import Poses
-from tableverse_factory.viz.viewer.loaded_scene import OpenedScene
+from tableverse_factory.viz.viewer.loaded_scene import LoadedScene
 from tableverse_factory.viz.viewer.panel import NO_MATCH, Panel
+from tableverse_factory.viz.viewer.panel_html import format_status
 from tableverse_factory.viz.viewer.simulation import Contacts, Simulation
 
 MAX_OBJECTS = 200
 _PUSHES = {"left": (-1.0, 0.0, 0.0), "right": (1.0, 0.0, 0.0), "away": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
 _SLOW = 0.9
-"""Of the speed asked for: below, it is said."""
+"""Share of the chosen speed below which the panel reports it."""
 
 
 class PhysicsPlayer:
-    """One simulation of the opened scene."""
+    """The simulation of the shown scene, and a second one for contacts at fixed poses."""
 
     def __init__(self, panel: Panel) -> None:
-        """Has nothing to simulate.
-
-        Args:
-            panel: The controls.
-        """
         self._panel = panel
         self._simulation: Simulation | None = None
-        self._held: Simulation | None = None
+        self._fixed: Simulation | None = None
         self._masses: dict[str, float] = {}
         self.running = False
 
     @property
     def time_s(self) -> float:
-        """Simulated since the objects were last put down [s]."""
+        """Simulated time since the last reset [s]."""
         return self._simulation.time_s if self._simulation is not None else 0.0
 
     def close(self) -> None:
-        """Has nothing to simulate."""
-        self._simulation, self._held, self._masses, self.running = None, None, {}, False
+        """Remove the scene."""
+        self._simulation, self._fixed, self._masses, self.running = None, None, {}, False
 
-    def open(self, opened: OpenedScene, names: Mapping[str, str]) -> None:
-        """Takes a scene as exported.
+    def open(self, loaded: LoadedScene, names: Mapping[str, str]) -> None:
+        """Set the scene, as exported.
 
         Args:
-            opened: The scene.
-            names: Of its objects, in words.
+            loaded: The scene.
+            names: Display names of its objects by id.
         """
-        self._simulation, self._held = Simulation(opened.model), Simulation(opened.model)
-        self._masses = {figure.name: figure.mass_kg for figure in opened.figures}
+        self._simulation, self._fixed = Simulation(loaded.model), Simulation(loaded.model)
+        self._masses = {body.name: body.mass_kg for body in loaded.bodies}
         options = [f"{name} {names.get(name, '')}" for name in list(self._masses)[:MAX_OBJECTS]]
         self._panel.target.options = options or [NO_MATCH]
-        self.say()
+        self.show_status()
 
-    def put(self, poses: Poses) -> None:
-        """Puts the objects down at rest."""
+    def reset(self, poses: Poses) -> None:
+        """Reset the objects to poses at rest."""
         if self._simulation is not None:
-            self._simulation.put(poses)
+            self._simulation.reset(poses)
 
     def push(self) -> bool:
-        """Pushes the object that the controls name as they say; whether there is one."""
+        """Push the object chosen in the controls; return whether there is one."""
         name = self._panel.target.value.partition(" ")[0]
         if name not in self._masses or self._simulation is None:
             return False
@@ -69,14 +64,14 @@ class PhysicsPlayer:
         return True
 
     def advance(self, seconds: float, budget_s: float) -> float:
-        """Simulates.
+        """Simulate within a budget.
 
         Args:
-            seconds: To simulate [s].
-            budget_s: Of the wall's time [s].
+            seconds: Simulated time [s].
+            budget_s: Wall time [s].
 
         Returns:
-            The share of it that the budget was enough for.
+            Share of the simulated time that the budget allowed.
 
         Raises:
             InputError: if the simulation became unstable.
@@ -89,23 +84,23 @@ class PhysicsPlayer:
         return passed / seconds
 
     def poses(self) -> Poses:
-        """Where the objects are now."""
+        """Return the poses of the objects."""
         return self._simulation.poses() if self._simulation is not None else {}
 
     def contacts(self, poses: Poses | None) -> Contacts:
-        """What touches.
+        """Measure the contacts.
 
         Args:
-            poses: Of objects that are held in another place than the simulation's, at rest; None for the simulation's.
+            poses: Fixed poses at rest; None for the state of the simulation.
         """
-        if self._simulation is None or self._held is None:
-            return Contacts.none()
+        if self._simulation is None or self._fixed is None:
+            return Contacts.empty()
         if poses is None:
             return self._simulation.contacts()
-        self._held.put(poses)
-        return self._held.contacts(shown=poses)
+        self._fixed.reset(poses)
+        return self._fixed.contacts(shown=poses)
 
-    def say(self, share: float = 1.0) -> None:
-        """Says how much was simulated, and whether it is slower than asked for."""
-        slow = f", {100 * share:.0f} % of the speed asked for" if share < _SLOW else ""
-        self._panel.physics_said.content = said_html(f"{self.time_s:.1f} s simulated{slow}")
+    def show_status(self, share: float = 1.0) -> None:
+        """Show the simulated time, and the share of the chosen speed where it is lower."""
+        slow = f", {100 * share:.0f} % of the chosen speed" if share < _SLOW else ""
+        self._panel.physics_status.content = format_status(f"{self.time_s:.1f} s simulated{slow}")

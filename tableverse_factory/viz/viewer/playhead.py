@@ -1,41 +1,36 @@
-"""Where in a recording one is, while it plays, stands, or is dragged to and fro."""
+"""Playback position of a recording."""
 
 
 class Playhead:
-    """A place between the start and the end of a recording.
+    """A position between the start and the end of a recording.
 
     Attributes:
-        duration_s: Of the recording [s].
-        time_s: The place [s].
-        playing: Whether time passes.
+        duration_s: Duration of the recording [s].
+        time_s: Position [s].
+        playing: Whether the position advances.
     """
 
     def __init__(self, duration_s: float) -> None:
-        """Stands at the start.
-
-        Args:
-            duration_s: Of the recording [s].
-        """
         self.duration_s = max(0.0, duration_s)
         self.time_s = 0.0
         self.playing = False
 
     def play(self) -> None:
-        """Goes on; from the end, once more from the start."""
+        """Play on, from the end once more from the start."""
         if self.time_s >= self.duration_s:
             self.time_s = 0.0
         self.playing = True
 
     def pause(self) -> None:
-        """Stays where it is."""
+        """Stop playing."""
         self.playing = False
 
     def seek(self, time_s: float) -> None:
-        """Goes to a place; beyond the ends there is none."""
+        """Move to a position, clamped to the recording."""
         self.time_s = min(max(time_s, 0.0), self.duration_s)
 
     def advance(self, seconds: float) -> None:
-        """Lets time pass if it plays; at the end it stops."""
+        """Advance while playing; stop at the end."""
         if self.playing:
             self.seek(self.time_s + seconds)
             self.playing = self.time_s < self.duration_s

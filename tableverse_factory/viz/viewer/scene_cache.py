@@ -1,4 +1,4 @@
-"""Opened scenes, shared by all browsers: each is read once, the last few are kept."""
+"""Cache of loaded scenes, shared by all browsers."""
 
 import threading
 from collections import OrderedDict
@@ -7,35 +7,35 @@ from concurrent.futures import Future
 from typing import Any
 
 from tableverse_factory.dataset.dataset import Dataset, Scene
-from tableverse_factory.viz.viewer.catalogue import Catalogue, SearchHits
-from tableverse_factory.viz.viewer.loaded_scene import OpenedScene
+from tableverse_factory.viz.viewer.loaded_scene import LoadedScene
+from tableverse_factory.viz.viewer.scene_index import SceneIndex, SearchHits
 
-KEPT = 4
-"""Opened scenes are of some tens of megabytes."""
+MAX_SCENES = 4
+"""Most loaded scenes; each takes some tens of megabytes."""
 
 Row = Mapping[str, Any]
 
 
 class SceneCache:
-    """What can be looked at: the scenes of a dataset, or one scene without."""
+    """The scenes of a dataset, or a single exported scene; the last few stay loaded."""
 
     def __init__(self, source: Dataset | Scene) -> None:
-        """Reads the list of scenes.
+        """Read the list of scenes.
 
         Args:
-            source: A dataset, or a scene of `scene_file`.
+            source: A dataset, or a scene of `load_scene_file`.
 
         Raises:
-            InputError: if the list does not read.
+            InputError: if the list cannot be read.
         """
         self._dataset = source if isinstance(source, Dataset) else None
-        self._alone = source if isinstance(source, Scene) else None
-        self._catalogue = Catalogue(source) if isinstance(source, Dataset) else None
-        self._opened: OrderedDict[str, Future[OpenedScene]] = OrderedDict()
+        self._single = source if isinstance(source, Scene) else None
+        self._index = SceneIndex(source) if isinstance(source, Dataset) else None
+        self._loaded: OrderedDict[str, Future[LoadedScene]] = OrderedDict()
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        return 1 if self._catalogue is None else len(self._catalogue)
+        return 1 if self._index is None else len(self._index)
 
     @property
     def has_links(self) -> bool:
@@ -43,53 +43,53 @@ class SceneCache:
         return self._dataset is not None
 
     def first(self) -> str | None:
-        """The scene to begin with; None where there is none."""
-        return self._catalogue.first() if self._catalogue is not None else self._only.scene_id
+        """Return the scene to begin with; None for an empty dataset."""
+        return self._index.first() if self._index is not None else self._single_scene.scene_id
 
     def search(self, text: str, status: str) -> SearchHits:
-        """As `Catalogue.search`; the one scene, where there is no dataset."""
-        if self._catalogue is None:
-            return SearchHits([self._only.scene_id])
-        return self._catalogue.search(text, status)
+        """Search as `SceneIndex.search`; a single scene always matches."""
+        if self._index is None:
+            return SearchHits([self._single_scene.scene_id])
+        return self._index.search(text, status)
 
-    def open(self, scene_id: str) -> OpenedScene:
-        """The scene of this id. Who asks for one that is just read waits for it, and nobody else does.
+    def open(self, scene_id: str) -> LoadedScene:
+        """Return a loaded scene; concurrent calls for one id wait for the same load.
 
         Raises:
-            InputError: if there is none, it has no files, or they do not load.
+            InputError: if there is no such scene, it has no files, or they do not load.
         """
         with self._lock:
-            coming = self._opened.get(scene_id)
-            mine = coming is None
-            if coming is None:
-                coming = self._opened[scene_id] = Future()
-            self._opened.move_to_end(scene_id)
-            while len(self._opened) > KEPT:
-                self._opened.popitem(last=False)
-        if mine:
+            future = self._loaded.get(scene_id)
+            must_load = future is None
+            if future is None:
+                future = self._loaded[scene_id] = Future()
+            self._loaded.move_to_end(scene_id)
+            while len(self._loaded) > MAX_SCENES:
+                self._loaded.popitem(last=False)
+        if must_load:
             try:
-                coming.set_result(OpenedScene(self._scene(scene_id)))
-            except BaseException as error:  # noqa: BLE001 - those who wait must hear of it, whatever it is
+                future.set_result(LoadedScene(self._scene(scene_id)))
+            except BaseException as error:  # noqa: BLE001 - it is passed on to all who wait
                 with self._lock:
-                    if self._opened.get(scene_id) is coming:
-                        del self._opened[scene_id]
-                coming.set_exception(error)
-        return coming.result()
+                    if self._loaded.get(scene_id) is future:
+                        del self._loaded[scene_id]
+                future.set_exception(error)
+        return future.result()
 
-    def lost(self, scene_id: str) -> Row | None:
-        """The row of a scene that has no files; None for all others.
+    def find_dropped_row(self, scene_id: str) -> Row | None:
+        """Return the row of a scene that was dropped or failed; None for all others.
 
         Raises:
-            InputError: if the row does not read.
+            InputError: if the row cannot be read.
         """
-        if self._dataset is None or self._catalogue is None or self._catalogue.has_files(scene_id):
+        if self._dataset is None or self._index is None or self._index.has_files(scene_id):
             return None
         return self._dataset.scene_row(scene_id)
 
     @property
-    def _only(self) -> Scene:
-        assert self._alone is not None  # noqa: S101 - without a dataset there is a scene
-        return self._alone
+    def _single_scene(self) -> Scene:
+        assert self._single is not None  # noqa: S101 - without a dataset there is a scene
+        return self._single
 
     def _scene(self, scene_id: str) -> Scene:
-        return self._dataset.scene(scene_id) if self._dataset is not None else self._only
+        return self._dataset.scene(scene_id) if self._dataset is not None else self._single_scene

@@ -1,4 +1,4 @@
-"""What one browser looks at. Every browser has its own scene, camera, controls and physics; none disturbs another."""
+"""The session of one browser: its scene, camera, controls and physics, independent of other browsers."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,82 +6,87 @@ from typing import Any
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.textures.catalogue import FAMILIES
 from tableverse_factory.viz.viewer.canvas import Canvas
-from tableverse_factory.viz.viewer.facts import facts_html, lost_html, photograph_html, said_html
 from tableverse_factory.viz.viewer.layouts import LAYOUTS, SETTLED, Poses
-from tableverse_factory.viz.viewer.loaded_scene import OpenedScene
+from tableverse_factory.viz.viewer.loaded_scene import LoadedScene
 from tableverse_factory.viz.viewer.motion_player import MotionPlayer
 from tableverse_factory.viz.viewer.panel import AS_EXPORTED, NO_GHOST, NO_MATCH, PAUSE, PLAY, Panel
+from tableverse_factory.viz.viewer.panel_html import (
+    format_dropped_scene,
+    format_facts,
+    format_photograph,
+    format_status,
+)
 from tableverse_factory.viz.viewer.physics_player import PhysicsPlayer
 from tableverse_factory.viz.viewer.scene_cache import Row, SceneCache
 from tableverse_factory.viz.viewer.scene_list import SceneList
-from tableverse_factory.viz.viewer.session_lock import Turns
+from tableverse_factory.viz.viewer.session_lock import SessionLock
 
 _CONTACTS_EVERY = 5
-"""Contacts are drawn anew at every so many steps of what plays."""
+"""Number of ticks between two drawings of the contacts."""
 
 
 class Session:
-    """One client's view and controls.
+    """The view and the controls of one client.
 
-    viser writes what a browser chose into a control at any time, in its own thread, before a callback has its turn: a
-    value is read once in a turn, and what hangs on it is kept here.
+    viser writes a new value into a control at any time, in a thread of its own, before the callback runs. An action
+    therefore reads a value once, and the state that depends on it is kept here.
     """
 
     def __init__(
-        self, client: Any, shelf: SceneCache, robot: str | None, link: Callable[[str], str], wake: Callable[[], None]
+        self, client: Any, scenes: SceneCache, robot: str | None, link: Callable[[str], str], wake: Callable[[], None]
     ) -> None:
-        """Builds the controls.
+        """Build the controls.
 
         Args:
             client: A `viser.ClientHandle`.
-            shelf: The scenes.
-            robot: The arm of motions whose robot comes from a file.
-            link: Makes the address of a scene; empty where it has none.
-            wake: Called when something begins to play.
+            scenes: The scenes to show.
+            robot: The arm of trajectories whose robot comes from a file.
+            link: Makes the address of a scene; empty if it has none.
+            wake: Called when playback starts.
         """
-        self._client, self._shelf, self._link, self._wake = client, shelf, link, wake
-        self._turns = Turns(client, self._halt)
+        self._client, self._scenes, self._link, self._wake = client, scenes, link, wake
+        self._lock = SessionLock(client, self._halt)
         self._canvas, self._panel = Canvas(client), Panel(client.gui)
-        self._list = SceneList(self._panel, shelf)
+        self._list = SceneList(self._panel, scenes)
         self._motion = MotionPlayer(self._panel, self._canvas, robot)
         self._physics = PhysicsPlayer(self._panel)
         self._scene_id = ""
-        self._opened: OpenedScene | None = None
+        self._loaded: LoadedScene | None = None
         self._names: dict[str, str] = {}
         self._ticks = 0
-        self._listen()
+        self._connect_controls()
 
     @property
     def playing(self) -> bool:
-        """Whether physics or a motion goes on."""
+        """Whether physics or a motion plays."""
         return self._physics.running or self._motion.playing
 
     @property
     def simulated_s(self) -> float:
-        """Since the objects were last put down [s]."""
+        """Simulated time since the last reset [s]."""
         return self._physics.time_s
 
     @property
     def duration_s(self) -> float:
-        """Of the motion that is shown [s]; 0 without one."""
+        """Duration of the shown motion [s]; 0 without one."""
         return self._motion.duration_s
 
     def open(self, scene_id: str | None) -> None:
-        """Shows a scene; of one that was lost, why."""
-        self._turns.take(lambda: self._open(scene_id))
+        """Show a scene, or the reason why it has none."""
+        self._lock.run(lambda: self._open(scene_id))
 
     def tick(self, seconds: float, budget_s: float) -> None:
-        """Lets time pass in what plays; not while something else is done here, for others wait for their tick.
+        """Advance playback, unless another action runs: other sessions wait for their tick.
 
         Args:
-            seconds: Since the last time [s].
-            budget_s: To be spent on physics at most [s].
+            seconds: Time since the last tick [s].
+            budget_s: Most wall time for physics [s].
         """
-        self._turns.take_if_free(lambda: self._tick(seconds, budget_s))
+        self._lock.try_run(lambda: self._tick(seconds, budget_s))
 
-    def _listen(self) -> None:
+    def _connect_controls(self) -> None:
         panel = self._panel
-        for control, act in (
+        for control, action in (
             (panel.search, self._search),
             (panel.status, self._search),
             (panel.scene, lambda: self._open(panel.scene.value)),
@@ -90,24 +95,24 @@ class Session:
             (panel.contacts, self._show),
             (panel.names, self._show),
             (panel.ghosts, self._show),
-            (panel.layout, self._lay_out),
-            (panel.texture, self._retexture),
-            (panel.texture_number, self._retexture),
+            (panel.layout, self._change_layout),
+            (panel.texture, self._change_texture),
+            (panel.texture_number, self._change_texture),
             (panel.task, self._choose_task),
             (panel.time, self._scrub),
         ):
-            control.on_update(self._turns.of_control(act))
-        for button, act in (
-            (panel.camera, self._look),
+            control.on_update(self._lock.make_callback(action))
+        for button, action in (
+            (panel.camera, self._reset_camera),
             (panel.step, self._step),
             (panel.run, self._run),
             (panel.push, self._push),
             (panel.play, self._play),
-            (panel.whole_arm, self._motion.see_arm),
+            (panel.whole_arm, self._motion.frame_arm),
         ):
-            button.on_click(self._turns.of_control(act))
+            button.on_click(self._lock.make_callback(action))
 
-    # Which scene
+    # Scene
 
     def _search(self) -> None:
         other = self._list.search(self._scene_id)
@@ -117,7 +122,7 @@ class Session:
             self._list.show(self._scene_id)
 
     def _step(self) -> None:
-        other = self._list.beside(self._scene_id)
+        other = self._list.step(self._scene_id)
         if other is not None:
             self._open(other)
 
@@ -125,136 +130,138 @@ class Session:
         if scene_id is None or scene_id == NO_MATCH:
             self._list.show(self._scene_id)
             return
-        self._scene_id, self._opened, self._names = scene_id, None, {}
+        self._scene_id, self._loaded, self._names = scene_id, None, {}
         self._canvas.close()
         self._physics.close()
         self._motion.close()
-        self._list.show(scene_id)  # first: from a scene that does not open, one goes on to the next
+        self._list.show(scene_id)  # first: from a scene that does not open, the next can be chosen
         self._panel.photograph.content = self._panel.facts.content = ""
-        lost = self._shelf.lost(scene_id)
-        if lost is not None:
-            self._panel.facts.content = lost_html(lost)
+        dropped = self._scenes.find_dropped_row(scene_id)
+        if dropped is not None:
+            self._panel.facts.content = format_dropped_scene(dropped)
             return
-        opened = self._shelf.open(scene_id)
+        loaded = self._scenes.open(scene_id)
         with self._client.atomic():
-            self._canvas.open(opened)
-        self._opened = opened
-        self._describe(opened)
-        self._look()
+            self._canvas.open(loaded)
+        self._loaded = loaded
+        self._describe(loaded)
+        self._reset_camera()
         self._show()
-        self._motion.offer(opened.motion_rows)
-        self._panel.photograph.content = photograph_html(opened.photograph)  # last: a bad one costs nothing else
+        self._motion.set_rows(loaded.motion_rows)
+        self._panel.photograph.content = format_photograph(
+            loaded.photograph
+        )  # last: a damaged one affects nothing else
 
-    def _describe(self, opened: OpenedScene) -> None:
-        """Fills the controls with what this scene has."""
-        panel, objects = self._panel, opened.object_rows
-        self._names = {str(row["object_id"]): _name(row) for row in objects}
-        self._physics.open(opened, self._names)
-        panel.camera.label = "Picture's camera" if opened.has_camera else "View from the front"
+    def _describe(self, loaded: LoadedScene) -> None:
+        """Fill the controls for the scene."""
+        panel, objects = self._panel, loaded.object_rows
+        self._names = {str(row["object_id"]): _format_name(row) for row in objects}
+        self._physics.open(loaded, self._names)
+        panel.camera.show_names = "Picture's camera" if loaded.has_camera else "View from the front"
         link = self._link(self._scene_id)
-        panel.facts.content = facts_html(opened.scene.row, opened.meta, objects, opened.task_rows, link)
-        layouts = [name for name in LAYOUTS if name in opened.layouts]
+        panel.facts.content = format_facts(loaded.scene.row, loaded.meta, objects, loaded.task_rows, link)
+        layouts = [name for name in LAYOUTS if name in loaded.layouts]
         panel.layout.options, panel.layout.value = layouts, SETTLED
         panel.ghosts.options, panel.ghosts.value = [NO_GHOST, *layouts], NO_GHOST
         panel.texture.value, panel.texture_number.value = AS_EXPORTED, 0
 
-    # What is shown of it
+    # Visibility
 
-    def _look(self) -> None:
-        if self._opened is not None:
-            self._canvas.look_from(self._opened.viewpoint)
+    def _reset_camera(self) -> None:
+        if self._loaded is not None:
+            self._canvas.set_camera(self._loaded.viewpoint)
 
     def _show(self) -> None:
-        opened, panel = self._opened, self._panel
-        if opened is None:
+        loaded, panel = self._loaded, self._panel
+        if loaded is None:
             return
-        self._canvas.show(panel.looks.value, panel.pieces.value)
-        self._canvas.label(self._names, panel.names.value)
+        self._canvas.set_visibility(panel.looks.value, panel.pieces.value)
+        self._canvas.show_names(self._names, panel.names.value)
         ghosts = panel.ghosts.value
-        self._canvas.ghost(ghosts if ghosts in opened.layouts else None, opened.layouts.get(ghosts, {}))
+        self._canvas.show_ghost(ghosts if ghosts in loaded.layouts else None, loaded.layouts.get(ghosts, {}))
         self._place()
 
-    def _lay_out(self) -> None:
+    def _change_layout(self) -> None:
         self._halt()
-        self._motion.leave()
-        self._physics.put(self._layout())
+        self._motion.deselect()
+        self._physics.reset(self._layout())
         self._place()
 
     def _layout(self) -> Poses:
-        layouts = self._opened.layouts if self._opened is not None else {}
+        layouts = self._loaded.layouts if self._loaded is not None else {}
         return layouts.get(self._panel.layout.value, layouts.get(SETTLED, {}))
 
-    def _held(self) -> Poses | None:
-        """Where the objects are held: in the motion, or in the layout; None once they were simulated."""
-        if self._opened is not None and self._motion.shown:
-            return self._motion.poses(self._opened.settled)
+    def _find_fixed_poses(self) -> Poses | None:
+        """Return the poses in the motion or in the layout; None after the start of the simulation."""
+        if self._loaded is not None and self._motion.shown:
+            return self._motion.poses(self._loaded.settled)
         return self._layout() if self._physics.time_s == 0.0 else None
 
     def _place(self, contacts: bool = True) -> None:
-        held = self._held()
-        self._canvas.place(self._physics.poses() if held is None else held)
+        fixed = self._find_fixed_poses()
+        self._canvas.set_poses(self._physics.poses() if fixed is None else fixed)
         self._motion.show()
         if contacts:
-            self._touch(held)
+            self._show_contacts(fixed)
 
-    def _touch(self, held: Poses | None) -> None:
-        """Draws the contacts of what is shown; those of a motion and of a layout without the arm."""
-        if not self._panel.contacts.value or self._opened is None:
-            self._canvas.touch(None)
+    def _show_contacts(self, fixed: Poses | None) -> None:
+        """Draw the contacts of the shown poses; those of a motion without the arm."""
+        if not self._panel.contacts.value or self._loaded is None:
+            self._canvas.show_contacts(None)
             self._panel.shown.content = ""
             return
-        contacts = self._physics.contacts(held)
-        self._canvas.touch(contacts)
-        self._panel.shown.content = said_html(
+        contacts = self._physics.contacts(fixed)
+        self._canvas.show_contacts(contacts)
+        self._panel.shown.content = format_status(
             f"{contacts.total} contacts, {contacts.forces_n.sum():.2f} N in all, "
             f"deepest {1000 * max(contacts.depths_m.max(initial=0.0), 0.0):.2f} mm"
         )
 
-    def _retexture(self) -> None:
-        family, opened = self._panel.texture.value, self._opened
-        if opened is not None:
+    def _change_texture(self) -> None:
+        family, loaded = self._panel.texture.value, self._loaded
+        if loaded is not None:
             texture = f"{family}-{self._panel.texture_number.value}" if family in FAMILIES else None
-            self._canvas.lay(opened.retextured(texture))
+            self._canvas.set_static(loaded.retexture_table(texture))
 
-    # What plays
+    # Playback
 
     def _run(self) -> None:
-        asked = self._panel.run.value
+        pressed = self._panel.run.value
         self._halt()
-        if self._opened is None:
+        if self._loaded is None:
             return
-        if asked == PLAY:
+        if pressed == PLAY:
             self._simulate()
-        elif asked != PAUSE:
-            self._motion.leave()
-            self._physics.put(self._layout())
+        elif pressed != PAUSE:
+            self._motion.deselect()
+            self._physics.reset(self._layout())
             self._place()
-        self._physics.say()
+        self._physics.show_status()
 
     def _push(self) -> None:
         if self._physics.push():
             self._simulate()
 
     def _simulate(self) -> None:
-        self._motion.leave()
+        self._motion.deselect()
         self._physics.running = True
         self._wake()
 
     def _choose_task(self) -> None:
         self._halt()
-        if self._opened is not None:
-            self._motion.choose(self._opened)
+        if self._loaded is not None:
+            self._motion.select(self._loaded)
             self._place()
 
     def _play(self) -> None:
-        asked = self._panel.play.value
+        pressed = self._panel.play.value
         self._halt()
-        if asked == PLAY:
+        if pressed == PLAY:
             self._motion.play()
             self._wake()
 
     def _scrub(self) -> None:
-        self._motion.scrub()
+        self._motion.seek_to_slider()
         self._place()
 
     def _halt(self) -> None:
@@ -269,11 +276,11 @@ class Session:
             self._motion.advance(seconds)
         elif self._physics.running:
             share = self._physics.advance(seconds, budget_s)
-        now = self._ticks % _CONTACTS_EVERY == 0
-        self._place(contacts=now or not self.playing)
-        if now and self._physics.running:
-            self._physics.say(share)
+        due = self._ticks % _CONTACTS_EVERY == 0
+        self._place(contacts=due or not self.playing)
+        if due and self._physics.running:
+            self._physics.show_status(share)
 
 
-def _name(row: Row) -> str:
+def _format_name(row: Row) -> str:
     return sanitize_line(str(row.get("relabel_name") or row.get("label") or row["object_id"]), 60)

@@ -1,4 +1,4 @@
-"""One thing at a time in one browser's session; what goes wrong there is told there, and costs no other browser."""
+"""Serialization of the actions of one browser's session; errors are shown in that browser only."""
 
 import logging
 import threading
@@ -8,42 +8,42 @@ from typing import Any
 from tableverse_factory.core.errors import TableverseError
 from tableverse_factory.core.text import sanitize_line
 
-Act = Callable[[], None]
+Action = Callable[[], None]
 
 _log = logging.getLogger(__name__)
 
 
-class Turns:
-    """Acts of one session, which arrive in threads of viser's and of the clock."""
+class SessionLock:
+    """Runs the actions of one session one by one; they arrive in threads of viser and of the ticker."""
 
-    def __init__(self, client: Any, halt: Act) -> None:
-        """Nothing is done yet.
+    def __init__(self, client: Any, halt: Action) -> None:
+        """Wrap a client.
 
         Args:
-            client: A `viser.ClientHandle`, which is told what goes wrong.
-            halt: Ends what plays when something went wrong.
+            client: A `viser.ClientHandle`, which shows errors.
+            halt: Stops playback after an error.
         """
         self._client, self._halt = client, halt
         self._lock = threading.RLock()
 
-    def take(self, act: Act) -> None:
-        """Does it as soon as nothing else is done."""
+    def run(self, action: Action) -> None:
+        """Run an action as soon as no other one runs."""
         with self._lock:
-            self._do(act)
+            self._run(action)
 
-    def take_if_free(self, act: Act) -> None:
-        """Does it if nothing else is done."""
+    def try_run(self, action: Action) -> None:
+        """Run an action unless another one runs."""
         if self._lock.acquire(blocking=False):
             try:
-                self._do(act)
+                self._run(action)
             finally:
                 self._lock.release()
 
-    def of_control(self, act: Act) -> Callable[[Any], None]:
-        """A callback for a control: what the browser did counts, what this program writes into a control does not.
+    def make_callback(self, action: Action) -> Callable[[Any], None]:
+        """Make a callback for a control that runs an action on events of the browser, not of this program.
 
-        One callback of a control waits at most, and finds the newest value: viser's threads are shared by all browsers,
-        and a slider that is dragged would fill them.
+        At most one call of it waits and then finds the newest value: all browsers share the threads of viser, which a
+        dragged slider would fill.
         """
         waiting = threading.Lock()
 
@@ -52,17 +52,17 @@ class Turns:
                 return
             with self._lock:
                 waiting.release()
-                self._do(act)
+                self._run(action)
 
         return answer
 
-    def _do(self, act: Act) -> None:
+    def _run(self, action: Action) -> None:
         try:
-            act()
-        except Exception as error:  # noqa: BLE001 - whatever it is, it costs this browser alone; it is told and logged
+            action()
+        except Exception as error:  # noqa: BLE001 - any error is shown and logged, and affects this browser only
             self._halt()
-            said = sanitize_line(str(error), 500)
+            message = sanitize_line(str(error), 500)
             if not isinstance(error, TableverseError | OSError):
-                _log.exception("the viewer made a mistake")
-                said = f"The viewer made a mistake ({type(error).__name__}); the terminal that it runs in says more."
-            self._client.add_notification("This does not work", said, color="red", auto_close_seconds=20.0)
+                _log.exception("an action of the viewer failed")
+                message = f"Internal error ({type(error).__name__}); the terminal of the viewer shows more."
+            self._client.add_notification("This does not work", message, color="red", auto_close_seconds=20.0)

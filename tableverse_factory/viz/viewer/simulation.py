@@ -1,4 +1,4 @@
-"""The physics of one scene, as one viewer plays it: put down, pushed, stepped in time with the clock on the wall."""
+"""Interactive simulation of one scene: reset, push, real-time stepping, contacts."""
 
 import time
 from collections.abc import Container, Mapping
@@ -9,26 +9,26 @@ import numpy as np
 
 from schemas.geometry import Frozen, Points, Pose, Vector3
 from schemas.trajectories import Numbers
-from tableverse_factory.physics.simulate.at_rest import UNSTABLE, body_poses, free_bodies, quiet_data
+from tableverse_factory.physics.simulate.at_rest import UNSTABLE, find_free_bodies, make_quiet_data, read_body_poses
 from tableverse_factory.physics.simulate.model_solids import body_name
 
 MAX_CONTACTS = 1000
-"""The strongest are shown."""
+"""Most contacts shown, the strongest first."""
 
 SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.015, 0.1, 0.03
-"""Length of the arrow of a contact's force."""
+"""Limits and scale of the length of a force arrow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contacts(Frozen):
-    """Where things touch, the strongest contact first.
+    """Contacts of a scene, the strongest first.
 
     Attributes:
-        points: In the table frame. Shape (n, 3) [m].
+        points: Positions in the table frame. Shape (n, 3) [m].
         normals: Unit vectors from the first body to the second. Shape (n, 3).
-        forces_n: Along the normals [N]. Shape (n,).
-        depths_m: Overlap; negative for a gap [m]. Shape (n,).
-        total: Contacts that there are, also beyond `MAX_CONTACTS`.
+        forces_n: Forces along the normals [N]. Shape (n,).
+        depths_m: Overlaps; negative for a gap [m]. Shape (n,).
+        total: Number of contacts, those beyond `MAX_CONTACTS` included.
     """
 
     points: Points
@@ -38,45 +38,40 @@ class Contacts(Frozen):
     total: int
 
     @classmethod
-    def none(cls) -> "Contacts":
-        """Of what touches nothing."""
+    def empty(cls) -> "Contacts":
+        """Make a record without contacts."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0)
 
     def __len__(self) -> int:
         return len(self.forces_n)
 
-    def arrows(self) -> np.ndarray:
-        """Start and end of an arrow per contact, its length by the force. Shape (n, 2, 3) [m]."""
+    def compute_arrows(self) -> np.ndarray:
+        """Compute start and end of an arrow per contact, its length by the force. Shape (n, 2, 3) [m]."""
         lengths = np.clip(METRES_PER_NEWTON * self.forces_n, SHORTEST_M, LONGEST_M)
         return np.stack([self.points, self.points + lengths[:, None] * self.normals], axis=1)
 
 
 class Simulation:
-    """One state of a model. The model is shared with other viewers and stays as it is."""
+    """A state of a model whose moving bodies have free joints; other sessions share the model."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        """Starts as exported.
-
-        Args:
-            model: Compiled; what moves in it has a free joint.
-        """
-        self._model, self._data = model, quiet_data(model)
-        bodies = free_bodies(model)
+        self._model, self._data = model, make_quiet_data(model)
+        bodies = find_free_bodies(model)
         self._bodies = {body_name(model, body): body for body in bodies}
         mujoco.mj_forward(model, self._data)
 
     @property
     def time_s(self) -> float:
-        """Simulated since the objects were last put down [s]."""
+        """Simulated time since the last reset [s]."""
         return float(self._data.time)
 
     @property
     def unstable(self) -> bool:
-        """Whether MuJoCo has given up: from then on its numbers mean nothing."""
+        """Whether MuJoCo has reported an instability, after which its state is meaningless."""
         return any(self._data.warning[kind].number for kind in UNSTABLE)
 
-    def put(self, poses: Mapping[str, Pose]) -> None:
-        """Puts objects down at rest; those that are not named stand as exported."""
+    def reset(self, poses: Mapping[str, Pose]) -> None:
+        """Reset to poses at rest; other objects return to their exported poses."""
         mujoco.mj_resetData(self._model, self._data)
         for name, pose in poses.items():
             if name in self._bodies:
@@ -86,11 +81,11 @@ class Simulation:
         mujoco.mj_forward(self._model, self._data)
 
     def advance(self, seconds: float, budget_s: float = float("inf")) -> float:
-        """Steps for so long, or until the budget is spent.
+        """Step until the time or the budget is spent.
 
         Args:
-            seconds: Of simulated time [s].
-            budget_s: Of the wall's time [s]; a heavy scene plays slower instead of holding up the others.
+            seconds: Simulated time [s].
+            budget_s: Wall time [s]; a heavy scene plays slower instead of delaying the others.
 
         Returns:
             The simulated time that passed [s].
@@ -102,11 +97,11 @@ class Simulation:
         return done * float(self._model.opt.timestep)
 
     def push(self, name: str, impulse_ns: Vector3) -> None:
-        """Changes an object's momentum without turning it; one that is not there is left alone.
+        """Change the linear momentum of an object; unknown names are ignored.
 
         Args:
-            name: Of the object.
-            impulse_ns: In the table frame [N s].
+            name: Name of the object.
+            impulse_ns: Impulse in the table frame [N s].
         """
         if name in self._bodies:
             body = self._bodies[name]
@@ -114,11 +109,13 @@ class Simulation:
             self._data.qvel[start : start + 3] += impulse_ns / max(float(self._model.body_subtreemass[body]), 1e-6)
 
     def poses(self) -> dict[str, Pose]:
-        """Of all objects, by name."""
-        return dict(zip(self._bodies, body_poses(self._model, self._data, list(self._bodies.values())), strict=True))
+        """Read the poses of all objects by name."""
+        return dict(
+            zip(self._bodies, read_body_poses(self._model, self._data, list(self._bodies.values())), strict=True)
+        )
 
     def contacts(self, shown: Container[str] | None = None) -> Contacts:
-        """Of the state as it is.
+        """Measure the contacts of the current state.
 
         Args:
             shown: Objects whose contacts count; None for all.

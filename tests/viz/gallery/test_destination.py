@@ -14,10 +14,11 @@ from typer.testing import CliRunner
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.viz.gallery.destination import check_replaceable, folder_of, put_in_place
-from tableverse_factory.viz.gallery.gallery import default_dest, write_gallery
+from tableverse_factory.viz.gallery.destination import check_replaceable, find_local_folder, replace_folder
+from tableverse_factory.viz.gallery.gallery import write_gallery
 from tableverse_factory.viz.gallery.pages import Site
-from tableverse_factory.viz.gallery.scene import commands
+from tableverse_factory.viz.gallery.scene import list_commands
+from tableverse_factory.viz.output_folder import choose_destination
 from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.viz.gallery.test_gallery import digest
 
@@ -37,8 +38,8 @@ def test_only_a_gallery_is_ever_replaced(out, tmp_path):
         with pytest.raises(InputError):
             write_gallery(open_dataset(out), dest)
     assert (mine / "thesis.txt").read_text() == "years"
-    assert default_dest(str(out)) == out.with_name("out-gallery")
-    assert default_dest("s3://bucket/a/out/") == Path("out-gallery")
+    assert choose_destination(str(out), "gallery") == out.with_name("out-gallery")
+    assert choose_destination("s3://bucket/a/out/", "gallery") == Path("out-gallery")
 
 
 @pytest.mark.parametrize("form", ["{}", "file://{}", "{}/../out"])
@@ -85,7 +86,7 @@ def test_the_earlier_gallery_is_back_where_the_new_one_cannot_be(out, tmp_path):
     site = write_gallery(open_dataset(out), tmp_path / "site").parent
     before = digest(site)
     with pytest.raises(FileNotFoundError):
-        put_in_place(tmp_path / "never-made", site, tmp_path / "aside", "site")
+        replace_folder(tmp_path / "never-made", site, tmp_path / "aside", "site")
     assert digest(site) == before
     assert list(tmp_path.iterdir()) == [site]
 
@@ -131,8 +132,8 @@ def test_how_the_dataset_was_named_does_not_show(out, tmp_path, monkeypatch):
 
 def test_a_dataset_elsewhere_is_named_by_its_address(tmp_path):
     site = Site(tmp_path, "tables", "hf://datasets/me/tables", 1, 0, 0)
-    assert commands(site.named, "a")[0][1] == "tableverse view hf://datasets/me/tables a"
-    assert folder_of("hf://datasets/me/tables") is folder_of("s3://bucket/tables") is None
+    assert list_commands(site.named, "a")[0][1] == "tableverse view hf://datasets/me/tables a"
+    assert find_local_folder("hf://datasets/me/tables") is find_local_folder("s3://bucket/tables") is None
 
 
 def test_a_stopped_measurement_takes_its_copies_away(tmp_path):

@@ -12,7 +12,14 @@ from PIL import Image
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.viz.gallery.gallery import FEW, FILMS, SAMPLE, GalleryOptions, usual_effort, write_gallery
+from tableverse_factory.viz.gallery.gallery import (
+    DRAW_ALL_LIMIT,
+    FILMS_PER_SCENE,
+    SAMPLE_SIZE,
+    GalleryOptions,
+    choose_options,
+    write_gallery,
+)
 from tableverse_factory.viz.gallery.pictures import write_pictures
 from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.helpers.recorded_dataset import two_scenes
@@ -20,11 +27,11 @@ from tests.viz.gallery.test_gallery import Page, digest, index_of
 
 
 def test_few_scenes_are_all_drawn_and_many_by_sample():
-    assert usual_effort(FEW) == GalleryOptions(FEW, FILMS)
-    assert usual_effort(FEW + 1) == GalleryOptions(SAMPLE, 0)
-    assert usual_effort(20_000, renders=300) == GalleryOptions(300, 0)
-    assert usual_effort(3, films=0) == GalleryOptions(3, 0)
-    assert usual_effort(3, renders=0, films=2) == GalleryOptions(0, 2)
+    assert choose_options(DRAW_ALL_LIMIT) == GalleryOptions(DRAW_ALL_LIMIT, FILMS_PER_SCENE)
+    assert choose_options(DRAW_ALL_LIMIT + 1) == GalleryOptions(SAMPLE_SIZE, 0)
+    assert choose_options(20_000, renders=300) == GalleryOptions(300, 0)
+    assert choose_options(3, films=0) == GalleryOptions(3, 0)
+    assert choose_options(3, renders=0, films=2) == GalleryOptions(0, 2)
 
 
 def test_scenes_that_are_not_drawn_have_picture_page_and_the_command_that_draws_them(tmp_path):

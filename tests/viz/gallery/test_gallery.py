@@ -17,7 +17,7 @@ from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.transforms import inverse, transform_points
+from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tests.helpers.gallery_dataset import CAMERA, EYE, HOSTILE, scene_members, write_dataset
 
@@ -151,7 +151,7 @@ def test_the_twin_is_seen_by_the_camera_of_the_photograph(gallery):
     """The red box and the green box appear where the photograph's camera projects them."""
     twin = np.asarray(Image.open(gallery / "pictures" / "photo-twin.jpg")).astype(int)
     boxes = np.array([[0.0, -0.04, 0.04], [0.15, 0.025, 0.06]])
-    pixels = project(transform_points(inverse(EYE), boxes), CAMERA) * twin.shape[1] / CAMERA.width
+    pixels = project(transform_points(invert_pose(EYE), boxes), CAMERA) * twin.shape[1] / CAMERA.width
     (red_x, red_y), (green_x, green_y) = np.rint(pixels).astype(int)
     red, green = twin[red_y, red_x], twin[green_y, green_x]
     assert red[0] > red[1] + 40

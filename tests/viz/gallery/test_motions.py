@@ -7,11 +7,11 @@ import pytest
 from PIL import Image
 
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.robotics.execution.arrays import arrays_bytes
-from tableverse_factory.robotics.execution.perturbations import CHANGES
-from tableverse_factory.viz.gallery import words
+from tableverse_factory.robotics.execution.arrays import encode_recording
+from tableverse_factory.robotics.execution.perturbations import PERTURBATIONS
+from tableverse_factory.viz.gallery import formatting
 from tableverse_factory.viz.gallery.gallery import write_gallery
-from tableverse_factory.viz.gallery.motions import filmed_tasks, write_motions
+from tableverse_factory.viz.gallery.motions import choose_filmed_tasks, write_motions
 from tests.helpers.gallery_dataset import HOSTILE
 from tests.helpers.recorded_dataset import recording, trajectory_row, write_recorded_dataset
 from tests.viz.gallery.test_gallery import Page, digest, index_of
@@ -19,7 +19,7 @@ from tests.viz.gallery.test_gallery import Page, digest, index_of
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory) -> Path:
-    good, short = arrays_bytes(recording()), arrays_bytes(recording(7))
+    good, short = encode_recording(recording()), encode_recording(recording(7))
     hostile = {"instruction": HOSTILE, "detail": HOSTILE, "reason": HOSTILE, "failed_phase": HOSTILE}
     unplanned = {"failed_phase": None, "reason": "no_grasp", "detail": "0 of 2000 candidates", "arrays": None}
     scenes = {
@@ -115,24 +115,28 @@ def test_a_page_without_films_does_not_speak_of_them(out, tmp_path, scene):
 
 
 def test_changes_are_told_in_words():
-    assert set(words.CHANGES) == set(CHANGES)
-    assert words.changes(list(CHANGES)) == "half and double friction, ±30 % mass"
-    assert words.changes(["mass_plus_30", "<new>"]) == "+30 % mass, <new>"
-    assert words.changes([]) == words.changes(None) == "no change of friction or mass"
+    assert set(formatting.PERTURBATION_NAMES) == set(PERTURBATIONS)
+    assert formatting.format_perturbations(list(PERTURBATIONS)) == "half and double friction, ±30 % mass"
+    assert formatting.format_perturbations(["mass_plus_30", "<new>"]) == "+30 % mass, <new>"
+    assert (
+        formatting.format_perturbations([]) == formatting.format_perturbations(None) == "no change of friction or mass"
+    )
 
 
 def test_films_are_of_different_relations_and_outcomes_first():
     kinds = [("on", True), ("on", True), ("in", True), ("on", False), ("on", True), ("in", True)]
     rows = [{"task_id": f"{k}", "relation": r, "success": s, "arrays": "x"} for k, (r, s) in enumerate(kinds)]
     rows.append({"task_id": "without", "relation": "left of", "success": False, "arrays": None})
-    assert filmed_tasks(rows, 3) == {"0", "2", "3"}
-    assert filmed_tasks(rows, 4) == {"0", "1", "2", "3"}
-    assert filmed_tasks(rows, 99) == {f"{k}" for k in range(6)}
-    assert filmed_tasks(rows, 0) == frozenset()
+    assert choose_filmed_tasks(rows, 3) == {"0", "2", "3"}
+    assert choose_filmed_tasks(rows, 4) == {"0", "1", "2", "3"}
+    assert choose_filmed_tasks(rows, 99) == {f"{k}" for k in range(6)}
+    assert choose_filmed_tasks(rows, 0) == frozenset()
 
 
 def test_the_id_of_a_task_that_is_no_file_name_is_refused(tmp_path):
-    rows = [(trajectory_row("a-1", "../evil", True, arrays="trajectories/task_000.npz"), arrays_bytes(recording(3)))]
+    rows = [
+        (trajectory_row("a-1", "../evil", True, arrays="trajectories/task_000.npz"), encode_recording(recording(3)))
+    ]
     source = write_recorded_dataset(tmp_path / "out", {"a-1": rows})
     with pytest.raises(ValueError, match="not usable"):
         write_motions(open_dataset(source).scene("a-1"), tmp_path, films=9)
@@ -140,7 +144,7 @@ def test_the_id_of_a_task_that_is_no_file_name_is_refused(tmp_path):
 
 
 def test_an_arm_that_is_not_there_costs_its_film(tmp_path):
-    rows = [(trajectory_row("a-1", "task_000", True), arrays_bytes(replace(recording(5), robot="unheard-of")))]
+    rows = [(trajectory_row("a-1", "task_000", True), encode_recording(replace(recording(5), robot="unheard-of")))]
     source = write_recorded_dataset(tmp_path / "out", {"a-1": rows})
     (motion,) = write_motions(open_dataset(source).scene("a-1"), tmp_path, films=9)
     assert (motion.film, motion.plot) == ("", None)

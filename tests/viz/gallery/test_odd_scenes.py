@@ -18,7 +18,7 @@ from tableverse_factory.viz.gallery.gallery import write_gallery
 from tableverse_factory.viz.gallery.pages import Site
 from tableverse_factory.viz.gallery.pictures import write_pictures
 from tableverse_factory.viz.gallery.records import SceneRecord
-from tableverse_factory.viz.gallery.scene import Order, write_scene
+from tableverse_factory.viz.gallery.scene import SceneJob, write_scene
 from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.viz.gallery.test_gallery import Page
 
@@ -103,7 +103,7 @@ def test_a_page_that_cannot_be_made_says_so_in_its_place(tmp_path):
     row = open_dataset(out).scenes.to_table().drop_columns(["drift_m"]).to_pylist()[0]
     for name in ("scenes", "pictures"):
         (tmp_path / name).mkdir()
-    order = Order(SceneRecord(row, (), (), ()), render=False, before="", after="", page=1)
+    order = SceneJob(SceneRecord(row, (), (), ()), render=False, before="", after="", page=1)
     card = write_scene(Site(tmp_path, "out", str(out), 1, 0, 0), 0, None, order)
     assert "drift_m" in card.problem
     page = text_of(tmp_path / "scenes" / "scene.html")

@@ -193,7 +193,7 @@ def test_scenes_are_searched_and_two_browsers_do_not_disturb_each_other(small, v
 
 def test_a_page_from_elsewhere_sees_nothing(browser, viewer):
     assert until(lambda: not viewer.sessions())
-    elsewhere = Viewer(viewer._shelf, "b-2", "127.0.0.1", 0)
+    elsewhere = Viewer(viewer._scenes, "b-2", "127.0.0.1", 0)
     try:
         page = browser.new_page(viewport={"width": 400, "height": 300})
         page.goto(f"{elsewhere.url}?websocket={viewer.url.replace('http', 'ws')}")

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.viz.viewer.origin_check import OriginPolicy, wanted_scene
+from tableverse_factory.viz.viewer.origin_check import OriginPolicy, parse_scene_id
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - nothing listens here
 
@@ -37,14 +37,14 @@ EVERYWHERE = "0.0.0.0"  # noqa: S104 - nothing listens here
     ],
 )
 def test_only_our_own_page_is_let_in(origin, asked, bound, comes_in):
-    assert OriginPolicy(bound, ["https://known.example/proxy/8080/"]).lets_in(origin, asked) is comes_in
+    assert OriginPolicy(bound, ["https://known.example/proxy/8080/"]).allows(origin, asked) is comes_in
 
 
 def test_a_refusal_is_told_once_and_not_without_end(caplog):
     door = OriginPolicy("127.0.0.1")
     for number in range(300):
         for _ in range(3):
-            assert not door.lets_in(f"https://evil-{number}.example\x1b[2J", "127.0.0.1:8080")
+            assert not door.allows(f"https://evil-{number}.example\x1b[2J", "127.0.0.1:8080")
     assert len(caplog.messages) == 100
     assert "\x1b" not in caplog.text
 
@@ -56,7 +56,7 @@ def test_an_address_that_is_none_is_no_proxy(address):
 
 
 def test_an_address_names_its_scene():
-    assert wanted_scene("/?scene=a%20b-1") == "a b-1"
-    assert wanted_scene("/") is None
-    link = OriginPolicy("127.0.0.1").link_to("a&b #1", "http://127.0.0.1:8080", "127.0.0.1:8080")
+    assert parse_scene_id("/?scene=a%20b-1") == "a b-1"
+    assert parse_scene_id("/") is None
+    link = OriginPolicy("127.0.0.1").make_link("a&b #1", "http://127.0.0.1:8080", "127.0.0.1:8080")
     assert link == "?websocket=ws://127.0.0.1:8080/?scene=a%26b%20%231"

@@ -12,23 +12,23 @@ import trimesh
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.geometry.math.transforms import inverse, transform_points
-from tableverse_factory.viz.viewer.catalogue import Catalogue
-from tableverse_factory.viz.viewer.facts import facts_html, lost_html, safe
-from tableverse_factory.viz.viewer.glb import piece_color
-from tableverse_factory.viz.viewer.loaded_scene import OpenedScene, poses_with, scene_file
-from tableverse_factory.viz.viewer.motion import MotionPlayback, outcome
+from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
+from tableverse_factory.viz.viewer.glb import choose_piece_color
+from tableverse_factory.viz.viewer.loaded_scene import LoadedScene, load_scene_file, merge_poses
+from tableverse_factory.viz.viewer.motion_playback import MotionPlayback, describe_outcome
 from tableverse_factory.viz.viewer.origin_check import OriginPolicy
+from tableverse_factory.viz.viewer.panel_html import escape_text, format_dropped_scene, format_facts
 from tableverse_factory.viz.viewer.playhead import Playhead
-from tableverse_factory.viz.viewer.scene_cache import KEPT, SceneCache
+from tableverse_factory.viz.viewer.scene_cache import MAX_SCENES, SceneCache
+from tableverse_factory.viz.viewer.scene_index import SceneIndex
 from tableverse_factory.viz.viewer.simulation import Simulation
 from tests.helpers.recorded_dataset import CAMERA, EYE, X_ID, Y_ID, recording
 from tests.helpers.viewed_dataset import ABOVE_M, ASIDE_M, HOSTILE, many_scenes, members, opened, scene_of
 
 
 @pytest.fixture(scope="module")
-def scene() -> OpenedScene:
-    return OpenedScene(scene_of())
+def scene() -> LoadedScene:
+    return LoadedScene(scene_of())
 
 
 def loaded(glb: bytes) -> trimesh.Trimesh:
@@ -53,7 +53,7 @@ def test_a_copy_was_not_observed():
     meta = json.loads(files["meta.json"])
     meta["objects"][1]["poses"]["placed"] = None
     assert (
-        X_ID not in OpenedScene(Scene("a-1", {}, {**files, "meta.json": json.dumps(meta).encode()})).layouts["observed"]
+        X_ID not in LoadedScene(Scene("a-1", {}, {**files, "meta.json": json.dumps(meta).encode()})).layouts["observed"]
     )
 
 
@@ -63,11 +63,11 @@ def test_poses_that_are_none_are_refused(position):
     meta = json.loads(files["meta.json"])
     meta["objects"][0]["poses"]["rectified"]["position"] = position
     with pytest.raises(InputError, match="pose"):
-        OpenedScene(Scene("a-1", {}, {**files, "meta.json": json.dumps(meta).encode()}))
+        LoadedScene(Scene("a-1", {}, {**files, "meta.json": json.dumps(meta).encode()}))
 
 
 def test_what_is_sent_is_the_object_in_its_own_frame_with_its_texture(scene):
-    mesh = loaded(scene.figures[1].look)
+    mesh = loaded(scene.bodies[1].look)
     np.testing.assert_allclose(mesh.extents, (0.04, 0.04, 0.12), atol=1e-5)
     np.testing.assert_allclose(mesh.bounds.mean(axis=0), 0.0, atol=1e-5)
     assert mesh.volume > 0  # faces look outwards, or the browser would not draw them
@@ -77,24 +77,24 @@ def test_what_is_sent_is_the_object_in_its_own_frame_with_its_texture(scene):
 
 
 def test_the_table_lies_below_the_objects(scene):
-    ((glb, pose),) = scene.still
+    ((glb, pose),) = scene.static
     top = transform_points(pose, loaded(glb).vertices)[:, 2].max()
     assert top == pytest.approx(0.0, abs=1e-6)
 
 
 def test_another_texture_changes_the_table_and_nothing_else(scene):
-    ((before, pose),), ((after, same),) = scene.still, scene.retextured("marble-3")
+    ((before, pose),), ((after, same),) = scene.static, scene.retexture_table("marble-3")
     assert before != after
     np.testing.assert_array_equal(pose.position, same.position)
-    assert scene.retextured(None) == scene.still
+    assert scene.retexture_table(None) == scene.static
     with pytest.raises(InputError, match="no texture"):
-        scene.retextured("nothing-3")
+        scene.retexture_table("nothing-3")
 
 
 def test_pieces_differ_in_colour(scene):
-    assert len({piece_color(number) for number in range(48)}) == 48
-    assert scene.figures[0].n_pieces == 1
-    first, second = (np.unique(loaded(each.pieces).visual.vertex_colors, axis=0) for each in scene.figures)
+    assert len({choose_piece_color(number) for number in range(48)}) == 48
+    assert scene.bodies[0].n_pieces == 1
+    first, second = (np.unique(loaded(each.pieces).visual.vertex_colors, axis=0) for each in scene.bodies)
     assert len(first) == 1
     assert (first != second).any()
 
@@ -102,7 +102,7 @@ def test_pieces_differ_in_colour(scene):
 def test_a_model_that_is_none_of_ours_is_refused(tmp_path):
     xml = '<mujoco><worldbody><body><joint type="hinge"/><geom size=".1"/></body></worldbody></mujoco>'
     with pytest.raises(InputError, match="joints besides free ones"):
-        OpenedScene(Scene("a", {}, {"scene.xml": xml.encode()}))
+        LoadedScene(Scene("a", {}, {"scene.xml": xml.encode()}))
 
 
 # Camera
@@ -112,7 +112,7 @@ def test_the_camera_starts_where_the_picture_was_taken_and_sees_all_of_it(scene)
     view = scene.viewpoint
     assert scene.has_camera
     np.testing.assert_allclose(view.position, EYE.position)
-    middle = transform_points(inverse(EYE), view.target[None])[0]
+    middle = transform_points(invert_pose(EYE), view.target[None])[0]
     np.testing.assert_allclose(middle[:2], 0.0, atol=1e-9)  # on the optical axis
     assert view.target[2] == pytest.approx(0.0, abs=1e-9)  # and on the table
     upright = 2 * np.arctan(CAMERA.height / 2 / CAMERA.fy)
@@ -123,7 +123,7 @@ def test_the_camera_starts_where_the_picture_was_taken_and_sees_all_of_it(scene)
 
 
 def test_without_a_camera_it_looks_from_the_front_and_above():
-    scene = OpenedScene(scene_of(photographed=False))
+    scene = LoadedScene(scene_of(photographed=False))
     assert not scene.has_camera
     assert scene.photograph is None
     assert scene.viewpoint.position[1] < 0 < scene.viewpoint.position[2]
@@ -138,7 +138,7 @@ def test_what_stands_stays_and_presses_with_its_weight(scene):
     for name, pose in simulation.poses().items():
         np.testing.assert_allclose(pose.position, scene.settled[name].position, atol=1e-3)
     contacts = simulation.contacts()
-    weight = sum(figure.mass_kg for figure in scene.figures) * 9.81
+    weight = sum(figure.mass_kg for figure in scene.bodies) * 9.81
     assert contacts.forces_n.sum() == pytest.approx(weight, rel=0.02)
     assert np.abs(contacts.points[:, 2]).max() < 1e-3
     np.testing.assert_allclose(np.abs(contacts.normals[:, 2]), 1.0, atol=1e-6)
@@ -151,17 +151,17 @@ def test_contacts_are_those_of_mujoco_and_of_what_is_shown(scene):
     mujoco.mj_forward(scene.model, data)
     simulation, held = Simulation(scene.model), Simulation(scene.model)
     simulation.advance(500 * scene.model.opt.timestep)
-    held.put(simulation.poses())
+    held.reset(simulation.poses())
     assert held.contacts().total == data.ncon > 0
     shown = held.contacts(shown={Y_ID})
     assert 0 < shown.total < data.ncon
-    assert shown.forces_n.sum() == pytest.approx(scene.figures[0].mass_kg * 9.81, rel=0.02)
+    assert shown.forces_n.sum() == pytest.approx(scene.bodies[0].mass_kg * 9.81, rel=0.02)
 
 
 def test_from_a_layout_things_fall_and_the_model_is_shared(scene):
     before = scene.model.qpos0.copy()
     simulation, other = Simulation(scene.model), Simulation(scene.model)
-    simulation.put(scene.layouts["rectified"])
+    simulation.reset(scene.layouts["rectified"])
     assert len(simulation.contacts()) == 0
     passed = simulation.advance(0.05)
     assert passed == pytest.approx(0.05)
@@ -172,7 +172,7 @@ def test_from_a_layout_things_fall_and_the_model_is_shared(scene):
 
 
 def test_a_push_changes_the_speed_by_impulse_over_mass(scene):
-    simulation, mass = Simulation(scene.model), scene.figures[1].mass_kg
+    simulation, mass = Simulation(scene.model), scene.bodies[1].mass_kg
     simulation.push(X_ID, mass * np.array([0.0, 0.0, 1.0]))
     simulation.push("nobody", np.ones(3))
     simulation.advance(0.1)
@@ -200,14 +200,14 @@ def test_a_motion_is_where_its_recording_says():
     assert len(motion.arm_poses(sample)) == len(motion.meshes)
     assert np.abs(motion.arm_poses(0)[-1].position - motion.arm_poses(40)[-1].position).max() > 0.05
     base = {X_ID: Pose(np.zeros(3), np.array([1.0, 0, 0, 0]))}
-    assert list(poses_with(base, poses)) == [X_ID]  # what the scene lacks is not drawn
+    assert list(merge_poses(base, poses)) == [X_ID]  # what the scene lacks is not drawn
 
 
 def test_how_a_task_ended_is_told_in_a_line():
     failed = {"success": False, "failed_phase": "pre_place", "reason": "not_grasped", "detail": "\x1b[2Jbad\nline"}
-    assert outcome({"success": True}) == "success"
-    assert outcome(failed) == r"failed in pre-place: not grasped (\x1b[2Jbad\nline)"
-    assert outcome({**failed, "failed_phase": None, "detail": None}) == "failed: not grasped"
+    assert describe_outcome({"success": True}) == "success"
+    assert describe_outcome(failed) == r"failed in pre-place: not grasped (\x1b[2Jbad\nline)"
+    assert describe_outcome({**failed, "failed_phase": None, "detail": None}) == "failed: not grasped"
 
 
 def test_the_playhead_stops_at_the_end_and_starts_again():
@@ -228,7 +228,7 @@ def test_the_playhead_stops_at_the_end_and_starts_again():
 
 
 def test_scenes_are_found_by_id_name_label_and_status(tmp_path):
-    catalogue = Catalogue(opened(tmp_path / "out"))
+    catalogue = SceneIndex(opened(tmp_path / "out"))
     assert len(catalogue) == 3
     assert catalogue.search("RED block").scene_ids == ["a-1", "b-2"]
     assert catalogue.search("red", "dropped").scene_ids == []
@@ -239,15 +239,15 @@ def test_scenes_are_found_by_id_name_label_and_status(tmp_path):
 
 
 def test_a_list_of_twenty_thousand_is_looked_at_in_windows(tmp_path):
-    found = Catalogue(opened_many := _many(tmp_path)).search("mug k99 s-01")
+    found = SceneIndex(opened_many := _many(tmp_path)).search("mug k99 s-01")
     assert len(opened_many.shards) == 1
     assert len(found) == 100
-    assert found.window("s-010099", 50) == list(found.scene_ids[:50])
-    assert found.window("s-019999", 50) == list(found.scene_ids[50:])
-    assert found.beside("s-010099", -1) == "s-010099"
-    assert found.beside("s-010099", 1) == "s-010199"
-    assert found.beside("s-010099", 50) == found.scene_ids[50]
-    assert found.beside("gone", 1) == "s-010099"
+    assert found.page("s-010099", 50) == list(found.scene_ids[:50])
+    assert found.page("s-019999", 50) == list(found.scene_ids[50:])
+    assert found.step_from("s-010099", -1) == "s-010099"
+    assert found.step_from("s-010099", 1) == "s-010199"
+    assert found.step_from("s-010099", 50) == found.scene_ids[50]
+    assert found.step_from("gone", 1) == "s-010099"
 
 
 def _many(tmp_path):
@@ -257,7 +257,7 @@ def _many(tmp_path):
 
 
 def test_few_opened_scenes_are_kept(tmp_path):
-    ids = [f"s-{number}" for number in range(KEPT + 1)]
+    ids = [f"s-{number}" for number in range(MAX_SCENES + 1)]
     shelf = SceneCache(opened(tmp_path / "out", ids))
     first, second = shelf.open(ids[0]), shelf.open(ids[1])
     assert shelf.open(ids[0]) is first
@@ -269,8 +269,8 @@ def test_few_opened_scenes_are_kept(tmp_path):
 
 def test_a_lost_scene_says_why_and_an_unknown_one_is_told(tmp_path):
     shelf = SceneCache(opened(tmp_path / "out"))
-    assert shelf.lost("c-3")["reason"] == "not_at_rest"
-    assert shelf.lost("a-1") is None
+    assert shelf.find_dropped_row("c-3")["reason"] == "not_at_rest"
+    assert shelf.find_dropped_row("a-1") is None
     with pytest.raises(InputError, match="no scene 'nope'"):
         shelf.open("nope")
 
@@ -278,7 +278,7 @@ def test_a_lost_scene_says_why_and_an_unknown_one_is_told(tmp_path):
 def test_a_scene_that_lies_in_a_folder_opens_too(tmp_path):
     folder = tmp_path / "scene"
     scene_of().extract(folder)
-    shelf = SceneCache(scene_file(folder / "scene.xml"))
+    shelf = SceneCache(load_scene_file(folder / "scene.xml"))
     scene = shelf.open(shelf.first())
     assert (len(shelf), scene.scene.scene_id, scene.has_camera) == (1, "scene", True)
     assert scene.photograph is not None
@@ -287,7 +287,7 @@ def test_a_scene_that_lies_in_a_folder_opens_too(tmp_path):
     assert {row["object_id"] for row in scene.object_rows} == {X_ID, Y_ID}
     assert scene.task_rows == ()
     with pytest.raises(InputError, match="no such file"):
-        scene_file(folder / "none.xml")
+        load_scene_file(folder / "none.xml")
 
 
 # Texts
@@ -297,24 +297,28 @@ def test_foreign_text_stays_text():
     row = {"source": HOSTILE, "licence": HOSTILE, "quality_score": HOSTILE}
     objects = [{"object_id": "obj_000", "label": HOSTILE, "mass_kg": "much"}]
     tasks = [{"instruction": HOSTILE, "accepted": True}]
-    html = facts_html(
-        row, {"certificate": {"drift_m": HOSTILE}}, objects, tasks, OriginPolicy("::1").link_to(HOSTILE, None, HOSTILE)
+    html = format_facts(
+        row,
+        {"certificate": {"drift_m": HOSTILE}},
+        objects,
+        tasks,
+        OriginPolicy("::1").make_link(HOSTILE, None, HOSTILE),
     )
-    html += lost_html({"status": HOSTILE, "stage": HOSTILE, "reason": HOSTILE, "detail": HOSTILE})
+    html += format_dropped_scene({"status": HOSTILE, "stage": HOSTILE, "reason": HOSTILE, "detail": HOSTILE})
     assert "<script" not in html
     assert "<img" not in html
-    assert len(safe("x" * 10_000)) == 120
+    assert len(escape_text("x" * 10_000)) == 120
 
 
 def test_long_lists_are_cut():
     objects = [{"object_id": f"obj_{number:03d}", "label": "mug"} for number in range(5000)]
-    html = facts_html({}, {}, objects, [], "")
+    html = format_facts({}, {}, objects, [], "")
     assert html.count("<tr>") == 100
     assert "Objects (5000)" in html
 
 
 def test_the_glb_is_one_file_that_needs_no_other(scene):
-    data = scene.figures[0].look
+    data = scene.bodies[0].look
     size = struct.unpack("<I", data[12:16])[0]
     content = json.loads(data[20 : 20 + size])
     assert all("uri" not in each for each in (*content["buffers"], *content["images"]))

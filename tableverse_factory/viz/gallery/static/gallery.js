@@ -1,4 +1,4 @@
-// Everything here is a convenience: without scripts the pages show the same scenes, page by page.
+// Optional: without scripts the pages show the same scenes, page by page.
 "use strict";
 (() => {
   const root = document.body.dataset.root;
@@ -17,7 +17,7 @@
   paint(stored());
   button.addEventListener("click", () => {
     const theme = isDark() ? "light" : "dark";
-    try { localStorage.setItem("tableverse-theme", theme); } catch { /* private windows keep nothing */ }
+    try { localStorage.setItem("tableverse-theme", theme); } catch { /* private windows store nothing */ }
     paint(theme);
   });
 
@@ -72,7 +72,7 @@
   const small = document.querySelector("#cards").classList.contains("small");
   list.classList.toggle("small", small);
 
-  // The order of the fields is that of viz/gallery/index.py.
+  // The order of the fields is that of viz/gallery/search_index.py.
   const doneScene = (labels) => ([id, title, score, usable, codes, depth, drift, names, objects, tasks, good, tried, pictures]) => ({
     id, title: title || id, status: "done", score, usable: usable === 1, codes, depth, drift, objects, tasks, good, tried, pictures,
     names: names.map((name) => labels[name]), href: `${root}scenes/${id}.html`,
@@ -147,7 +147,7 @@
     some: (scene) => scene.good > 0,
     fail: (scene) => scene.good < scene.tried,
   };
-  // A positive limit is the most that is allowed (the least, of a score); a negative one asks for what lies beyond.
+  // A positive limit is a maximum (a minimum for scores); a negative one selects values beyond it.
   const within = (value, limit) => value !== null && (limit > 0 ? value <= limit : value > -limit);
   const tests = {
     q: (text) => { const each = text.toLowerCase().split(/\s+/).filter(Boolean); return (scene) => each.every((word) => scene.text.includes(word)); },
@@ -176,7 +176,7 @@
     for (const field of fields) {
       const value = (state.get(field.name) || "").slice(0, 200);
       field.value = value;
-      // A choice that is not offered is none.
+      // Ignore values that are not among the options.
       if (field.value !== value) field.value = "";
     }
     page = Math.max(1, Math.floor(Number(state.get("page"))) || 1);

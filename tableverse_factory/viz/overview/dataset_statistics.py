@@ -1,7 +1,6 @@
-"""What a dataset holds, counted: the figures behind the overview (paper, figure 2).
+"""Statistics of a dataset for the overview (paper, figure 2).
 
-Tables are read in batches and only counted there, by Arrow and NumPy: memory grows with the number of different
-labels, never with the number of objects.
+Arrow and NumPy count tables batch by batch: memory grows with the number of different labels, not of objects.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,11 +13,12 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.viz.funnel import SceneLoss
 
 FORMAT = "tableverse-statistics-1"
 MAX_LABEL_CHARS = 200
 TOP = 100
-"""So many names are told of each ranking; the rest is one number."""
+"""Most names in a ranking."""
 
 MASS_EDGES_KG = tuple(float(f"{10 ** (-3 + k / 6):.6g}") for k in range(28))
 SIZE_EDGES_M = tuple(float(f"{10 ** (-2.5 + k / 8):.6g}") for k in range(23))
@@ -28,12 +28,12 @@ _MERGE_ROWS = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """How often each name occurs.
+    """Frequencies of names.
 
     Attributes:
-        total: Of all names.
-        names: How many different ones there are.
-        top: The most frequent ones with their counts; equal counts in alphabetical order.
+        total: Number of occurrences of all names.
+        names: Number of different names.
+        top: The most frequent names with their counts; equal counts in alphabetical order.
     """
 
     total: int
@@ -43,10 +43,10 @@ class Ranking:
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """Counts between edges; what lies beyond is counted apart, and so is what is missing.
+    """Counts between edges; values beyond them and missing values are counted apart.
 
     Attributes:
-        edges: One more than counts; a value on an edge belongs to the bin above it.
+        edges: Edges of the bins; a value on an edge belongs to the bin above it.
     """
 
     edges: tuple[float, ...]
@@ -54,16 +54,6 @@ class Histogram:
     below: int
     above: int
     missing: int
-
-
-@dataclass(frozen=True, slots=True)
-class OverviewLoss:
-    """Scenes lost at one stage for one reason."""
-
-    stage: str
-    status: str
-    reason: str
-    count: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,26 +67,24 @@ class MotionLoss:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """All figures of the overview.
+    """Figures of the overview.
 
     Attributes:
         scenes: Counts: `entered`, `done`, `dropped`, `failed`, `usable`.
         objects: Counts: `total`, `contained`, `hinged`, `graspable`.
-        kinds: Done scenes by what they were made from.
+        kinds: Done scenes by kind of input.
         sources: Done scenes by source.
         labels: Objects by name, lower case.
-        long_tail: Rank and count of names, by falling count, at most 200 of them evenly spread over the orders of
-            magnitude.
+        long_tail: Rank and count of names by falling count, at most 200 of them, evenly spread on a logarithmic scale.
         objects_per_scene: Of done scenes.
         quality_scores: Of done scenes.
         masses_kg: Of objects.
         sizes_m: Longest side of objects.
         relations: Accepted tasks by relation.
         tasks: Counts: `accepted`, `refused`.
-        trajectories: Counts: `tried`, `succeeded`; both 0 where none were asked for.
-        trajectory_losses: Tasks that were tried and failed, by phase (empty before any motion) and reason, largest
-            first.
-        losses: Largest first.
+        trajectories: Counts: `tried`, `succeeded`; both 0 without trajectories.
+        trajectory_losses: Failed trajectories by phase (empty before any motion) and reason, largest first.
+        losses: Lost scenes by stage, status and reason, largest first.
     """
 
     scenes: Mapping[str, int]
@@ -113,22 +101,22 @@ class Statistics:
     tasks: Mapping[str, int]
     trajectories: Mapping[str, int]
     trajectory_losses: tuple[MotionLoss, ...]
-    losses: tuple[OverviewLoss, ...]
+    losses: tuple[SceneLoss, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, for `json.dumps`."""
+        """Return plain values for `json.dumps`."""
         return {"format": FORMAT, **asdict(self)}
 
 
-def gather(dataset: Dataset) -> Statistics:
-    """Counts all committed rows.
+def compute_statistics(dataset: Dataset) -> Statistics:
+    """Compute the statistics of all committed rows.
 
     Raises:
         InputError: if a committed shard lacks a table.
     """
-    outcomes = _outcomes(dataset.scenes)
+    outcomes = _count_outcomes(dataset.scenes)
     done = pc.field("status") == "done"
-    labels = _counted(_labels(_batches(dataset.objects, ("relabel_name", "label"))))
+    labels = _count_values(_choose_labels(_scan(dataset.objects, ("relabel_name", "label"))))
     n_accepted = dataset.tasks.count_rows(filter=pc.field("accepted"))
     return Statistics(
         scenes={
@@ -136,40 +124,40 @@ def gather(dataset: Dataset) -> Statistics:
             **{s: sum(o.count for o in outcomes if o.status == s) for s in ("done", "dropped", "failed")},
             "usable": dataset.scenes.count_rows(filter=done & pc.field("usable")),
         },
-        objects=_object_counts(dataset.objects),
-        kinds=_ranking(_counted(_columns(dataset.scenes, "kind", done))),
-        sources=_ranking(_counted(_columns(dataset.scenes, "source", done))),
-        labels=_ranking(labels),
-        long_tail=_long_tail(labels),
-        objects_per_scene=_objects_per_scene(dataset.scenes, done),
-        quality_scores=_histogram(_columns(dataset.scenes, "quality_score", done), np.arange(1, 12)),
-        masses_kg=_histogram(_columns(dataset.objects, "mass_kg"), MASS_EDGES_KG),
-        sizes_m=_histogram(_longest_sides(dataset.objects), SIZE_EDGES_M),
-        relations=_ranking(_counted(_columns(dataset.tasks, "relation", pc.field("accepted")))),
+        objects=_count_objects(dataset.objects),
+        kinds=_make_ranking(_count_values(_scan_column(dataset.scenes, "kind", done))),
+        sources=_make_ranking(_count_values(_scan_column(dataset.scenes, "source", done))),
+        labels=_make_ranking(labels),
+        long_tail=_sample_tail(labels),
+        objects_per_scene=_count_objects_per_scene(dataset.scenes, done),
+        quality_scores=_make_histogram(_scan_column(dataset.scenes, "quality_score", done), np.arange(1, 12)),
+        masses_kg=_make_histogram(_scan_column(dataset.objects, "mass_kg"), MASS_EDGES_KG),
+        sizes_m=_make_histogram(_scan_longest_sides(dataset.objects), SIZE_EDGES_M),
+        relations=_make_ranking(_count_values(_scan_column(dataset.tasks, "relation", pc.field("accepted")))),
         tasks={"accepted": n_accepted, "refused": dataset.tasks.count_rows() - n_accepted},
         trajectories={
             "tried": dataset.trajectories.count_rows(),
             "succeeded": dataset.trajectories.count_rows(filter=pc.field("success")),
         },
-        trajectory_losses=_motion_losses(dataset.trajectories),
+        trajectory_losses=_count_motion_losses(dataset.trajectories),
         losses=tuple(o for o in outcomes if o.status != "done"),
     )
 
 
-def _batches(table: ds.Dataset, columns: Sequence[str], keep: pc.Expression | None = None) -> Iterator[pa.RecordBatch]:
+def _scan(table: ds.Dataset, columns: Sequence[str], keep: pc.Expression | None = None) -> Iterator[pa.RecordBatch]:
     yield from table.scanner(columns=list(columns), filter=keep).to_batches()
 
 
-def _columns(table: ds.Dataset, column: str, keep: pc.Expression | None = None) -> Iterator[pa.Array]:
-    for batch in _batches(table, (column,), keep):
+def _scan_column(table: ds.Dataset, column: str, keep: pc.Expression | None = None) -> Iterator[pa.Array]:
+    for batch in _scan(table, (column,), keep):
         yield batch.column(0)
 
 
-def _outcomes(scenes: ds.Dataset) -> list[OverviewLoss]:
-    """Scenes by status, stage and why; the done ones in one line."""
+def _count_outcomes(scenes: ds.Dataset) -> list[SceneLoss]:
+    """Count scenes by status, stage and reason; finished ones in one entry."""
     keys = ["stage", "status", "why"]
     parts = []
-    for batch in _batches(scenes, ("status", "stage", "reason", "error_kind")):
+    for batch in _scan(scenes, ("status", "stage", "reason", "error_kind")):
         status, stage, reason, kind = batch.columns
         done = pc.fill_null(pc.equal(status, "done"), False)
         why = pc.if_else(done, "", pc.fill_null(pc.coalesce(reason, kind), ""))
@@ -179,13 +167,13 @@ def _outcomes(scenes: ds.Dataset) -> list[OverviewLoss]:
         return []
     merged = pa.concat_tables(parts).group_by(keys).aggregate([("count_all", "sum")])
     losses = [
-        OverviewLoss(row["stage"][:MAX_LABEL_CHARS], row["status"], row["why"][:MAX_LABEL_CHARS], row["count_all_sum"])
+        SceneLoss(row["stage"][:MAX_LABEL_CHARS], row["status"], row["why"][:MAX_LABEL_CHARS], row["count_all_sum"])
         for row in merged.to_pylist()
     ]
     return sorted(losses, key=lambda loss: (-loss.count, loss.stage, loss.status, loss.reason))
 
 
-def _motion_losses(trajectories: ds.Dataset) -> tuple[MotionLoss, ...]:
+def _count_motion_losses(trajectories: ds.Dataset) -> tuple[MotionLoss, ...]:
     failed = trajectories.to_table(columns=["failed_phase", "reason"], filter=~pc.field("success"))
     counts = failed.group_by(["failed_phase", "reason"]).aggregate([([], "count_all")]).to_pylist()
     losses = (
@@ -197,8 +185,8 @@ def _motion_losses(trajectories: ds.Dataset) -> tuple[MotionLoss, ...]:
     return tuple(sorted(losses, key=lambda loss: (-loss.count, loss.phase, loss.reason)))
 
 
-def _labels(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Array]:
-    """The judge's name of each object where it gave one, else the detector's, lower case."""
+def _choose_labels(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Array]:
+    """Choose the judge's name of each object, else the detector's, in lower case."""
     for batch in batches:
         name = pc.if_else(
             pc.equal(pc.utf8_trim_whitespace(pc.fill_null(batch.column(0), "")), ""), *batch.columns[::-1]
@@ -206,8 +194,8 @@ def _labels(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Array]:
         yield pc.utf8_trim_whitespace(pc.utf8_lower(pc.fill_null(name, "")))
 
 
-def _counted(columns: Iterable[pa.Array]) -> pa.Table:
-    """`name` and `count`, a row per different value; what is missing is not counted."""
+def _count_values(columns: Iterable[pa.Array]) -> pa.Table:
+    """Count values; return columns `name` and `count`, without missing values."""
     schema = pa.schema([("name", pa.string()), ("count", pa.int64())])
     total, parts, rows = schema.empty_table(), [], 0
     for column in columns:
@@ -215,17 +203,17 @@ def _counted(columns: Iterable[pa.Array]) -> pa.Table:
         parts.append(pa.table([counts.field("values").cast(pa.string()), counts.field("counts")], schema=schema))
         rows += len(counts)
         if rows > _MERGE_ROWS:
-            total, parts, rows = _merged(total, parts), [], 0
-    total = _merged(total, parts)
+            total, parts, rows = _merge_counts(total, parts), [], 0
+    total = _merge_counts(total, parts)
     return total.filter(pc.and_(pc.is_valid(total["name"]), pc.not_equal(total["name"], "")))
 
 
-def _merged(total: pa.Table, parts: Sequence[pa.Table]) -> pa.Table:
+def _merge_counts(total: pa.Table, parts: Sequence[pa.Table]) -> pa.Table:
     merged = pa.concat_tables([total, *parts]).group_by("name").aggregate([("count", "sum")])
     return merged.rename_columns({"count_sum": "count"}).select(["name", "count"])
 
 
-def _ranking(counts: pa.Table) -> Ranking:
+def _make_ranking(counts: pa.Table) -> Ranking:
     order = counts.sort_by([("count", "descending"), ("name", "ascending")]).slice(0, TOP).to_pylist()
     top = tuple((row["name"][:MAX_LABEL_CHARS], row["count"]) for row in order)
     return Ranking(_total(counts), counts.num_rows, top)
@@ -235,7 +223,7 @@ def _total(counts: pa.Table) -> int:
     return int(pc.sum(counts["count"]).as_py() or 0)
 
 
-def _long_tail(counts: pa.Table) -> tuple[tuple[int, int], ...]:
+def _sample_tail(counts: pa.Table) -> tuple[tuple[int, int], ...]:
     sizes = np.sort(counts["count"].to_numpy())[::-1]
     if not len(sizes):
         return ()
@@ -243,7 +231,7 @@ def _long_tail(counts: pa.Table) -> tuple[tuple[int, int], ...]:
     return tuple((int(rank), int(sizes[rank - 1])) for rank in ranks)
 
 
-def _object_counts(objects: ds.Dataset) -> dict[str, int]:
+def _count_objects(objects: ds.Dataset) -> dict[str, int]:
     return {
         "total": objects.count_rows(),
         "contained": objects.count_rows(filter=pc.field("contained_in").is_valid()),
@@ -252,21 +240,21 @@ def _object_counts(objects: ds.Dataset) -> dict[str, int]:
     }
 
 
-def _objects_per_scene(scenes: ds.Dataset, done: pc.Expression) -> Histogram:
-    """A bin per number up to 40, then by twos, fours and so on."""
-    most = max((pc.max(c).as_py() or 0 for c in _columns(scenes, "n_objects", done)), default=0)
+def _count_objects_per_scene(scenes: ds.Dataset, done: pc.Expression) -> Histogram:
+    """Count objects per scene in bins of one up to 40 objects, else of two, four and so on."""
+    most = max((pc.max(c).as_py() or 0 for c in _scan_column(scenes, "n_objects", done)), default=0)
     width = 1
     while most >= 40 * width:
         width *= 2
-    return _histogram(_columns(scenes, "n_objects", done), np.arange(0, most + 2 * width, width))
+    return _make_histogram(_scan_column(scenes, "n_objects", done), np.arange(0, most + 2 * width, width))
 
 
-def _longest_sides(objects: ds.Dataset) -> Iterator[pa.Array]:
-    for batch in _batches(objects, ("size_x_m", "size_y_m", "size_z_m")):
+def _scan_longest_sides(objects: ds.Dataset) -> Iterator[pa.Array]:
+    for batch in _scan(objects, ("size_x_m", "size_y_m", "size_z_m")):
         yield pc.max_element_wise(*batch.columns, skip_nulls=False)
 
 
-def _histogram(columns: Iterable[pa.Array], edges: Sequence[float] | np.ndarray) -> Histogram:
+def _make_histogram(columns: Iterable[pa.Array], edges: Sequence[float] | np.ndarray) -> Histogram:
     bounds = np.asarray(edges, dtype=np.float64)
     counts, missing = np.zeros(len(bounds) + 1, dtype=np.int64), 0
     for column in columns:

@@ -1,4 +1,4 @@
-"""The thread that lets time pass in all browsers while something plays in one."""
+"""The thread that advances playback in all browsers."""
 
 import logging
 import threading
@@ -9,51 +9,46 @@ from tableverse_factory.viz.viewer.session import Session
 
 TICK_S = 1 / 30
 _BUSY_SHARE = 0.7
-"""Of a tick that physics may take, all browsers together."""
+"""Share of a tick that physics may take, all browsers together."""
 
 _LONGEST_S = 0.2
-"""More time than this never passes at once: after a stall things go on, they do not jump."""
+"""Longest time that a tick advances: after a stall, playback continues without a jump."""
 
 _log = logging.getLogger(__name__)
 
 
-class Clock:
-    """Ticks for sessions that play, and sleeps while none does."""
+class Ticker:
+    """A thread that ticks the sessions that play, and sleeps while none does."""
 
     def __init__(self, sessions: Callable[[], Sequence[Session]]) -> None:
-        """Starts it.
-
-        Args:
-            sessions: Those that there are.
-        """
         self._sessions = sessions
         self._changed = threading.Condition()
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="viewer-clock", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="viewer-ticker", daemon=True)
         self._thread.start()
 
     def wake(self) -> None:
-        """Something plays now."""
+        """Continue after a session has begun to play."""
         with self._changed:
             self._changed.notify_all()
 
     def stop(self) -> None:
-        """Ends its thread."""
+        """Stop the thread and wait for it."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
         self._thread.join()
 
-    def _playing(self) -> list[Session]:
+    def _list_playing(self) -> list[Session]:
         return [session for session in self._sessions() if session.playing]
 
     def _run(self) -> None:
         last = time.perf_counter()
         while not self._stopped:
-            playing = self._playing()
+            playing = self._list_playing()
             if not playing:
                 with self._changed:
-                    self._changed.wait_for(lambda: self._stopped or self._playing(), timeout=None)
+                    self._changed.wait_for(lambda: self._stopped or self._list_playing(), timeout=None)
                 last = time.perf_counter()
                 continue
             now = time.perf_counter()
@@ -63,8 +58,8 @@ class Clock:
             time.sleep(max(0.0, now + TICK_S - time.perf_counter()))
 
 
-def _tick(session: Session, passed: float, budget_s: float) -> None:
+def _tick(session: Session, seconds: float, budget_s: float) -> None:
     try:
-        session.tick(passed, budget_s)
-    except Exception:  # noqa: BLE001 - one whose browser cannot even be told: the others go on
+        session.tick(seconds, budget_s)
+    except Exception:  # noqa: BLE001 - a failing session must not stop the others
         _log.exception("a browser of the viewer missed a tick")

@@ -1,0 +1,74 @@
+"""Search data of the filters: a script of plain data, since a page opened from disk may not fetch JSON.
+
+Twenty thousand scenes take some two megabytes, which a page loads at the first use of a filter.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tableverse_factory.viz.gallery.pages import make_lost_name
+from tableverse_factory.viz.gallery.records import SceneRecord
+from tableverse_factory.viz.gallery.scene import SceneCard
+
+FILE_NAME = "scenes.js"
+LOST_PAGE_SIZE = 100
+MOST_LABELS = 500
+"""Most labels that the filter lists; typing finds the others."""
+
+
+def write_search_index(
+    path: Path, done: Sequence[SceneRecord], cards: Sequence[SceneCard], lost: Sequence[SceneRecord]
+) -> None:
+    """Write the data, without markup: `<` and all but ASCII are escaped.
+
+    Args:
+        path: Path of the script.
+        done: Finished scenes.
+        cards: Card of each finished scene.
+        lost: Dropped and failed scenes.
+    """
+    names = Counter(name for scene in done for name in set(scene.labels))
+    labels = sorted(names, key=lambda name: (-names[name], name))
+    number = {name: index for index, name in enumerate(labels)}
+    index = {
+        "labels": labels,
+        "offered": min(MOST_LABELS, len(labels)),
+        "done": [_encode_done(scene, card, number) for scene, card in zip(done, cards, strict=True)],
+        "lost": [
+            _encode_lost(scene, make_lost_name(position // LOST_PAGE_SIZE + 1)) for position, scene in enumerate(lost)
+        ],
+    }
+    text = json.dumps(index, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    path.write_text(f"window.TABLEVERSE = {text};\n".replace("<", "\\u003c"), encoding="ascii")
+
+
+def _encode_done(scene: SceneRecord, card: SceneCard, number: dict[str, int]) -> list[Any]:
+    """Encode a scene in the order of fields that `gallery.js` reads."""
+    row = scene.row
+    return [
+        scene.scene_id,
+        0 if scene.title == scene.scene_id else scene.title,
+        row["quality_score"],
+        0 if row["usable"] is False else 1,
+        list(card.reason_codes),
+        _to_micrometres(scene.penetration_m),
+        _to_micrometres(row["drift_m"]),
+        sorted(number[name] for name in set(scene.labels)),
+        len(scene.objects),
+        scene.n_tasks,
+        scene.n_succeeded,
+        len(scene.trajectories),
+        [caption for _, caption in card.pictures.thumbs] if card.pictures else [],
+    ]
+
+
+def _encode_lost(scene: SceneRecord, page: str) -> list[Any]:
+    title = 0 if scene.title == scene.scene_id else scene.title
+    return [scene.scene_id, title, str(scene.row["status"]), scene.reason, page]
+
+
+def _to_micrometres(metres: float | None) -> float | None:
+    return None if metres is None or not abs(metres) < 1e3 else round(1e6 * metres, 1)
