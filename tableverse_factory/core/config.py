@@ -114,7 +114,7 @@ def list_keys() -> dict[str, dict[str, Any]]:
     schema = Config.model_json_schema()
     keys = {}
     for section, reference in schema["properties"].items():
-        for name, field in schema["$defs"][_definition_name(reference)]["properties"].items():
+        for name, field in schema["$defs"][_resolve_definition(reference)]["properties"].items():
             keys[f"{section}.{name}"] = field
     return keys
 
@@ -127,7 +127,7 @@ def format_commented_yaml(config: Config | None = None) -> str:
     ]
     schema, values = Config.model_json_schema(), (config or Config()).model_dump(mode="json")
     for section, reference in schema["properties"].items():
-        definition = schema["$defs"][_definition_name(reference)]
+        definition = schema["$defs"][_resolve_definition(reference)]
         lines += ["", *_format_comment(definition.get("description", ""), ""), f"{section}:"]
         for name, field in definition["properties"].items():
             lines += _format_comment(field.get("description", ""), "  ")
@@ -250,7 +250,7 @@ def _format_example(section: str) -> str:
     return next((f"{key}={field.get('default')}" for key, field in list_keys().items() if key.startswith(section)), "")
 
 
-def _definition_name(reference: Mapping[str, Any]) -> str:
+def _resolve_definition(reference: Mapping[str, Any]) -> str:
     target = reference.get("$ref") or reference["allOf"][0]["$ref"]
     return str(target).rpartition("/")[2]
 

@@ -7,9 +7,9 @@ import numpy as np
 
 def make_rng(run_seed: int, scene_id: str, stage: str) -> np.random.Generator:
     """Make a generator that depends on its three arguments alone, through stable hashes."""
-    words = [_stable_word(scene_id), _stable_word(stage)]
+    words = [_hash_word(scene_id), _hash_word(stage)]
     return np.random.default_rng(np.random.SeedSequence([run_seed, *words]))
 
 
-def _stable_word(text: str) -> int:
+def _hash_word(text: str) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")

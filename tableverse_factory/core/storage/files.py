@@ -121,7 +121,7 @@ def atomic_file(path: StoragePath) -> Iterator[BinaryIO]:
         with _write_multipart(path) if isinstance(path, UPath) else _write_and_rename(path) as file:
             yield file
     except OSError as error:
-        raise write_error(path, error) from error
+        raise make_write_error(path, error) from error
 
 
 @contextmanager
@@ -168,7 +168,7 @@ def write_atomic(path: StoragePath, data: bytes) -> None:
     try:
         path.fs.pipe_file(path.path, data)
     except OSError as error:
-        raise write_error(path, error) from error
+        raise make_write_error(path, error) from error
 
 
 def move(source: StoragePath, target: StoragePath) -> None:
@@ -187,7 +187,7 @@ def move(source: StoragePath, target: StoragePath) -> None:
         else:
             raise ValueError(f"{source} and {target} are not in the same store")
     except OSError as error:
-        raise write_error(target, error) from error
+        raise make_write_error(target, error) from error
 
 
 def remove(path: StoragePath) -> None:
@@ -202,7 +202,7 @@ def remove(path: StoragePath) -> None:
         else:
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise write_error(path, error) from error
+        raise make_write_error(path, error) from error
 
 
 def remove_folder(folder: StoragePath, keep: str = "") -> None:
@@ -224,7 +224,7 @@ def remove_folder(folder: StoragePath, keep: str = "") -> None:
             for path in (folder / name for name in list_names(folder) if name != keep):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
     except OSError as error:
-        raise write_error(folder, error) from error
+        raise make_write_error(folder, error) from error
 
 
 def open_stream(path: StoragePath) -> BinaryIO:
@@ -276,7 +276,7 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def missing_build_error(path: StoragePath) -> BuildError:
+def make_missing_build_error(path: StoragePath) -> BuildError:
     """Make the error for a missing file that every build has."""
     folder = path.parent
     if isinstance(folder, Path) and not folder.exists():
@@ -284,7 +284,7 @@ def missing_build_error(path: StoragePath) -> BuildError:
     return BuildError(f"{folder} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
 
 
-def write_error(path: StoragePath, error: OSError) -> BuildError:
+def make_write_error(path: StoragePath, error: OSError) -> BuildError:
     """Make the error that stops a build whose disk or store refuses a write."""
     if isinstance(error, StoreError):
         return BuildError(str(error))

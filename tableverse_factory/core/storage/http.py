@@ -71,7 +71,7 @@ class HttpRangeReader:
         def resume() -> ByteRange:
             with self._request(address, start + len(data), stop) as response:
                 total = _check_range(response, start + len(data), stop, address)
-                seen.append((total, _version(response)))
+                seen.append((total, _read_version(response)))
                 if seen[0] != seen[-1]:
                     raise _error(address, "it changed while it was read: open the dataset again")
                 _receive(response, data, max(0, min(stop, total) - start), address)
@@ -91,8 +91,8 @@ class HttpRangeReader:
             with self._request(address, 0, 1) as response:
                 length = response.headers.get("content-length", "")
                 if response.status_code == 200 and length.isdecimal():  # it says so; reading it may be refused later
-                    return ByteRange(b"", int(length), _version(response))
-                return ByteRange(b"", _check_range(response, 0, 1, address), _version(response))
+                    return ByteRange(b"", int(length), _read_version(response))
+                return ByteRange(b"", _check_range(response, 0, 1, address), _read_version(response))
 
         return _retry(address, ask)
 
@@ -194,7 +194,7 @@ def _check_range(response: httpx.Response, start: int, stop: int, address: str) 
     return int(found[3])
 
 
-def _version(response: httpx.Response) -> str:
+def _read_version(response: httpx.Response) -> str:
     return str(response.headers.get("etag") or response.headers.get("last-modified") or "")
 
 

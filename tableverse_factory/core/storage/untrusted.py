@@ -172,12 +172,12 @@ def parse_json(data: bytes, name: str, reason: str) -> Any:
         value = json.loads(data)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is no JSON: {describe_error(error)}"[:500], reason) from error
-    if _max_nesting(data) > MAX_JSON_DEPTH:
+    if _bound_nesting(data) > MAX_JSON_DEPTH:
         raise InputError(f"{name} is nested deeper than {MAX_JSON_DEPTH} levels", reason)
     return value
 
 
-def _max_nesting(data: bytes) -> int:
+def _bound_nesting(data: bytes) -> int:
     """Bound the nesting depth from above: brackets inside strings count too."""
     codes = np.frombuffer(data, dtype=np.uint8)
     steps = np.isin(codes, (0x5B, 0x7B)).astype(np.int32) - np.isin(codes, (0x5D, 0x7D)).astype(np.int32)

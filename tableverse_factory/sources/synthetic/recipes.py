@@ -92,9 +92,9 @@ def put_utensils_in(rng: np.random.Generator) -> list[PlacedModel]:
         foot = (-0.15 if count == 1 else 0.55) * cavity.floor_radius
         lean = (0.55 if count == 1 else 0.75) * cavity.rim_radius
         slope = np.arctan2(lean - foot, cavity.rim - cavity.floor)
-        upward = _multiply(_make_rotation((0.0, 0.0, 1.0), azimuth), _make_rotation((0.0, 1.0, 0.0), slope))
+        upward = multiply_quaternions(_make_rotation((0.0, 0.0, 1.0), azimuth), _make_rotation((0.0, 1.0, 0.0), slope))
         # The utensil's +x end is its head: stood on it, or with the head up.
-        rotation = _multiply(upward, _make_rotation((0.0, 1.0, 0.0), np.pi / 2 if head_down else -np.pi / 2))
+        rotation = multiply_quaternions(upward, _make_rotation((0.0, 1.0, 0.0), np.pi / 2 if head_down else -np.pi / 2))
         axis = transform_points(Pose(np.zeros(3), rotation), np.array([[-half if head_down else half, 0.0, 0.0]]))[0]
         placed = stand_on(model, rotation, toward * (foot + float(axis @ toward)) + [0.0, 0.0, cavity.floor])
         group.append(placed)
@@ -112,7 +112,7 @@ def lean_on_prop(rng: np.random.Generator) -> list[PlacedModel]:
         heavy_enough = prop.mass_kg > 0.5 * leaner.mass_kg
         if not (0.55 * reach < height and heavy_enough):
             continue
-        upright = _multiply(_make_rotation((1.0, 0.0, 0.0), -slope), _turn_on_edge(extents))
+        upright = multiply_quaternions(_make_rotation((1.0, 0.0, 0.0), -slope), _turn_on_edge(extents))
         back = stand_on(prop, _UPRIGHT)
         front = stand_on(leaner, upright)
         near = -back.vertices()[:, 1].min() + front.vertices()[:, 1].max() + GAP_M
@@ -188,7 +188,7 @@ def _turn_on_edge(extents: np.ndarray) -> Quaternion:
     thin, tall = int(np.argmin(extents)), int(np.argmax(extents))
     if thin == 2:
         stood = _make_rotation((1.0, 0.0, 0.0), np.pi / 2)
-        return stood if tall == 1 else _multiply(stood, _make_rotation((0.0, 0.0, 1.0), np.pi / 2))
+        return stood if tall == 1 else multiply_quaternions(stood, _make_rotation((0.0, 0.0, 1.0), np.pi / 2))
     return _UPRIGHT
 
 
@@ -197,7 +197,3 @@ _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 def _make_rotation(axis: tuple[float, float, float], angle: float) -> Quaternion:
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * np.asarray(axis)])
-
-
-def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    return multiply_quaternions(a, b)

@@ -22,41 +22,41 @@ THREADS = (96, 128, 160)
 """Threads across the square."""
 
 
-def linen(draw: TextureSampler) -> Raster:
-    """Plain weave of uneven threads."""
+def draw_linen(draw: TextureSampler) -> Raster:
+    """Draw a plain weave of uneven threads."""
     base = oklch(0.3 + 0.63 * draw.spread(1), 0.14 * draw.spread(3) ** 2, draw.spread(0))
     threads = draw.choose(THREADS)
     slubs = draw.noise((5, threads), 1) + draw.noise((threads, 5), 1)
     raster = map_shades(0.5 + draw.between(0.08, 0.2) * slubs, base, 0.74, 1.16)
-    return brighten(raster, 0.09 * _plain_weave(draw, threads) + _folds(draw))
+    return brighten(raster, 0.09 * _make_plain_weave(draw, threads) + _draw_folds(draw))
 
 
-def gingham(draw: TextureSampler) -> Raster:
-    """Checks of equal stripes."""
-    color, ground = _bold_color(draw), oklch(draw.between(0.9, 0.98), draw.between(0, 0.03), draw.between(0, 1))
+def draw_gingham(draw: TextureSampler) -> Raster:
+    """Draw checks of equal stripes."""
+    color, ground = _draw_bold_color(draw), oklch(draw.between(0.9, 0.98), draw.between(0, 0.03), draw.between(0, 1))
     checks = draw.choose((6, 8, 12, 16, 24))
     u, v = pixel_grid(draw.size)
     stripes = (smoothstep(wave(t * checks), -0.03, 0.03) for t in (u, v))
     across, down = stripes
     raster = paint(draw.fill(ground), color, 0.48 * (across + down))
-    return _weave(draw, raster)
+    return _add_weave(draw, raster)
 
 
-def windowpane(draw: TextureSampler) -> Raster:
-    """Thin lines of one or two colours on a ground."""
+def draw_windowpane(draw: TextureSampler) -> Raster:
+    """Draw thin lines of one or two colours on a ground."""
     ground = draw.color((0.25, 0.68), (0.0, 0.12))
-    line, second = _bold_color(draw, 0.5), _contrast_color(draw, ground)
+    line, second = _draw_bold_color(draw, 0.5), _draw_contrast_color(draw, ground)
     count = draw.choose((4, 6, 8, 10))
     u, v = pixel_grid(draw.size)
     raster = draw.fill(ground)
     for t in (u, v):
-        raster = paint(raster, line, 0.8 * _line(t * count, 0.09))
-        raster = paint(raster, second, 0.7 * _line(t * count + np.float32(0.5), 0.04))
-    return _weave(draw, raster)
+        raster = paint(raster, line, 0.8 * _make_line(t * count, 0.09))
+        raster = paint(raster, second, 0.7 * _make_line(t * count + np.float32(0.5), 0.04))
+    return _add_weave(draw, raster)
 
 
-def tartan(draw: TextureSampler) -> Raster:
-    """A symmetric sett of stripes, the same both ways, in twill."""
+def draw_tartan(draw: TextureSampler) -> Raster:
+    """Draw a symmetric sett of stripes, the same both ways, in twill."""
     hue = draw.spread(0)
     colors = [
         oklch(0.3 + 0.35 * draw.spread(1), 0.05 + 0.14 * draw.spread(3), hue),
@@ -74,13 +74,13 @@ def tartan(draw: TextureSampler) -> Raster:
     warp_on_top = (0.5 + 0.5 * wave((u + v) * 128))[..., None]
     share = 0.5 + 0.16 * (warp_on_top - 0.5) * 2
     raster: Raster = share * stripe[None, :] + (1 - share) * stripe[:, None]
-    return brighten(raster, 0.04 * draw.noise((90, 90), 2) + _folds(draw))
+    return brighten(raster, 0.04 * draw.noise((90, 90), 2) + _draw_folds(draw))
 
 
-def stripes(draw: TextureSampler) -> Raster:
-    """Ticking: stripes of several widths along one side."""
+def draw_stripes(draw: TextureSampler) -> Raster:
+    """Draw ticking: stripes of several widths along one side."""
     ground = draw.color((0.55, 0.42), (0.0, 0.06))
-    colors = [_bold_color(draw), _contrast_color(draw, ground), scale_color(ground, 0.8)]
+    colors = [_draw_bold_color(draw), _draw_contrast_color(draw, ground), scale_color(ground, 0.8)]
     repeats = draw.choose((3, 4, 6, 8))
     u, _ = pixel_grid(draw.size)
     t = take_fraction(u * repeats)
@@ -89,11 +89,11 @@ def stripes(draw: TextureSampler) -> Raster:
         middle, half = np.float32(draw.between(0.1, 0.9)), draw.between(0.02, 0.16)
         distance = np.abs(take_fraction(t - middle + np.float32(0.5)) - np.float32(0.5))
         raster = paint(raster, color, smoothstep(distance, half + 0.01, half))
-    return _weave(draw, raster if draw.chance(0.5) else raster.transpose(1, 0, 2))
+    return _add_weave(draw, raster if draw.chance(0.5) else raster.transpose(1, 0, 2))
 
 
-def twill(draw: TextureSampler) -> Raster:
-    """Denim and its kin: diagonal ribs, pale threads showing through, worn places."""
+def draw_twill(draw: TextureSampler) -> Raster:
+    """Draw denim and its kin: diagonal ribs, pale threads showing through, worn places."""
     base = draw.color((0.25, 0.5), (0.02, 0.1))
     pale = oklch(draw.between(0.75, 0.92), 0.02, draw.between(0, 1))
     threads = draw.choose(THREADS)
@@ -105,8 +105,8 @@ def twill(draw: TextureSampler) -> Raster:
     return map_colors(weight, (scale_color(base, 0.8), base, pale))
 
 
-def houndstooth(draw: TextureSampler) -> Raster:
-    """Four dark and four light threads, both ways, in a two-over-two twill: the broken check comes by itself."""
+def draw_houndstooth(draw: TextureSampler) -> Raster:
+    """Draw four dark and four light threads, both ways, in a two-over-two twill, which gives the broken check."""
     light = oklch(0.72 + 0.26 * draw.spread(1), 0.1 * draw.spread(3), draw.spread(0) + 0.5)
     dark = oklch(0.15 + 0.35 * draw.spread(4), 0.13 * draw.spread(3), draw.spread(0))
     repeats = draw.choose((6, 8, 12, 16))
@@ -115,23 +115,23 @@ def houndstooth(draw: TextureSampler) -> Raster:
     warp_on_top = (i - j) % 4 < 2
     dark_here = np.where(warp_on_top, i % 8 < 4, j % 8 < 4)
     blurred = dark_here.astype(np.float32)
-    return _weave(draw, map_colors(blurred, (light, dark)))
+    return _add_weave(draw, map_colors(blurred, (light, dark)))
 
 
-def dots(draw: TextureSampler) -> Raster:
-    """Polka dots in a staggered grid."""
+def draw_dots(draw: TextureSampler) -> Raster:
+    """Draw polka dots in a staggered grid."""
     ground = draw.color((0.25, 0.7), (0.0, 0.15))
-    color = _contrast_color(draw, ground)
+    color = _draw_contrast_color(draw, ground)
     count = draw.choose((6, 8, 12, 18))
     u, v = pixel_grid(draw.size)
     radius = draw.between(0.18, 0.36)
-    distance = np.minimum(*(_from_middle(u * count + shift, v * count + shift) for shift in (0.0, 0.5)))
+    distance = np.minimum(*(_measure_from_middle(u * count + shift, v * count + shift) for shift in (0.0, 0.5)))
     raster = paint(draw.fill(ground), color, smoothstep(distance, radius + 0.03, radius - 0.03))
-    return _weave(draw, raster)
+    return _add_weave(draw, raster)
 
 
-def felt(draw: TextureSampler) -> Raster:
-    """Matted fibres of two tones."""
+def draw_felt(draw: TextureSampler) -> Raster:
+    """Draw matted fibres of two tones."""
     base = draw.color((0.22, 0.66), (0.0, 0.15))
     fibres = draw.noise((40, 120), 2) + draw.noise((120, 40), 2)
     melange = draw.between(0.06, 0.3)
@@ -142,8 +142,8 @@ def felt(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(fibres, 0.05))
 
 
-def tweed(draw: TextureSampler) -> Raster:
-    """Herringbone of two yarns with coloured flecks."""
+def draw_tweed(draw: TextureSampler) -> Raster:
+    """Draw a herringbone of two yarns with coloured flecks."""
     dark = draw.color((0.2, 0.35), (0.0, 0.07))
     light = oklch(0.55 + 0.35 * draw.spread(4), 0.05 * draw.spread(3), draw.spread(0) + 0.08)
     columns = draw.choose((8, 12, 16, 24))
@@ -156,8 +156,8 @@ def tweed(draw: TextureSampler) -> Raster:
     return paint(raster, oklch(0.65, 0.14, draw.between(0, 1)), flecks)
 
 
-def wicker(draw: TextureSampler) -> Raster:
-    """Strands over and under pairs of stakes."""
+def draw_wicker(draw: TextureSampler) -> Raster:
+    """Draw strands over and under pairs of stakes."""
     base = draw.color((0.35, 0.5), (0.02, 0.07), (0.08, 0.16))
     down, right = draw.choose((20, 28, 36)), draw.choose((8, 12, 16), 4)
     u, v = pixel_grid(draw.size)
@@ -173,40 +173,40 @@ def wicker(draw: TextureSampler) -> Raster:
     return brighten(raster, np.clip(shade - gap - 0.3 * smoothstep(round_strand, 0.4, 0.0), -0.85, 0.5))
 
 
-def _bold_color(draw: TextureSampler, bright: float = 0.3) -> Color:
+def _draw_bold_color(draw: TextureSampler, bright: float = 0.3) -> Color:
     return oklch(bright + 0.35 * draw.spread(4), 0.06 + 0.14 * draw.between(0, 1), draw.spread(0))
 
 
-def _contrast_color(draw: TextureSampler, ground: Color) -> Color:
+def _draw_contrast_color(draw: TextureSampler, ground: Color) -> Color:
     bright = draw.between(0.2, 0.45) if float(ground.sum()) > 3 * 128 else draw.between(0.75, 0.97)
     return oklch(bright, draw.between(0.02, 0.16), draw.between(0, 1))
 
 
-def _plain_weave(draw: TextureSampler, threads: int) -> Field:
+def _make_plain_weave(draw: TextureSampler, threads: int) -> Field:
     """Make the heights of a plain weave."""
     u, v = pixel_grid(draw.size)
     woven: Field = wave(u * threads) * wave(v * threads)
     return woven
 
 
-def _weave(draw: TextureSampler, raster: Raster) -> Raster:
+def _add_weave(draw: TextureSampler, raster: Raster) -> Raster:
     """Add weave and folds to printed or dyed colours."""
     threads = draw.pick(THREADS)
     yarn = draw.noise((6, threads), 1) + draw.noise((threads, 6), 1)
-    return brighten(raster, 0.07 * _plain_weave(draw, threads) + 0.025 * yarn + _folds(draw))
+    return brighten(raster, 0.07 * _make_plain_weave(draw, threads) + 0.025 * yarn + _draw_folds(draw))
 
 
-def _folds(draw: TextureSampler) -> Field:
+def _draw_folds(draw: TextureSampler) -> Field:
     """Draw soft folds."""
     soft: Field = draw.between(0.0, 0.035) * draw.noise((2, 2), 2)
     return soft
 
 
-def _line(turns: Field, width: float) -> Field:
+def _make_line(turns: Field, width: float) -> Field:
     return smoothstep(np.abs(take_fraction(turns) - np.float32(0.5)), width / 2 + 0.006, width / 2 - 0.006)
 
 
-def _from_middle(x: Field, y: Field) -> Field:
+def _measure_from_middle(x: Field, y: Field) -> Field:
     a, b = take_fraction(x) - np.float32(0.5), take_fraction(y) - np.float32(0.5)
     distance: Field = np.sqrt(a * a + b * b)
     return distance

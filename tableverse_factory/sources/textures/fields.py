@@ -197,12 +197,6 @@ def brighten(raster: Raster, gain: Field) -> Raster:
     return brighter
 
 
-def chosen(ids: Ids, values: np.ndarray) -> np.ndarray:
-    """A value for each pixel by its number. Shape (n, n, …)."""
-    picked: np.ndarray = values[ids]
-    return picked
-
-
 def gather_wrapped(field: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Look a field up at other pixels, which wrap round. Shape of the places."""
     size = len(field)

@@ -30,9 +30,9 @@ METALS: tuple[tuple[float, float], ...] = (
 """Hue and greatest chroma."""
 
 
-def brushed_metal(draw: TextureSampler) -> Raster:
-    """Steel, brass, copper, anodised aluminium: long scratches and a soft reflection."""
-    base = _metal_color(draw, 0.4, 0.48)
+def draw_brushed_metal(draw: TextureSampler) -> Raster:
+    """Draw steel, brass, copper, anodised aluminium: long scratches and a soft reflection."""
+    base = _draw_metal_color(draw, 0.4, 0.48)
     fine = draw.noise((2, 128), 2, 0.9) + 0.5 * draw.noise((6, 250), 1)
     _, v = pixel_grid(draw.size)
     glow = wave(v * draw.whole(1, 2) + np.float32(draw.between(0, 1)) + 0.06 * draw.noise((2, 2), 2))
@@ -40,9 +40,9 @@ def brushed_metal(draw: TextureSampler) -> Raster:
     return map_shades(weight, base, 0.68, 1.25)
 
 
-def hammered_metal(draw: TextureSampler) -> Raster:
-    """Round dents beside one another."""
-    base = _metal_color(draw, 0.36, 0.46)
+def draw_hammered_metal(draw: TextureSampler) -> Raster:
+    """Draw round dents beside one another."""
+    base = _draw_metal_color(draw, 0.36, 0.46)
     count = draw.choose((12, 18, 26, 36))
     dents = draw.cells(count, count, 0.8)
     depth = dents.nearest * dents.nearest
@@ -51,8 +51,8 @@ def hammered_metal(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(depth, 6.0 * 18 / count) + 0.02 * draw.noise((80, 80), 2))
 
 
-def galvanised(draw: TextureSampler) -> Raster:
-    """Zinc flowers: crystals that shine each in its own direction."""
+def draw_galvanised(draw: TextureSampler) -> Raster:
+    """Draw zinc flowers: crystals that shine each in its own direction."""
     base = draw.color((0.5, 0.35), (0.0, 0.02))
     count = draw.choose((8, 14, 22))
     crystals = draw.cells(count, count)
@@ -62,8 +62,8 @@ def galvanised(draw: TextureSampler) -> Raster:
     return map_shades(weight, base, 0.7, 1.2)
 
 
-def patina(draw: TextureSampler) -> Raster:
-    """Rusted iron or weathered copper: a metal eaten by its oxide in blotches."""
+def draw_patina(draw: TextureSampler) -> Raster:
+    """Draw rusted iron or weathered copper: a metal eaten by its oxide in blotches."""
     metal, oxide, crust = (
         (parse_hex("6f6a66"), parse_hex("8a4b24"), parse_hex("4a2a1c")),
         (parse_hex("9c6242"), parse_hex("5f9c8a"), parse_hex("3c5f58")),
@@ -85,8 +85,8 @@ def patina(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(eaten + 0.4 * grit, 0.22))
 
 
-def tread_plate(draw: TextureSampler) -> Raster:
-    """Raised bars by turns, as on a workshop's bench."""
+def draw_tread_plate(draw: TextureSampler) -> Raster:
+    """Draw raised bars by turns, as on a workshop's bench."""
     base = draw.color((0.35, 0.45), (0.0, 0.06))
     count = draw.choose((8, 12, 16, 20))
     u, v = pixel_grid(draw.size)
@@ -100,8 +100,8 @@ def tread_plate(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(height, 1.1) + 0.08 * height)
 
 
-def leather(draw: TextureSampler) -> Raster:
-    """Grain of small scales with creases between."""
+def draw_leather(draw: TextureSampler) -> Raster:
+    """Draw a grain of small scales with creases between."""
     base = oklch(0.2 + 0.55 * draw.spread(1), 0.02 + 0.1 * draw.spread(3), draw.spread(0) ** 2)
     count = draw.choose((36, 52, 72))
     scales = draw.cells(count, count, 0.9)
@@ -111,8 +111,8 @@ def leather(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(height + 0.6 * folds, 0.35) - 0.22 * (1 - height))
 
 
-def cork(draw: TextureSampler) -> Raster:
-    """Granules of bark, some dark."""
+def draw_cork(draw: TextureSampler) -> Raster:
+    """Draw granules of bark, some dark."""
     base = draw.color((0.5, 0.32), (0.05, 0.06), (0.14, 0.06))
     count = draw.choose((22, 34, 50))
     granules = draw.cells(count, count)
@@ -125,8 +125,8 @@ def cork(draw: TextureSampler) -> Raster:
     return brighten(raster, -0.28 * smoothstep(granules.border, 0.14, 0.0) + shade_relief(granules.border, 0.1))
 
 
-def chipboard(draw: TextureSampler) -> Raster:
-    """Fine chips pressed flat, under nothing."""
+def draw_chipboard(draw: TextureSampler) -> Raster:
+    """Draw fine chips pressed flat."""
     base = draw.color((0.4, 0.5), (0.02, 0.07), (0.1, 0.16))
     raster = draw.fill(base)
     count = draw.choose((40, 60, 84))
@@ -138,8 +138,8 @@ def chipboard(draw: TextureSampler) -> Raster:
     return raster
 
 
-def laminate(draw: TextureSampler) -> Raster:
-    """Plastic with fine flecks, as on a kitchen's worktop."""
+def draw_laminate(draw: TextureSampler) -> Raster:
+    """Draw plastic with fine flecks, as on a kitchen's worktop."""
     base = draw.color((0.25, 0.72), (0.0, 0.1))
     raster = brighten(draw.fill(base), 0.02 * draw.noise((6, 6), 4))
     fine = draw.choose((50, 80, 120))
@@ -151,8 +151,8 @@ def laminate(draw: TextureSampler) -> Raster:
     return raster
 
 
-def rubber(draw: TextureSampler) -> Raster:
-    """A mat of studs, ribs or coins."""
+def draw_rubber(draw: TextureSampler) -> Raster:
+    """Draw a mat of studs, ribs or coins."""
     base = draw.color((0.2, 0.5), (0.0, 0.13))
     count = draw.choose((12, 18, 24, 32))
     u, v = pixel_grid(draw.size)
@@ -169,8 +169,8 @@ def rubber(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(height, 0.9) + 0.1 * (height - 0.5))
 
 
-def plaster(draw: TextureSampler) -> Raster:
-    """Trowelled microcement or lime: sweeping strokes of two tones."""
+def draw_plaster(draw: TextureSampler) -> Raster:
+    """Draw trowelled microcement or lime: sweeping strokes of two tones."""
     base = draw.color((0.4, 0.53), (0.0, 0.07))
     count = draw.choose((3, 5, 8))
     strokes = wave(0.5 * draw.noise((count, count), 6, 0.6)) + 0.4 * draw.noise((4, 60), 2)
@@ -180,8 +180,8 @@ def plaster(draw: TextureSampler) -> Raster:
     return brighten(raster, shade_relief(strokes + clouds, 0.1))
 
 
-def lacquer(draw: TextureSampler) -> Raster:
-    """One colour of paint, brushed or sprayed, with the marks of use."""
+def draw_lacquer(draw: TextureSampler) -> Raster:
+    """Draw one colour of paint, brushed or sprayed, with the marks of use."""
     base = draw.color((0.2, 0.77), (0.0, 0.2))
     brush = draw.noise((2, 90), 2, 0.8) * draw.pick((0.0, 0.012, 0.03))
     clouds = draw.noise((3, 3), 4) * (0.01 + 0.06 * draw.spread(2))
@@ -190,6 +190,6 @@ def lacquer(draw: TextureSampler) -> Raster:
     return brighten(raster, draw.pick((0.0, 0.15, -0.2)) * scratches)
 
 
-def _metal_color(draw: TextureSampler, dark: float, extent: float) -> Color:
+def _draw_metal_color(draw: TextureSampler, dark: float, extent: float) -> Color:
     hue, chroma = draw.choose(METALS, 0)
     return oklch(dark + extent * draw.spread(1), chroma * draw.spread(3), hue + draw.between(-0.02, 0.02))

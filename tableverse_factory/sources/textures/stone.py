@@ -35,9 +35,9 @@ MARBLES: tuple[tuple[str, str, str], ...] = (
 """Ground, clouds, veins."""
 
 
-def marble(draw: TextureSampler) -> Raster:
-    """Clouds, a few strong veins, many hair-fine ones."""
-    ground, cloud, vein = _colors(draw, MARBLES)
+def draw_marble(draw: TextureSampler) -> Raster:
+    """Draw clouds, a few strong veins, many hair-fine ones."""
+    ground, cloud, vein = _draw_colors(draw, MARBLES)
     warp = draw.noise((2, 2), 5, 0.55)
     coarse = draw.choose((2, 3, 4))
     clouds = draw.noise((coarse, coarse), 5, 0.55)
@@ -50,8 +50,8 @@ def marble(draw: TextureSampler) -> Raster:
     return brighten(raster, 0.01 * draw.noise((90, 90), 2))
 
 
-def onyx(draw: TextureSampler) -> Raster:
-    """Bands of translucent colour, folded."""
+def draw_onyx(draw: TextureSampler) -> Raster:
+    """Draw bands of translucent colour, folded."""
     hue, chroma = draw.spread(0), 0.03 + 0.1 * draw.spread(3)
     bright = 0.45 + 0.4 * draw.spread(1)
     fold = draw.noise((2, 2), 5, 0.5)
@@ -65,8 +65,8 @@ def onyx(draw: TextureSampler) -> Raster:
     return brighten(map_colors(bands, stops), 0.015 * draw.noise((60, 60), 2))
 
 
-def granite(draw: TextureSampler) -> Raster:
-    """Grains of three or four minerals."""
+def draw_granite(draw: TextureSampler) -> Raster:
+    """Draw grains of three or four minerals."""
     hue, bright = draw.spread(0), 0.3 + 0.55 * draw.spread(1)
     ground = oklch(bright, 0.05 * draw.spread(3), hue)
     minerals = (
@@ -84,8 +84,8 @@ def granite(draw: TextureSampler) -> Raster:
     return raster
 
 
-def terrazzo(draw: TextureSampler) -> Raster:
-    """Chips of several stones in a ground."""
+def draw_terrazzo(draw: TextureSampler) -> Raster:
+    """Draw chips of several stones in a ground."""
     ground = draw.color((0.25, 0.7), (0.0, 0.07))
     lively, hue = draw.between(0.01, 0.1), draw.spread(4)
     stones = [
@@ -112,8 +112,8 @@ def _draw_chips(draw: TextureSampler, raster: Raster, count: int, share: float, 
     return covered
 
 
-def travertine(draw: TextureSampler) -> Raster:
-    """Level beds with rows of pits."""
+def draw_travertine(draw: TextureSampler) -> Raster:
+    """Draw level beds with rows of pits."""
     base = draw.color((0.6, 0.32), (0.02, 0.05), (0.12, 0.14))
     beds = draw.noise((1, draw.choose((5, 8, 12))), 5, 0.65)
     fine = draw.noise((5, 70), 3, 0.7)
@@ -123,8 +123,8 @@ def travertine(draw: TextureSampler) -> Raster:
     return brighten(paint(raster, scale_color(base, 0.5), 0.8 * deep), shade_relief(-deep, 0.25))
 
 
-def sandstone(draw: TextureSampler) -> Raster:
-    """Grains of sand in faint, wavy beds."""
+def draw_sandstone(draw: TextureSampler) -> Raster:
+    """Draw grains of sand in faint, wavy beds."""
     base = draw.color((0.5, 0.4), (0.03, 0.07), (0.04, 0.22))
     _, v = pixel_grid(draw.size)
     bend = draw.noise((2, 2), 3)
@@ -134,8 +134,8 @@ def sandstone(draw: TextureSampler) -> Raster:
     return map_shades(weight, base, 0.72, 1.12)
 
 
-def slate(draw: TextureSampler) -> Raster:
-    """Split stone: steps, fine ridges, a dull sheen."""
+def draw_slate(draw: TextureSampler) -> Raster:
+    """Draw split stone: steps, fine ridges, a dull sheen."""
     base = draw.color((0.24, 0.3), (0.0, 0.045))
     coarse = draw.choose((2, 3, 5))
     height = draw.noise((coarse, 2 * coarse), 6, 0.62)
@@ -145,8 +145,8 @@ def slate(draw: TextureSampler) -> Raster:
     return brighten(paint(raster, parse_hex("8a5f3c"), rust), shade_relief(steps, draw.between(0.5, 1.1)))
 
 
-def concrete(draw: TextureSampler) -> Raster:
-    """Cast or trowelled: clouds, stains, small pores."""
+def draw_concrete(draw: TextureSampler) -> Raster:
+    """Draw cast or trowelled concrete: clouds, stains, small pores."""
     base = draw.color((0.38, 0.5), (0.0, 0.024))
     trowel = draw.choose((1, 2, 4))
     clouds = draw.noise((3, 3 * trowel), 6, 0.6)
@@ -163,6 +163,6 @@ def _draw_cracks(draw: TextureSampler) -> Field:
     return thin
 
 
-def _colors(draw: TextureSampler, palettes: Sequence[tuple[str, ...]]) -> list[Color]:
+def _draw_colors(draw: TextureSampler, palettes: Sequence[tuple[str, ...]]) -> list[Color]:
     tint = 0.88 + 0.22 * draw.spread(1)
     return [draw.near(scale_color(parse_hex(c), tint), 10) for c in palettes[int(len(palettes) * draw.spread(0))]]

@@ -20,7 +20,7 @@ from tableverse_factory.sources.textures.fields import (
 )
 
 
-def glazed_tiles(draw: TextureSampler, layouts: Sequence[tuple[int, int]], steps: Sequence[float] = ()) -> Raster:
+def draw_glazed_tiles(draw: TextureSampler, layouts: Sequence[tuple[int, int]], steps: Sequence[float] = ()) -> Raster:
     """Glazed tiles: squares, or bricks in a running bond; each fired a little differently.
 
     Args:
@@ -30,22 +30,22 @@ def glazed_tiles(draw: TextureSampler, layouts: Sequence[tuple[int, int]], steps
     """
     down, right = draw.choose(layouts)
     step = draw.pick(steps) if steps else 0.0
-    return _draw_glazed(draw, lay_rows(draw.size, down, right, np.arange(down) * step % 1), _glaze_color(draw))
+    return _draw_glazed(draw, lay_rows(draw.size, down, right, np.arange(down) * step % 1), _draw_glaze_color(draw))
 
 
-def stone_slabs(draw: TextureSampler) -> Raster:
-    """Large squares of stone, clouds running on from none to the next."""
+def draw_stone_slabs(draw: TextureSampler) -> Raster:
+    """Draw large squares of stone, clouds running on from none to the next."""
     count = draw.choose((2, 3, 4))
     boards = lay_rows(draw.size, count, count, np.zeros(count))
     base = draw.color((0.35, 0.55), (0.0, 0.05))
     clouds = draw.noise((6, 6), 6, 0.6)
     tone = draw.each(boards.count, 0.06)[boards.ids]
     raster = map_shades(0.5 + 0.2 * clouds, base, 0.75, 1.15)
-    return _draw_joints(draw, brighten(raster, tone), boards.edge, 0.004, _grout_color(draw))
+    return _draw_joints(draw, brighten(raster, tone), boards.edge, 0.004, _draw_grout_color(draw))
 
 
-def mosaic(draw: TextureSampler) -> Raster:
-    """Small squares of a few colours at random."""
+def draw_mosaic(draw: TextureSampler) -> Raster:
+    """Draw small squares of a few colours at random."""
     count = draw.choose((16, 20, 26, 32))
     boards = lay_rows(draw.size, count, count, np.zeros(count))
     hue, chroma, bright = draw.spread(0), 0.02 + 0.13 * draw.spread(3), 0.25 + 0.55 * draw.spread(1)
@@ -55,11 +55,11 @@ def mosaic(draw: TextureSampler) -> Raster:
     ]
     kinds = draw.rng.integers(0, len(palette), boards.count)
     colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + draw.each(boards.count, 0.08))[:, None]
-    return _draw_joints(draw, colors[boards.ids], boards.edge, 0.0022, _grout_color(draw))
+    return _draw_joints(draw, colors[boards.ids], boards.edge, 0.0022, _draw_grout_color(draw))
 
 
-def broken_mosaic(draw: TextureSampler) -> Raster:
-    """Shards with wide joints."""
+def draw_broken_mosaic(draw: TextureSampler) -> Raster:
+    """Draw shards with wide joints."""
     count = draw.choose((9, 13, 18))
     shards = draw.cells(count, count)
     hue = draw.spread(0)
@@ -67,25 +67,25 @@ def broken_mosaic(draw: TextureSampler) -> Raster:
     palette[0] = oklch(0.2 + 0.75 * draw.spread(1), 0.16 * draw.spread(3), hue)
     kinds = np.minimum(draw.rng.integers(-3, len(palette), shards.count).clip(0), len(palette) - 1)
     colors = np.asarray(palette, dtype=np.float32)[kinds] * (1 + draw.each(shards.count, 0.1))[:, None]
-    return _draw_joints(draw, colors[shards.ids], shards.border / (2 * count), 0.003, _grout_color(draw))
+    return _draw_joints(draw, colors[shards.ids], shards.border / (2 * count), 0.003, _draw_grout_color(draw))
 
 
-def hexagons(draw: TextureSampler) -> Raster:
-    """Hexagons, or pennies: the cells of a triangular grid."""
+def draw_hexagons(draw: TextureSampler) -> Raster:
+    """Draw hexagons, or pennies: the cells of a triangular grid."""
     across, down = draw.choose(((7, 8), (12, 14), (19, 22)))
     u, v = pixel_grid(draw.size)
     x, y = u * across, v * down
     distance, second, ids = _find_hexagons(x, y, across, down)
     pennies = draw.chance(0.3)
     edge = (0.47 - distance) / across if pennies else (second - distance) / (2 * across)
-    base, other = _glaze_color(draw), _glaze_color(draw, 1)
+    base, other = _draw_glaze_color(draw), _draw_glaze_color(draw, 1)
     accent = draw.rng.random(across * down) < draw.pick((0.0, 0.0, 0.2, 0.5))
     colors = np.where(accent[:, None], other, base) * (1 + draw.each(across * down, 0.09))[:, None]
-    return _draw_joints(draw, colors.astype(np.float32)[ids], edge, 0.0028, _grout_color(draw))
+    return _draw_joints(draw, colors.astype(np.float32)[ids], edge, 0.0028, _draw_grout_color(draw))
 
 
-def checkers(draw: TextureSampler) -> Raster:
-    """Two colours by turns, of stone or linoleum."""
+def draw_checkers(draw: TextureSampler) -> Raster:
+    """Draw two colours by turns, of stone or linoleum."""
     count = draw.choose((4, 6, 8, 12, 16))
     boards = lay_rows(draw.size, count, count, np.zeros(count))
     light = draw.color((0.75, 0.22), (0.0, 0.07))
@@ -94,12 +94,12 @@ def checkers(draw: TextureSampler) -> Raster:
     raster = np.where(odd[..., None], dark, light).astype(np.float32)
     clouds = draw.noise((5, 5), 6, 0.6)
     return _draw_joints(
-        draw, brighten(raster, 0.06 * clouds), boards.edge, draw.pick((0.0008, 0.0025)), _grout_color(draw)
+        draw, brighten(raster, 0.06 * clouds), boards.edge, draw.pick((0.0008, 0.0025)), _draw_grout_color(draw)
     )
 
 
-def cement_tiles(draw: TextureSampler) -> Raster:
-    """Patterned cement: each tile the mirror of the next, a star of arcs and petals in two or three colours."""
+def draw_cement_tiles(draw: TextureSampler) -> Raster:
+    """Draw patterned cement: each tile the mirror of the next, a star of arcs and petals in two or three colours."""
     count = draw.choose((4, 6, 8))
     u, v = pixel_grid(draw.size)
     x, y = (2 * np.abs(take_fraction(t * (count // 2)) - np.float32(0.5)) for t in (u, v))
@@ -108,13 +108,13 @@ def cement_tiles(draw: TextureSampler) -> Raster:
     third = oklch(draw.between(0.45, 0.8), draw.between(0.04, 0.14), draw.between(0, 1))
     raster = draw.fill(ground)
     for coat in (color, third, color)[: draw.whole(2, 3)]:
-        raster = paint(raster, coat, 0.93 * smoothstep(_motif(draw, x, y), -0.012, 0.012))
+        raster = paint(raster, coat, 0.93 * smoothstep(_draw_motif(draw, x, y), -0.012, 0.012))
     boards = lay_rows(draw.size, count, count, np.zeros(count))
     chalky = 0.04 * draw.noise((20, 20), 4, 0.7)
     return _draw_joints(draw, brighten(raster, chalky), boards.edge, 0.0009, scale_color(ground, 0.7))
 
 
-def _motif(draw: TextureSampler, x: Field, y: Field) -> Field:
+def _draw_motif(draw: TextureSampler, x: Field, y: Field) -> Field:
     """Draw a shape, positive inside, that is symmetric in x and y."""
     shapes: tuple[Callable[[], Field], ...] = (
         lambda: draw.between(0.3, 0.9) - np.sqrt(x * x + y * y),
@@ -150,11 +150,11 @@ def _find_hexagons(x: Field, y: Field, across: int, down: int) -> tuple[Field, F
     return nearest, second, ids.astype(np.int32)
 
 
-def _glaze_color(draw: TextureSampler, shift: int = 0) -> Color:
+def _draw_glaze_color(draw: TextureSampler, shift: int = 0) -> Color:
     return oklch(0.3 + 0.66 * draw.spread(1 + 3 * shift), 0.13 * draw.spread(3), draw.spread(0) + 0.5 * shift)
 
 
-def _grout_color(draw: TextureSampler) -> Color:
+def _draw_grout_color(draw: TextureSampler) -> Color:
     return draw.near(parse_hex(draw.pick(("e8e4dc", "c9c4ba", "8f8a82", "4a4744", "f3f1ec"))), 8)
 
 
@@ -163,7 +163,9 @@ def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Rast
     tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
     pooled = draw.noise((16, 16), 4, 0.6)
     raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)
-    return _draw_joints(draw, brighten(raster, tone), boards.edge, draw.pick((0.002, 0.003, 0.005)), _grout_color(draw))
+    return _draw_joints(
+        draw, brighten(raster, tone), boards.edge, draw.pick((0.002, 0.003, 0.005)), _draw_grout_color(draw)
+    )
 
 
 def _draw_joints(draw: TextureSampler, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:

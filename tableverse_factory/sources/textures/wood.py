@@ -40,10 +40,10 @@ SPECIES: tuple[tuple[str, str], ...] = (
 """Light and dark of the grain."""
 
 
-def boards_in_rows(
+def draw_boards_in_rows(
     draw: TextureSampler, downs: Sequence[int], rights: tuple[int, int], seam: float, tones: float, rings: float
 ) -> Raster:
-    """Boards in rows: long planks, or short staves glued into a butcher block.
+    """Draw boards in rows: long planks, or short staves glued into a butcher block.
 
     Args:
         draw: Choices of the texture.
@@ -57,20 +57,20 @@ def boards_in_rows(
     return _draw_boards(draw, lay_rows(draw.size, down, right, draw.rng.random(down)), seam, tones, rings)
 
 
-def parquet(draw: TextureSampler) -> Raster:
-    """Squares of strips, every other one turned."""
+def draw_parquet(draw: TextureSampler) -> Raster:
+    """Draw squares of strips, every other one turned."""
     blocks, strips = draw.choose((4, 6, 8)), draw.whole(3, 6)
     return _draw_boards(draw, lay_baskets(draw.size, blocks, strips), seam=0.0012, tones=0.24, rings=3.0)
 
 
-def herringbone_parquet(draw: TextureSampler) -> Raster:
-    """Boards that meet at right angles."""
+def draw_herringbone_parquet(draw: TextureSampler) -> Raster:
+    """Draw boards that meet at right angles."""
     repeats, length = draw.choose(((1, 4), (2, 3), (1, 5), (2, 4), (1, 6)))
     return _draw_boards(draw, lay_herringbone(draw.size, repeats, length), seam=0.0014, tones=0.2, rings=3.5)
 
 
-def veneer(draw: TextureSampler) -> Raster:
-    """Wide leaves of one stem, side by side, as on the top of a good table."""
+def draw_veneer(draw: TextureSampler) -> Raster:
+    """Draw wide leaves of one stem, side by side, as on the top of a good table."""
     down = draw.whole(1, 3)
     raster = _draw_boards(
         draw, lay_rows(draw.size, down, 1, draw.rng.random(down)), seam=0.0, tones=0.05, rings=26.0 / down
@@ -78,8 +78,8 @@ def veneer(draw: TextureSampler) -> Raster:
     return brighten(raster, 0.05 * draw.noise((5, 2), 2))
 
 
-def plywood(draw: TextureSampler) -> Raster:
-    """Pale rotary-cut veneer with wide flames, and now and then a patch."""
+def draw_plywood(draw: TextureSampler) -> Raster:
+    """Draw pale rotary-cut veneer with wide flames, and now and then a patch."""
     light, dark = _draw_species(draw, (2, 5, 6, 9, 0))
     flames = draw.noise((1, 4), 3) * draw.between(1.5, 3.5)
     grain = _make_fibres(draw)
@@ -91,8 +91,8 @@ def plywood(draw: TextureSampler) -> Raster:
     return raster
 
 
-def bamboo(draw: TextureSampler) -> Raster:
-    """Narrow slats with their knots."""
+def draw_bamboo(draw: TextureSampler) -> Raster:
+    """Draw narrow slats with their knots."""
     down, right = draw.choose((24, 32, 40)), draw.whole(2, 3)
     boards = lay_rows(draw.size, down, right, draw.rng.random(down))
     light = draw.color((0.62, 0.26), (0.06, 0.05), (0.17, 0.07))
@@ -104,8 +104,8 @@ def bamboo(draw: TextureSampler) -> Raster:
     return brighten(raster, -0.35 * bell(boards.edge, 0.0009))
 
 
-def painted_wood(draw: TextureSampler) -> Raster:
-    """Boards under paint, rubbed through to the wood here and there."""
+def draw_painted_wood(draw: TextureSampler) -> Raster:
+    """Draw boards under paint, rubbed through to the wood here and there."""
     down = draw.choose((4, 5, 6, 8))
     boards = lay_rows(draw.size, down, 1, draw.rng.random(down))
     wood = _draw_boards(draw, boards, seam=0.0018, tones=0.15, rings=4.5)
@@ -118,8 +118,8 @@ def painted_wood(draw: TextureSampler) -> Raster:
     return brighten(coated, 0.035 * strokes * cover + tone - 0.45 * bell(boards.edge, 0.0014))
 
 
-def strand_board(draw: TextureSampler) -> Raster:
-    """Flat flakes of wood pressed together (OSB): layers of long cells at several angles, the nearest one shows."""
+def draw_strand_board(draw: TextureSampler) -> Raster:
+    """Draw pressed flakes of wood (OSB): layers of long cells at several angles, of which the nearest one shows."""
     light, dark = _draw_species(draw, (0, 5, 9, 3, 14, 7))
     fine = draw.choose((10, 14, 18))
     top, weight = (

@@ -108,7 +108,7 @@ async def fetch_bytes(
     while redirects <= MAX_REDIRECTS:
         async with turns.acquire(url.raw_host):
             began = asyncio.get_running_loop().time()
-            answer = await _attempt(pool, url, bounds, left_s)
+            answer = await _try_request(pool, url, bounds, left_s)
             left_s -= asyncio.get_running_loop().time() - began
         if isinstance(answer, bytes):
             return answer
@@ -125,7 +125,7 @@ async def fetch_bytes(
     raise InputError(f"more than {MAX_REDIRECTS} redirects", "too_many_redirects")
 
 
-async def _attempt(
+async def _try_request(
     pool: httpcore.AsyncConnectionPool, url: httpx.URL, bounds: FetchBounds, left_s: float
 ) -> bytes | httpx.URL | _BusyError:
     """Make one request; returns the body, the address of a redirect, or why to try again."""
@@ -144,7 +144,7 @@ async def _request(pool: httpcore.AsyncConnectionPool, url: httpx.URL, max_bytes
         async with pool.stream("GET", target, headers=[(b"Host", url.netloc), *_HEADERS]) as answer:
             if answer.status not in _REDIRECTS:
                 return await _read_body(answer, max_bytes)
-            location = _header(answer, b"location")
+            location = _get_header(answer, b"location")
     except (httpcore.NetworkError, httpcore.ProtocolError, httpcore.TimeoutException) as error:
         detail = f"{type(error).__name__}: {sanitize_line(str(error))}"
         raise _BusyError(f"the connection fails: {detail}", "unreachable") from error
@@ -158,16 +158,16 @@ async def _request(pool: httpcore.AsyncConnectionPool, url: httpx.URL, max_bytes
 
 async def _read_body(answer: httpcore.Response, max_bytes: int) -> bytes:
     if answer.status in TRANSIENT_STATUSES:
-        wait_s = parse_retry_after(_header(answer, b"retry-after"))
+        wait_s = parse_retry_after(_get_header(answer, b"retry-after"))
         raise _BusyError(f"the server answers {answer.status}", "http_error", wait_s)
     if answer.status != 200:
         raise InputError(f"the server answers {answer.status}", "http_error")
-    coding = _header(answer, b"content-encoding")
+    coding = _get_header(answer, b"content-encoding")
     if coding.lower() not in ("", "identity"):
         raise InputError(
             f"the answer is packed ({sanitize_line(coding, 20)}), which was not asked for", "compressed_answer"
         )
-    length = _header(answer, b"content-length")
+    length = _get_header(answer, b"content-length")
     too_large = InputError(f"it is longer than {max_bytes} bytes, the most that is fetched", "file_too_large")
     if length.isdecimal() and int(length[:20]) > max_bytes:
         raise too_large
@@ -179,5 +179,5 @@ async def _read_body(answer: httpcore.Response, max_bytes: int) -> bytes:
     return bytes(data)
 
 
-def _header(answer: httpcore.Response, name: bytes) -> str:
+def _get_header(answer: httpcore.Response, name: bytes) -> str:
     return next((value.decode("latin-1") for key, value in answer.headers if key.lower() == name), "")

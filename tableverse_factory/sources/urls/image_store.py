@@ -5,7 +5,7 @@ from pathlib import Path
 
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import write_atomic, write_error
+from tableverse_factory.core.storage.files import make_write_error, write_atomic
 
 INDEX_NAME = "index.jsonl"
 SUFFIXES = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp"}
@@ -73,7 +73,7 @@ class ImageStore:
             with self._index.open("a") as file:
                 file.write(line if self._ends_in_line else "\n" + line)
         except OSError as error:
-            raise write_error(self._index, error) from error
+            raise make_write_error(self._index, error) from error
         self._ends_in_line = True
         self._names[key] = path.name
         return path

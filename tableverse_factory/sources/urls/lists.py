@@ -88,7 +88,8 @@ def _parse_csv(name: str, text: str) -> UrlList:
         known = _match_columns(name, header)
         cells = {column: header.index(given) for column, given in known.items()}
         rows = [
-            _make_row({column: _at(line, cell) for column, cell in cells.items()}) for line in _limit_rows(name, reader)
+            _make_row({column: _get_cell(line, cell) for column, cell in cells.items()})
+            for line in _limit_rows(name, reader)
         ]
     except csv.Error as error:
         raise InputError(f"{name} is no CSV: {describe_error(error)}", "unreadable_list") from None
@@ -111,7 +112,7 @@ def _limit_rows(name: str, reader: Iterator[list[str]]) -> Iterator[list[str]]:
         yield line
 
 
-def _at(line: list[str], cell: int) -> str | None:
+def _get_cell(line: list[str], cell: int) -> str | None:
     return line[cell] if cell < len(line) else None
 
 
