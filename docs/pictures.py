@@ -44,7 +44,7 @@ from tableverse_factory.pipeline import WITH_TRAJECTORIES
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.sources.manifest import make_manifest
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
 SEED, NUMBER = 7, 1
 """Which synthetic capture."""
@@ -66,7 +66,7 @@ _OVERRIDES = ("trajectories.max_tasks=6",)
 def records(folder: Path, number: int) -> tuple[ImageRow, dict[str, Any]]:
     """What each stage gives of the capture, by the stage's name."""
     config = build_config({}, _OVERRIDES)
-    capture = synthesize(folder / "captures", number + 1, SEED)[number]
+    capture = synthesize_captures(folder / "captures", number + 1, SEED)[number]
     row = make_manifest([str(capture)], config.observe).rows[0]
     item: Any = row
     found = {}
