@@ -1,4 +1,4 @@
-"""Remembered answers: found by content, forgotten in turn, never mixed up."""
+"""Memoized results: found by content, evicted in turn, never mixed up."""
 
 import gc
 import weakref

@@ -1,4 +1,4 @@
-"""A process of ours loads Open3D without the web server of its plots, and whoever else imports us keeps both."""
+"""Open3D loads without the web server of its plots in our processes; importers of the library keep both."""
 
 import subprocess
 import sys
@@ -12,13 +12,13 @@ print(round(scene.cast_rays(np.array([[0, 0, 0, 0, 0, 1]], np.float32))["t_hit"]
 """
 
 
-def said(before: str) -> list[str]:
+def run_import(before: str) -> list[str]:
     line = [sys.executable, "-W", "ignore", "-c", f"import sys\n{before}\n{CAST}"]
     return subprocess.run(line, check=True, capture_output=True, text=True).stdout.split()
 
 
 def test_rays_hit_without_a_web_server_in_the_process():
-    ours = said("from tableverse_factory.core.open3d_import import stub_plotly; stub_plotly()")
+    ours = run_import("from tableverse_factory.core.open3d_import import stub_plotly; stub_plotly()")
     assert ours == ["1.0", "False"]
 
 
@@ -26,4 +26,4 @@ def test_importing_us_leaves_the_plots_of_others_alone():
     theirs = (
         "import tableverse_factory.geometry.mesh.height_maps, open3d, dash; assert dash.Dash.__module__ == 'dash.dash'"
     )
-    assert said(theirs) == ["1.0", "True"]
+    assert run_import(theirs) == ["1.0", "True"]

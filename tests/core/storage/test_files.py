@@ -1,4 +1,4 @@
-"""What a user may type for a place, and what is said where it is none; files that are whole or absent in a store."""
+"""Storage paths that users give, and files that are whole or absent in a store."""
 
 import sys
 

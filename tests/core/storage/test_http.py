@@ -180,7 +180,7 @@ def answering(status: int, body: bytes = b"", **headers: str):
 
 
 @pytest.mark.parametrize(
-    ("fault", "said"),
+    ("fault", "message"),
     [
         (answering(200, b"x" * 100), "does not serve ranges of bytes"),
         (answering(206, b"x" * 100), "the server gives no Content-Range"),
@@ -204,12 +204,12 @@ def answering(status: int, body: bytes = b"", **headers: str):
         (answering(302, b"", Location="/" + TAR), "more than 5 redirects"),
     ],
 )
-def test_what_a_server_does_wrong_is_one_error(server, fault, said):
+def test_what_a_server_does_wrong_is_one_error(server, fault, message):
     server.fault = fault
     opened = open_dataset(server.address)
     with pytest.raises((InputError, StoreError)) as caught:
         opened.scene("s-1-1")
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert str(caught.value).isprintable()
     assert TAR in str(caught.value)
     assert len(str(caught.value)) < 500
@@ -425,7 +425,7 @@ def test_an_address_that_is_none_is_said_without_its_secrets(address):
 
 
 def test_nothing_there_and_nobody_there_are_said(server, run):
-    for place, said in ((f"{server.address}/nowhere", "no such folder"), ("http://127.0.0.1:9/x", "no answer (")):
+    for place, message in ((f"{server.address}/nowhere", "no such folder"), ("http://127.0.0.1:9/x", "no answer (")):
         code, _, errors = run("query", place)
         assert (code, errors.count("\n")) == (1, 2)
-        assert said in errors
+        assert message in errors

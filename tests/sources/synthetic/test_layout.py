@@ -1,4 +1,4 @@
-"""Synthetic layouts: readable, noisy by what is said, and the truth beside them is the scene of the capture."""
+"""Synthetic layouts: readable, with the stated noise, and true to the scene of the capture."""
 
 import json
 from pathlib import Path
