@@ -29,7 +29,7 @@ def estimate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate the cost of a larger build from the timings of this one.
+    """Estimate the cost of a larger build from this one.
 
     CPU and GPU hours, storage, tokens, wall time and cost, each with its interval. The estimate uses all scenes that
     are accounted for in OUT, dropped and failed ones included, and needs at least 50. docs/monitoring.md explains the

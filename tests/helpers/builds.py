@@ -47,7 +47,7 @@ def write_manifest(path: Path, names: list[str], root: str = "/data") -> Path:
 def request(manifest: Path, out: Path, **run: object) -> BuildRequest:
     config = Config(run=RunConfig(**{**QUICK, **run}))
     return BuildRequest(
-        manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tests.helpers.tiny_line:LINES"
+        manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tests.helpers.tiny_line:PIPELINES"
     )
 
 
@@ -58,7 +58,7 @@ def build(manifest: Path, out: Path, **run: object) -> BuildSummary:
 def compute(row: ImageRow, out: Path) -> SceneResult:
     """The result of a scene that the tiny line gets done, computed in this process."""
     setup = SandboxSetup(
-        "tests.helpers.tiny_line:LINES",
+        "tests.helpers.tiny_line:PIPELINES",
         Config().model_dump_json(),
         str(out.parent / "cache"),
         1,
@@ -108,6 +108,11 @@ def wait_until(condition, timeout_s: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < until, "waited in vain"
         time.sleep(0.02)
+
+
+def crowd() -> float:
+    """Processes that want each CPU, at least 1: limits of time are multiplied by it on a crowded machine."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def digests(out: Path) -> dict[str, str]:

@@ -22,7 +22,7 @@ START_S = 120.0
 TINY = f"""#!{sys.executable}
 from functools import partial
 import workers.run
-workers.run.BuildRequest = partial(workers.run.BuildRequest, pipeline="tests.helpers.tiny_line:LINES")
+workers.run.BuildRequest = partial(workers.run.BuildRequest, pipeline="tests.helpers.tiny_line:PIPELINES")
 from tableverse_factory.cli.main import main
 main()
 """

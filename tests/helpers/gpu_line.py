@@ -60,4 +60,4 @@ STAGES = (
     Stage("place", "geometry", complete, reads=("place",)),
     Stage("export", "physics", pack, reads=("export",)),
 )
-LINES = dict.fromkeys(SceneKind, STAGES)
+PIPELINES = dict.fromkeys(SceneKind, STAGES)

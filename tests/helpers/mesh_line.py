@@ -14,7 +14,7 @@ def mesh(item, config, rng, services):
     size = (4, 6)
     view = RgbdImage(np.zeros((*size, 3), np.uint8), np.ones(size, np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
     order = MeshQuery(np.ones(size, bool), int(item["name"]))
-    (answer,) = MeshClient(config.place.mesh_command, config.place.mesh_timeout_s, services).make(view, [order])
+    (answer,) = MeshClient(config.place.mesh_command, config.place.mesh_timeout_s, services).make_meshes(view, [order])
     if isinstance(answer, str):
         raise GeometryError(answer)
     return tiny_line.cut({**item, "name": "fine"}, config, rng, services)
@@ -23,4 +23,4 @@ def mesh(item, config, rng, services):
 _STAGES = tuple(
     Stage("mesh", "geometry", mesh, reads=("place",)) if stage.name == "cut" else stage for stage in tiny_line._STAGES
 )
-LINES = {SceneKind.CAPTURE: _STAGES}
+PIPELINES = {SceneKind.CAPTURE: _STAGES}

@@ -22,7 +22,7 @@ def main() -> None:
         cache_dir=Path(manifest).parent / "cache",
         executor="ray" if executor == "ray" else "local",
         workers=int(workers) if executor == "ray" else None,
-        pipeline=os.environ.get("LINES_OF_TEST", "tests.helpers.tiny_line:LINES"),
+        pipeline=os.environ.get("PIPELINES_OF_TEST", "tests.helpers.tiny_line:PIPELINES"),
     )
     with ProgressDisplay(Console(stderr=True)) as progress:
         summary = run_build(request, progress, StopSignals())

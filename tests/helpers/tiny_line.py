@@ -100,4 +100,4 @@ _STAGES = (
     Stage("fall", "physics", drop_some, reads=("settle",)),
     Stage("pack", "curation", pack, reads=("export",)),
 )
-LINES = {SceneKind.CAPTURE: _STAGES, SceneKind.IMAGE: _STAGES, SceneKind.LAYOUT: (_STAGES[0], *_STAGES[1:])}
+PIPELINES = {SceneKind.CAPTURE: _STAGES, SceneKind.IMAGE: _STAGES, SceneKind.LAYOUT: (_STAGES[0], *_STAGES[1:])}

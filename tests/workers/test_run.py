@@ -12,7 +12,7 @@ import pytest
 
 from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.core.errors import BuildError, InputError
-from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
+from tests.helpers.builds import build, crowd, digests, finish, kill, scenes, start, wait_until, write_manifest
 from workers.plan.invalidate import reopen_scenes
 from workers.progress.build_state import read_build_state
 from workers.state.lock import create_writer_lock
@@ -159,7 +159,10 @@ def test_a_folder_of_somebody_else_is_left_alone(mixed, tmp_path):
 
 def test_one_writer_at_a_time(mixed, tmp_path):
     manifest, _ = mixed
-    with create_writer_lock(tmp_path / "out" / ".work" / "lock"), pytest.raises(BuildError, match="being written by process"):
+    with (
+        create_writer_lock(tmp_path / "out" / ".work" / "lock"),
+        pytest.raises(BuildError, match="being written by process"),
+    ):
         build(manifest, tmp_path / "out")
     build(manifest, tmp_path / "out")
 
@@ -190,7 +193,7 @@ def test_a_signal_stops_within_three_seconds_and_the_same_command_goes_on(tmp_pa
     process.send_signal(getattr(signal, name))
     asked = time.monotonic()
     assert finish(process)[0] == code
-    assert time.monotonic() - asked < 3.0
+    assert time.monotonic() - asked < 3.0 * crowd()
     assert read_build_state(tmp_path / "out").remaining == 2
     build(manifest, tmp_path / "out")
     build(manifest, tmp_path / "whole")

@@ -61,7 +61,7 @@ def asking(server, tmp_path, monkeypatch):
             tmp_path / out,
             config,
             tmp_path / "cache",
-            pipeline="tests.helpers.asking_line:LINES",
+            pipeline="tests.helpers.asking_line:PIPELINES",
             limits=limits,
         )
 
@@ -75,7 +75,7 @@ def in_a_process(request: BuildRequest) -> subprocess.Popen[str]:
     command = [sys.executable, str(HELPERS / "run_build.py"), str(request.manifest), str(request.out), "local", "1"]
     return subprocess.Popen(
         [*command, *overrides],
-        env={**os.environ, "LINES_OF_TEST": request.pipeline},
+        env={**os.environ, "PIPELINES_OF_TEST": request.pipeline},
         text=True,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -143,7 +143,7 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
 
 @pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", 3)])
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
-    request = replace(asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.dying_line:LINES")
+    request = replace(asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.dying_line:PIPELINES")
     assert run_build(request, Silent()).over_budget is None
     assert sum_costs(request.out).calls == calls
     assert read_build_state(request.out).failed == 1

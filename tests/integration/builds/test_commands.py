@@ -24,7 +24,7 @@ def test_status_for_people_and_for_scripts(run, out):
     assert code == 0
     assert "5 scenes: 2 done, 2 dropped, 1 failed, 0 remaining; 2 of 2 shards committed" in " ".join(text.split())
     assert re.search(r"failed +cut +GeometryError +1", text)
-    assert "not_at_rest: the objects would not come to rest" in text.splitlines()
+    assert "not_at_rest: the objects did not come to rest" in text.splitlines()
     code, text, _ = run("status", out, "--json")
     found = json.loads(text)
     assert (found["done"], found["dropped"], found["failed"], found["remaining"]) == (2, 2, 1, 0)

@@ -13,7 +13,7 @@ import pytest
 from schemas.config import ObserveConfig
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
-from tests.helpers.builds import digests, finish, wait_until
+from tests.helpers.builds import crowd, digests, finish, wait_until
 from workers.progress.build_state import read_build_state
 
 pytestmark = pytest.mark.slow
@@ -54,7 +54,7 @@ def test_whenever_it_is_asked_to_stop_it_stops_in_time_and_goes_on_later(whole, 
         else:
             process.send_signal(number)
         code, _ = finish(process, LIMIT_S)
-        assert time.monotonic() - asked < 3.0 * _crowd()
+        assert time.monotonic() - asked < 3.0 * crowd()
         # While it starts, nothing listens for signals yet; then it must only end, not with success.
         assert code == 128 + number if turn % 3 else code != 0
         stopped += 1
@@ -76,11 +76,6 @@ def _start(manifest: Path, out: Path, executor: str) -> subprocess.Popen[str]:
         env={**os.environ, "TABLEVERSE_CACHE": str(manifest.parent / "cache"), "OMP_NUM_THREADS": "1"},
         start_new_session=True,
     )
-
-
-def _crowd() -> float:
-    """How many processes want each CPU, at least 1: on a crowded machine three seconds are not three seconds."""
-    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
 def _accounted(out: Path) -> int:

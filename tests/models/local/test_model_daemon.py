@@ -13,8 +13,8 @@ import pytest
 
 from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.models.local import batch_server, model_daemon
-from tableverse_factory.models.local.batch_server import REFUSED, serve
-from tableverse_factory.models.local.wire import WireError, read_words, receive, send
+from tableverse_factory.models.local.batch_server import REFUSED, serve_batches
+from tableverse_factory.models.local.wire import WireError, decode_error, receive_arrays, send_arrays
 from tests.helpers.paths import ROOT
 
 
@@ -28,7 +28,10 @@ def desk(tmp_path):
         listener = socket.socket(socket.AF_UNIX)
         listener.bind(str(path))
         listener.listen(64)
-        thread = threading.Thread(target=serve, args=(listener, path, most, lambda _: answer, 0.1), daemon=True)
+        guard = socket.socket(socket.AF_UNIX)  # connected before the server starts: it never finds itself idle
+        guard.connect(str(path))
+        ends.append(guard)
+        thread = threading.Thread(target=serve_batches, args=(listener, path, most, lambda _: answer, 0.1), daemon=True)
         thread.start()
         threads.append((thread, path))
 
@@ -66,12 +69,12 @@ def test_what_is_asked_while_the_model_works_goes_through_it_together(desk):
     connect = desk(answer)
     ends = [connect() for _ in range(7)]
     for k, end in enumerate(ends):
-        send(end, [np.array([k])])
+        send_arrays(end, [np.array([k])])
         if k == 0:
             time.sleep(0.1)
     free.set()
     for k, end in enumerate(ends):
-        fine, twice = receive(end)
+        fine, twice = receive_arrays(end)
         assert (fine.tolist(), twice.tolist()) == ([1], [2 * k])
     assert sizes == [1, 4, 2]
 
@@ -85,12 +88,12 @@ def test_a_question_that_cannot_be_answered_harms_no_neighbour(desk):
     connect = desk(answer)
     ends = [connect() for _ in range(4)]
     for k, end in enumerate(ends):
-        send(end, [np.array([k])])
+        send_arrays(end, [np.array([k])])
     for k, end in enumerate(ends):
-        first, second = receive(end)
+        first, second = receive_arrays(end)
         if k == 2:
             assert first.tolist() == REFUSED.tolist()
-            assert read_words(second) == ("ModelError", "two is too much")
+            assert decode_error(second) == ("ModelError", "two is too much")
         else:
             assert second.tolist() == [2 * k]
 
@@ -106,10 +109,10 @@ def test_who_has_an_answer_need_not_wait_for_the_others_of_the_batch(desk):
     connect = desk(answer)
     ends = [connect() for _ in range(2)]
     for k, end in enumerate(ends):
-        send(end, [np.array([k])])
-    assert receive(ends[0])[1].tolist() == [0]
+        send_arrays(end, [np.array([k])])
+    assert receive_arrays(ends[0])[1].tolist() == [0]
     heard.set()
-    assert receive(ends[1])[1].tolist() == [2]
+    assert receive_arrays(ends[1])[1].tolist() == [2]
 
 
 def test_what_a_person_must_see_to_is_told_to_all_and_tried_once(desk):
@@ -123,10 +126,10 @@ def test_what_a_person_must_see_to_is_told_to_all_and_tried_once(desk):
     connect = desk(answer)
     ends = [connect() for _ in range(4)]
     for k, end in enumerate(ends):
-        send(end, [np.array([k])])
+        send_arrays(end, [np.array([k])])
     time.sleep(0.2)
     free.set()
-    assert [read_words(receive(end)[1])[0] for end in ends] == ["ModelAccessError"] * 4
+    assert [decode_error(receive_arrays(end)[1])[0] for end in ends] == ["ModelAccessError"] * 4
     assert sum(asked) == 4
 
 
@@ -140,15 +143,15 @@ def test_an_error_of_the_model_harms_no_neighbour_and_leaves_the_process(desk):
     ends = [connect() for _ in range(4)]
     for _ in range(2):
         for k, end in enumerate(ends):
-            send(end, [np.array([k])])
-        answers = [receive(end) for end in ends]
-        kind, said = read_words(answers[2][1])
+            send_arrays(end, [np.array([k])])
+        answers = [receive_arrays(end) for end in ends]
+        kind, said = decode_error(answers[2][1])
         assert (kind, "a kernel refuses" in said) == ("ModelError", True)
         assert [answers[k][1].tolist() for k in (0, 1, 3)] == [[0], [2], [6]]
 
 
 def test_who_talks_slowly_holds_nobody_up_for_longer_than_one_message_may_take(desk, monkeypatch):
-    monkeypatch.setattr(batch_server, "SLOW_S", 0.3)
+    monkeypatch.setattr(batch_server, "MESSAGE_S", 0.3)
     connect = desk(doubled)
     slow, good = connect(), connect()
     stop = threading.Event()
@@ -165,8 +168,8 @@ def test_who_talks_slowly_holds_nobody_up_for_longer_than_one_message_may_take(d
     thread.start()
     time.sleep(0.1)
     began = time.monotonic()
-    send(good, [np.array([21])])
-    assert receive(good)[1].tolist() == [42]
+    send_arrays(good, [np.array([21])])
+    assert receive_arrays(good)[1].tolist() == [42]
     assert time.monotonic() - began < 2.0
     stop.set()
     thread.join(timeout=20)
@@ -183,27 +186,27 @@ def test_a_header_that_describes_no_array_is_no_message(shape):
         left.sendall((1).to_bytes(4, "little") + len(array).to_bytes(8, "little") + array)
         left.shutdown(socket.SHUT_WR)
         with pytest.raises(WireError):
-            receive(right)
+            receive_arrays(right)
 
 
 def test_who_hangs_up_or_talks_nonsense_is_forgotten(desk):
     connect = desk(doubled)
     gone, rude, huge, good = (connect() for _ in range(4))
-    send(gone, [np.array([1])])
+    send_arrays(gone, [np.array([1])])
     gone.close()
     rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
     huge.sendall(b"\x01\x00\x00\x00" + b"\xff" * 8)
     for end in (rude, huge):
         with pytest.raises(WireError):
-            receive(end)
-    send(good, [np.array([21])])
-    assert receive(good)[1].tolist() == [42]
+            receive_arrays(end)
+    send_arrays(good, [np.array([21])])
+    assert receive_arrays(good)[1].tolist() == [42]
 
 
 def test_no_pickle_passes():
     left, right = socket.socketpair()
     with left, right, pytest.raises(ValueError, match="Object arrays"):
-        send(left, [np.array([{}], dtype=object)])
+        send_arrays(left, [np.array([{}], dtype=object)])
 
 
 @pytest.fixture
@@ -213,13 +216,13 @@ def folder(monkeypatch):
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as short:
         monkeypatch.setenv("XDG_RUNTIME_DIR", short)
         yield Path(short)
-        model_daemon.hang_up()
+        model_daemon.close_connections()
 
 
 def test_a_process_is_started_once_and_again_after_its_death(folder, tmp_path):
     spec = {"mark": str(tmp_path / "mark")}
-    assert model_daemon.ask("tests.helpers.doubling_process", spec, [np.array([4])])[0].tolist() == [8]
-    assert model_daemon.ask("tests.helpers.doubling_process", spec, [np.array([13])])[0].tolist() == [26]
+    assert model_daemon.ask_daemon("tests.helpers.doubling_process", spec, [np.array([4])])[0].tolist() == [8]
+    assert model_daemon.ask_daemon("tests.helpers.doubling_process", spec, [np.array([13])])[0].tolist() == [26]
     assert (tmp_path / "mark").exists()  # it did die
     found = list(folder.glob("*/*.sock"))
     assert len(found) == 1
@@ -232,27 +235,27 @@ def test_who_is_interrupted_does_not_take_the_answer_for_that_to_the_next_questi
         raise KeyboardInterrupt
 
     spec = {"mark": str(tmp_path / "mark")}
-    assert model_daemon.ask("tests.helpers.doubling_process", spec, [np.array([1])])[0].tolist() == [2]
+    assert model_daemon.ask_daemon("tests.helpers.doubling_process", spec, [np.array([1])])[0].tolist() == [2]
     with monkeypatch.context() as meanwhile:
-        meanwhile.setattr(model_daemon, "receive", interrupted)
+        meanwhile.setattr(model_daemon, "receive_arrays", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            model_daemon.ask("tests.helpers.doubling_process", spec, [np.array([2])])
-    assert model_daemon.ask("tests.helpers.doubling_process", spec, [np.array([50])])[0].tolist() == [100]
+            model_daemon.ask_daemon("tests.helpers.doubling_process", spec, [np.array([2])])
+    assert model_daemon.ask_daemon("tests.helpers.doubling_process", spec, [np.array([50])])[0].tolist() == [100]
 
 
 def test_a_model_that_cannot_be_had_is_told_to_the_asker(folder):
     with pytest.raises(ModelAccessError, match="no weights for this one"):
-        model_daemon.ask("tests.helpers.doubling_process", {"refuses": 1}, [np.array([4])])
+        model_daemon.ask_daemon("tests.helpers.doubling_process", {"refuses": 1}, [np.array([4])])
 
 
 def test_a_model_that_does_not_fit_is_told_once_and_for_all(folder):
     with pytest.raises(ModelAccessError, match="does not fit"):
-        model_daemon.ask("tests.helpers.doubling_process", {"too_large": 1}, [np.array([4])])
+        model_daemon.ask_daemon("tests.helpers.doubling_process", {"too_large": 1}, [np.array([4])])
 
 
 def test_a_process_that_does_not_start_is_an_error_that_tells_of_its_log_and_no_path(folder):
     with pytest.raises(ModelError, match=r"\.log") as told:
-        model_daemon.ask("no_such_module_here", {}, [np.array([4])])
+        model_daemon.ask_daemon("no_such_module_here", {}, [np.array([4])])
     assert str(folder) not in str(told.value), "messages go into datasets"
     (log,) = folder.glob("*/*.log")
     assert "No module named" in log.read_text()
@@ -263,17 +266,17 @@ def test_other_weights_in_the_same_folder_are_another_process(folder, tmp_path):
     weights.mkdir()
     spec = {"mark": str(tmp_path), "weights": str(weights)}
     (weights / "model.safetensors").write_bytes(b"one")
-    one = model_daemon._address("tests.helpers.doubling_process", spec)
-    assert model_daemon._address("tests.helpers.doubling_process", spec) == one
+    one = model_daemon.compute_socket_path("tests.helpers.doubling_process", spec)
+    assert model_daemon.compute_socket_path("tests.helpers.doubling_process", spec) == one
     (weights / "model.safetensors").write_bytes(b"other")
-    assert model_daemon._address("tests.helpers.doubling_process", spec) != one
+    assert model_daemon.compute_socket_path("tests.helpers.doubling_process", spec) != one
 
 
 @pytest.mark.parametrize("given", ["nowhere", "x" * 90])
 def test_without_a_folder_for_sockets_the_one_for_temporary_files_does(folder, tmp_path, monkeypatch, given):
     (tmp_path / ("x" * 90)).mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / given))
-    found = model_daemon._address("tests.helpers.doubling_process", {})
+    found = model_daemon.compute_socket_path("tests.helpers.doubling_process", {})
     assert found.parent.parent == Path(tempfile.gettempdir())
     assert len(str(found)) <= 107
 
@@ -282,4 +285,4 @@ def test_a_folder_of_somebody_else_is_not_used(folder):
     (folder / f"tableverse-{os.getuid()}").mkdir(mode=0o777)
     (folder / f"tableverse-{os.getuid()}").chmod(0o777)
     with pytest.raises(ModelAccessError, match="this user alone"):
-        model_daemon.ask("tests.helpers.doubling_process", {}, [np.array([4])])
+        model_daemon.ask_daemon("tests.helpers.doubling_process", {}, [np.array([4])])

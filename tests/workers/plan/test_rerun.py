@@ -154,7 +154,7 @@ def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(built, tmp_path
 
 def test_a_stage_is_found_by_its_own_name_and_by_its_section():
     for name in ("rectify", "cut"):
-        assert find_restart_points(tiny_line.LINES, {"layout"}, name) == {"layout": 1}
+        assert find_restart_points(tiny_line.PIPELINES, {"layout"}, name) == {"layout": 1}
 
 
 def test_a_list_of_shards():

@@ -53,7 +53,7 @@ def test_a_complete_build_is_read_once(out, monkeypatch):
     same_as_survey(out, tally)
     assert tally.stages == ("manifest", "look", "cut", "fall", "pack")
     assert tally.passed["look"] == 7
-    monkeypatch.setattr(follow, "committed_scenes", lambda *_, **__: pytest.fail("read again"))
+    monkeypatch.setattr(follow, "read_committed_scenes", lambda *_, **__: pytest.fail("read again"))
     again = following.read_tally()
     assert (again.ended, again.passed, again.wall) == (tally.ended, tally.passed, tally.wall)
 

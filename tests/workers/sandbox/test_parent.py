@@ -33,7 +33,7 @@ def sandbox(tmp_path):
 
 def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
     given = {
-        "pipeline": "tests.helpers.tiny_line:LINES",
+        "pipeline": "tests.helpers.tiny_line:PIPELINES",
         "config_json": Config().model_dump_json(),
         "cache_dir": str(tmp_path),
         "attempts": 2,
@@ -134,14 +134,15 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
 
 def test_the_clock_of_the_deadline_starts_with_the_stage_not_with_the_import(tmp_path):
     sandbox = Sandbox(_setup(tmp_path, attempts=1))
+    started = time.monotonic()
     report, _ = _run_one(sandbox, 0, b"no message", deadline_s=0.001)
     sandbox.close()
-    assert report.wall_s < 1.0
+    assert report.wall_s < 0.5 * (time.monotonic() - started), "most of the time is the import"
 
 
 def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
     with pytest.raises(BuildError, match="no_such_module"):
-        _run_one(Sandbox(_setup(tmp_path, pipeline="no_such_module:LINES")), 0, b"")
+        _run_one(Sandbox(_setup(tmp_path, pipeline="no_such_module:PIPELINES")), 0, b"")
 
 
 def test_close_leaves_no_process(sandbox):
@@ -169,7 +170,7 @@ t._run_one(sandbox, 1, item, deadline_s=60.0)
         (child,) = psutil.Process(parent.pid).children()
         time.sleep(0.2)
         parent.kill()
-    wait_until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, 5.0)
+    wait_until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
 
 
 def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
