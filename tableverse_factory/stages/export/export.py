@@ -1,4 +1,4 @@
-"""EXPORT: MJCF with its assets, the certificate measured on those very files, and the rows of the tables."""
+"""The stage `export`: MJCF with its assets, the certificate measured on those files, and the rows of the tables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,13 +28,13 @@ from tableverse_factory.stages.export.tabletop import draw_tabletop_texture
 from tableverse_factory.stages.export.texture import bake_texture
 
 SETTLINGS = 3
-"""How often a scene that still drifts may go on settling before it is given up."""
+"""Most rounds of settling of a scene that still drifts."""
 
 MASS_STEP_KG = 1e-5
-"""Judges round masses; what differs by less stands as it stood."""
+"""Greatest difference of masses that needs no new settling [kg]: judges round masses."""
 
 PALETTE = ((196, 102, 92), (98, 140, 184), (128, 166, 104), (214, 170, 88), (150, 120, 170), (92, 160, 158))
-"""For meshes that come without colours."""
+"""Colours of meshes that come without."""
 
 
 def export(
@@ -43,9 +43,9 @@ def export(
     rng: np.random.Generator,
     services: Services,  # noqa: ARG001
 ) -> Outcome[ExportedScene]:
-    """Writes the scene with the predicted masses, lets it come to rest on them, and certifies what it wrote.
+    """Write the scene with the judged masses, settle it with them, and certify the written files.
 
-    Nothing deeper than `export.epsilon_m` and nothing that moves leaves the factory. Dropped: `unusable_mesh`,
+    No scene with a penetration deeper than `export.epsilon_m` or with motion is exported. Drops: `unusable_mesh`,
     `simulation_unstable`, `object_fell`, `not_at_rest`, `colliding`.
     """
     layout = scene.settled.rectified
@@ -64,7 +64,7 @@ def export(
 
 @dataclass(frozen=True, slots=True)
 class _CertifiedFiles:
-    """A scene's files with what was measured on them."""
+    """A scene's files with their certificate and measurements."""
 
     bodies: tuple[SceneBody, ...]
     files: SceneFiles
@@ -97,7 +97,7 @@ def _load_projectors(layout: RectifiedLayout) -> Sequence[ColorProjector | None]
 def _settle_and_certify(
     scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, tabletop: TableTexture, config: Config
 ) -> _CertifiedFiles:
-    """The files of the scene at rest, settled on until the certificate agrees or patience ends."""
+    """Write the scene and settle it until the certificate finds it at rest, at most `SETTLINGS` times."""
     layout, step = scene.settled.rectified, config.settle.timestep_s
     history = _build_history(layout)
     rests = all(map(_has_settled_mass, layout.placed.objects, bodies))
@@ -117,7 +117,7 @@ def _settle_and_certify(
 
 
 def _has_settled_mass(item: PlacedObject, body: SceneBody) -> bool:
-    """Whether the judge's mass is the one with which the object came to rest in the stage before."""
+    """Whether the object has already settled with the judge's mass."""
     prior = estimate_mass_kg(item.label, body.properties.volume_m3, aabb_size(body.mesh.vertices))
     return abs(body.properties.mass_kg - prior) <= MASS_STEP_KG
 
@@ -137,7 +137,7 @@ def _build_camera(layout: RectifiedLayout) -> PosedCamera | None:
 
 
 def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | None:
-    """Why the scene may not leave, or None."""
+    """Explain why the scene may not be exported; None if it may."""
     certificate, measured = written.certificate, written.measured
     if measured.warnings:
         return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(measured.warnings)}")

@@ -1,8 +1,8 @@
-"""Colours of a mesh as a texture: MuJoCo, like most simulators, does not look at colours of vertices.
+"""Baking of a mesh's colours to a texture: MuJoCo, like most simulators, ignores vertex colours.
 
 Meshes get an atlas of triangles, filled from the picture where it shows them and from the vertices' colours elsewhere.
-Those too dense for that get one colour per face, all corners of a face at the same texel: then no colour bleeds into
-another whatever the filter, and equal colours share a texel.
+Denser meshes get one colour per face, all corners of a face at the same texel: then no filter mixes colours, and equal
+colours share a texel.
 """
 
 from collections.abc import Callable
@@ -19,21 +19,21 @@ from tableverse_factory.stages.export.projected_color import ColorProjector, pro
 
 SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8
-"""Where the picture has more detail than the texture has room, its density is tried again at this share of it."""
+"""Factor of the density after each try that does not fit."""
 
 SMALL_TRIES, LARGE_TRIES = 4, 24
-"""The small texture will do down to half the picture's density; the large one takes whatever fits."""
+"""Tries by size: the small texture down to half the picture's density, the large one until the atlas fits."""
 
 Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
-"""Faces and barycentric weights of points on them, to sRGB."""
+"""Maps faces and barycentric weights of points on them to sRGB."""
 
 
 def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appearance | None:
-    """The mesh's own texture; else one of its vertex colours, and of the picture where it shows the mesh; else None.
+    """Bake the mesh's own texture, else one from its vertex colours and the picture; None without colours.
 
     Args:
-        mesh: In its own frame, before scale.
-        photograph: The picture it was seen in, or None.
+        mesh: Mesh in its own frame, before scale.
+        photograph: The picture of the object, or None.
     """
     if mesh.texture is not None:
         return Appearance.at_corners(encode_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
@@ -46,7 +46,7 @@ def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -
 
 
 def _measure_detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Float64[np.ndarray, " m"]:
-    """Texels per metre worth giving each face: the picture's own where it shows the face, none elsewhere."""
+    """Measure the texels per metre of each face: the picture's own where it shows the face, 0 elsewhere."""
     count = len(mesh.faces)
     if photograph is None:
         return np.zeros(count)
@@ -56,7 +56,7 @@ def _measure_detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Fl
 
 
 def _choose_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
-    """The atlas with as much of the detail as there is room for."""
+    """Choose the atlas with as much detail as fits."""
     sizes = ((SMALL_SIDE, SMALL_TRIES), (LARGE_SIDE, LARGE_TRIES)) if detail.any() else ((SMALL_SIDE, 1),)
     for side, tries in sizes:
         for power in range(tries):
@@ -115,12 +115,12 @@ def _bake_atlas(atlas: Atlas, painter: Painter) -> Appearance:
 
 
 def _compute_texel_uv(column: np.ndarray, row: np.ndarray, side: int) -> np.ndarray:
-    """Texture coordinates; the v axis of an OBJ points up, the rows of a picture go down."""
+    """Compute texture coordinates; v of an OBJ points up, the rows of a picture go down."""
     return np.stack([(column + 0.5) / side, 1.0 - (row + 0.5) / side], axis=-1)
 
 
 def _reduce_colors(colors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sorted distinct colours and the index of each; coarser by a bit at a time until there are at most so many."""
+    """Reduce to sorted distinct colours, with the index of each; coarser bit by bit until there are at most `most`."""
     places = np.array([16, 8, 0])
     for shift in range(8):
         coarse = (colors >> shift << shift) + ((1 << shift) >> 1)

@@ -1,4 +1,4 @@
-"""Stray points out: statistical and radius filters on the points of one object (paper section 3.1)."""
+"""Statistical and radius outlier filters on the points of one object (paper section 3.1)."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -13,10 +13,10 @@ MIN_IN_RADIUS = 6
 
 
 def find_inlier_points(points: Points) -> Bool[np.ndarray, " n"]:
-    """Which points stay: their mean distance to their neighbours is usual, and their surroundings are not empty.
+    """Find points whose mean distance to their neighbours is usual and whose surroundings are not empty.
 
-    The radius in which so many others must lie follows the density of the points themselves, so that near and far
-    objects are treated alike.
+    The radius that must hold `MIN_IN_RADIUS` others follows the density of the points, so that near and far objects
+    are treated alike.
     """
     keep = np.zeros(len(points), dtype=bool)
     if len(points) <= NEIGHBOURS:

@@ -1,4 +1,4 @@
-"""The second stage: an observation becomes a table and the objects on it."""
+"""The stage `perceive`: an observation becomes a table and the objects on it."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def perceive(
     rng: np.random.Generator,
     services: Services,
 ) -> Outcome[PerceivedObjects]:
-    """Finds the table, then the things on it; their points are denoised, in the camera frame."""
+    """Find the table and the objects on it; their points are denoised, in the camera frame."""
     view = find_table(item, rng)
     if isinstance(view, Dropped):
         return view
@@ -63,7 +63,7 @@ def perceive(
 
 
 def choose_detector(item: Observation, config: PerceiveConfig) -> str:
-    """The backend that `perceive.detector` means for this capture."""
+    """Choose the backend for this capture."""
     if config.detector != "auto":
         return config.detector
     return "geometric" if item.recorded_detections is None else "replay"
@@ -72,10 +72,10 @@ def choose_detector(item: Observation, config: PerceiveConfig) -> str:
 def segment_boxes(
     view: TableView, found: DetectionResult, config: Config, rng: np.random.Generator, services: Services
 ) -> IdImage:
-    """The pixels of boxes, as the segmenter that the configuration names sees them; the k-th has the id `k + 1`.
+    """Segment the detector's boxes with the configured segmenter; the k-th has the id `k + 1`.
 
     Raises:
-        ModelError: if the segmenter cannot be asked.
+        ModelError: if the segmenter is out of reach.
     """
     if not found.candidates:
         return np.zeros(view.valid.shape, dtype=np.int32)
@@ -87,9 +87,9 @@ def segment_boxes(
 def _build_objects(
     view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, config: PerceiveConfig
 ) -> tuple[tuple[PerceivedObject, ...], tuple[tuple[str, str], ...]]:
-    """Candidates with enough clean points, in the detector's order, and why the others are left out.
+    """Build the objects with enough clean points, in the detector's order, and the reasons against the others.
 
-    Object ids count the candidates from 0, instance ids from 1, whoever is left out.
+    Object ids count all candidates from 0, instance ids from 1.
     """
     kept: dict[int, PerceivedObject] = {}
     left_out: list[tuple[str, str]] = []
@@ -115,13 +115,12 @@ def _build_objects(
 
 
 def _select_mask(candidate: Candidate, ids: IdImage) -> Mask:
-    """A candidate's pixels."""
     mask: Mask = (ids == candidate.instance) & (ids > 0)
     return mask
 
 
 def _clean_points(view: TableView, mask: Mask) -> tuple[Points, Colors]:
-    """Clean points with their colours, from measured pixels only, thinned to at most about `MAX_POINTS`."""
+    """Select clean points with their colours, from measured pixels only, thinned to about `MAX_POINTS`."""
     rows, columns = np.nonzero(mask & (view.observation.depth > 0))
     step = max(1, -(-len(rows) // MAX_POINTS))
     rows, columns = rows[::step], columns[::step]
@@ -133,7 +132,7 @@ def _clean_points(view: TableView, mask: Mask) -> tuple[Points, Colors]:
 def _paint_ids(
     view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, objects: tuple[PerceivedObject, ...]
 ) -> IdImage:
-    """Instance ids of the objects that are kept; of those that share their pixels the last one has them."""
+    """Paint the instance ids of the objects; where objects share pixels, the last one has them."""
     kept = np.where(view.on_plane, TABLE_ID, 0).astype(np.int32)
     for item in objects:
         kept[_select_mask(candidates[item.instance_id - 1], ids)] = item.instance_id

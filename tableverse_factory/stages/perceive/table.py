@@ -1,4 +1,4 @@
-"""The table: which of the picture's planes carries things, and how far it reaches."""
+"""Detection of the table plane and its outline in a depth image."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy import ndimage
 
-from schemas.geometry import Frozen, Mask, Picture, Points, Pose
+from schemas.geometry import Mask, Picture, Points, Pose
 from schemas.objects import Table
 from schemas.observation import Observation
 from schemas.outcome import Dropped
@@ -38,7 +38,7 @@ MIN_RAISED_AREA_M2 = 0.08
 PARALLEL_COS = 0.996
 BENT_PARALLEL_COS = 0.98
 BENDS = 2.0
-"""Bends of a model within which readings are of a plane that was found: narrow to find it, wide to fit it."""
+"""Tolerance of the fit to a plane, in bends of a depth model."""
 DEGREE, BENT_DEGREE = 2, 4
 RAISED_BENDS = 0.75
 MIN_SOLIDITY = 0.3
@@ -58,18 +58,16 @@ RECTANGLE_MARGIN_M = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _PlaneCandidate(Frozen):
+class _PlaneCandidate:
     plane: Plane
-    outline_xy: Points2
-    axes: Float64[np.ndarray, "3 3"]
     share: float
     area_m2: float
     solidity: float
     supported_share: float
 
     @property
-    def evidence(self) -> float:
-        """How much of the picture it fills, more if it faces up in the picture and carries things."""
+    def score(self) -> float:
+        """Share of the picture, higher for a plane that faces up in the picture and supports objects."""
         upward = 0.2 + 0.8 * float(np.clip((0.3 - self.plane.normal[1]) / 1.3, 0.0, 1.0))
         return self.share * upward * (1.0 if self.supported_share >= SUPPORT_MIN_SHARE else 0.3)
 
@@ -77,12 +75,12 @@ class _PlaneCandidate(Frozen):
 def find_table(
     observation: Observation, rng: np.random.Generator, table_top: Mask | None = None
 ) -> TableView | Dropped:
-    """The picture over its table, or the reason why there is none.
+    """Find the table plane of a picture, or the reason why there is none.
 
     Args:
         observation: The picture with its depth.
-        rng: Draws the planes that are tried.
-        table_top: Pixels among which the plane is looked for; None for all.
+        rng: Generator of the planes tried.
+        table_top: Pixels among which to look for the plane; None for all.
     """
     depth = fill_depth_gaps(observation.depth)
     points, valid = backproject(depth, observation.camera), depth > 0
@@ -107,9 +105,9 @@ def find_table(
 
 
 def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
-    """The picture over the plane of what somebody sees as the table-top, so that no larger floor is taken for it.
+    """Refit the table to the pixels that a segmenter gives to the table-top, so that no larger floor is taken for it.
 
-    As it was where too little of that was measured, or it is no plane that a table can have.
+    Unchanged where too few of them were measured, or they lie on no plane that a table can have.
     """
     if int((table_top & view.valid).sum()) < MIN_TABLE_TOP_PIXELS:
         return view
@@ -118,10 +116,10 @@ def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generat
 
 
 def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
-    """The picture over the plane that fills the box in which a detector sees the table, where it lies over another.
+    """Refit the table to a higher plane that fills more of the box in which a detector sees the table.
 
-    As it was where the table that was found fills enough of the box, for things hide the rest; and where no higher
-    plane fills more of it: a floor is taken for a table, never the other way round.
+    Unchanged where the found table fills enough of the box, because objects hide the rest; and where no higher plane
+    fills more of it: a floor may be taken for a table, never the reverse.
     """
     x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
     inside = np.zeros(view.valid.shape, dtype=bool)
@@ -144,14 +142,14 @@ def _measure_table_share(view: TableView, inside: Mask) -> float:
 
 
 def _sample_grid(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of a regular grid of readings, in rows."""
+    """Sample the rows and columns of a regular grid of readings."""
     step = max(1, int(np.sqrt(valid.sum() / SAMPLES)))
     rows, columns = np.nonzero(valid[::step, ::step])
     return rows * step, columns * step
 
 
 def compute_table_axes(plane: Plane) -> Float64[np.ndarray, "3 3"]:
-    """Rows: x to the camera's right, y away from it, z along the plane's normal, as camera directions."""
+    """Compute the axes as rows: x to the camera's right, y away from it, z along the plane's normal."""
     right = np.array([1.0, 0.0, 0.0])
     x = right - (right @ plane.normal) * plane.normal
     if np.linalg.norm(x) < 1e-6:  # the camera lies on its side
@@ -168,11 +166,11 @@ def _rate_plane(plane: Plane, sample: Points, inliers: Mask) -> _PlaneCandidate:
     heights = plane.heights(sample)
     above = (heights > 0.015) & (heights < MAX_HEIGHT_M) & is_inside_outline(outline, xy)
     solidity = len(np.unique(np.floor(kept / CELL_M), axis=0)) * CELL_M**2 / max(area, 1e-9)
-    return _PlaneCandidate(plane, outline, axes, float(inliers.mean()), area, solidity, float(above.mean()))
+    return _PlaneCandidate(plane, float(inliers.mean()), area, solidity, float(above.mean()))
 
 
 def _find_main_region(xy: Points2) -> tuple[Points2, float]:
-    """The points of the largest patch and of those near it or not much smaller; and the area they cover [m²]."""
+    """Find the points of the largest patch and of those near it or not much smaller, and their area [m²]."""
     cells = np.floor((xy - xy.min(axis=0)) / CELL_M).astype(np.int64)
     if int(cells.max(initial=0)) > 4000:
         return xy, float("inf")
@@ -202,8 +200,8 @@ def _explain_rejection(candidate: _PlaneCandidate) -> str:
 
 
 def _choose_plane(candidates: list[_PlaneCandidate], parallel: float) -> _PlaneCandidate:
-    """The plane with most evidence, unless a parallel one stands over it like a table over its floor."""
-    best = max(candidates, key=lambda c: c.evidence)
+    """Choose the plane with the best score, unless a parallel one stands over it like a table over its floor."""
+    best = max(candidates, key=lambda c: c.score)
     raised = [
         c
         for c in candidates
@@ -213,7 +211,7 @@ def _choose_plane(candidates: list[_PlaneCandidate], parallel: float) -> _PlaneC
         and c.solidity >= MIN_SOLIDITY
         and c.supported_share >= SUPPORT_MIN_SHARE
     ]
-    return max(raised, key=lambda c: c.evidence, default=best)
+    return max(raised, key=lambda c: c.score, default=best)
 
 
 def _build_view(
@@ -250,10 +248,10 @@ def _build_view(
 
 
 def _level_plane(plane: Plane, others: list[Plane], points: Points, tolerance: Float64[np.ndarray, " n"]) -> Plane:
-    """The plane turned about its middle to the normal that it shares with the floor, shelves and whatever is parallel.
+    """Turn the plane about its middle to the normal that it shares with the floor, shelves and other parallel planes.
 
-    A model bends depth by a share of it over large patches, so a wide floor says more about gravity than a small
-    table. Points count by angle, not by metres: the far ones are bent by more.
+    A depth model's error grows with depth over large patches, so a wide floor tells more about gravity than a small
+    table. Points are weighted by angle, not by metres, because far ones are bent by more.
     """
     step = max(1, len(points) // SAMPLES)
     points, tolerance = points[::step], tolerance[::step]
@@ -269,7 +267,7 @@ def _level_plane(plane: Plane, others: list[Plane], points: Points, tolerance: F
 
 
 def _remove_strips(flat: Mask, tolerance_px: float) -> Mask:
-    """The flat pixels without strips as narrow as those where an upright face crosses the plane's height."""
+    """Remove strips as narrow as those where an upright face crosses the plane's height."""
     size = 2 * int(np.ceil(1.2 * tolerance_px)) + 1
     core = ndimage.minimum_filter(flat.astype(np.uint8), size, mode="nearest")
     wide: Mask = flat & (ndimage.maximum_filter(core, size) > 0)
@@ -277,7 +275,7 @@ def _remove_strips(flat: Mask, tolerance_px: float) -> Mask:
 
 
 def compute_camera_to_table(view: TableView, object_points: Points) -> Pose:
-    """Pose of the camera in the table frame, whose origin lies under the middle of the objects' bounding rectangle."""
+    """Compute the camera's pose in the table frame; its origin lies under the middle of the objects' rectangle."""
     center = fit_min_rectangle(compute_convex_outline(view.xy(object_points))).center
     matrix = np.eye(4)
     matrix[:3, :3] = view.axes
@@ -286,7 +284,7 @@ def compute_camera_to_table(view: TableView, object_points: Points) -> Pose:
 
 
 def fit_table_rectangle(view: TableView, pose: Pose, object_points: Points, color: Picture) -> Table:
-    """The rectangle around the visible table-top and, with a margin, the footprints of all objects."""
+    """Fit the rectangle around the visible table-top and, with a margin, the footprints of all objects."""
     footprint = transform_points(pose, object_points)[:, :2]
     corners = compute_convex_outline(footprint)
     spread = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * RECTANGLE_MARGIN_M

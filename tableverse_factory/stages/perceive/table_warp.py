@@ -1,4 +1,4 @@
-"""How a sensor or a depth model bends the flat table."""
+"""Warp of the flat table by a sensor or a depth model."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,14 +12,14 @@ SAMPLES = 9000
 def fit_warp(
     xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask, most: float, degree: int
 ) -> Float64[np.ndarray, "h w"]:
-    """A polynomial through what lies close to the plane, things that stand on it left out [m]. Shape (h, w).
+    """Fit a polynomial through the readings close to the plane, without the objects on it [m]. Shape (h, w).
 
     Args:
-        xy: Along the table [m].
-        heights: Above the plane [m].
-        flat: What lies close to it.
-        most: Bound of what is given [m]: polynomials run away where nothing holds them.
-        degree: Of the polynomial.
+        xy: Coordinates along the table [m].
+        heights: Heights above the plane [m].
+        flat: Pixels close to the plane.
+        most: Bound of the result [m]: polynomials run away beyond their support.
+        degree: Degree of the polynomial.
     """
     if int(flat.sum()) < MIN_PIXELS:
         return np.zeros(heights.shape)
@@ -38,7 +38,7 @@ def fit_warp(
 def _evaluate_polynomial(
     xy: Float64[np.ndarray, "*shape 2"], weights: Float64[np.ndarray, " k"], degree: int
 ) -> Float64[np.ndarray, "*shape"]:
-    """`_build_monomials(xy, degree) @ weights` after Horner, without an array for each term."""
+    """Evaluate `_build_monomials(xy, degree) @ weights` by Horner's rule, without an array for each term."""
     x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
     of_term = {
         (total - k, k): weight

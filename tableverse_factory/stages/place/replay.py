@@ -1,4 +1,4 @@
-"""Replays the meshes that a MeshModel made earlier and that lie beside the capture."""
+"""The mesh model `replay`: meshes recorded beside the capture."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 
 
 def replay_mesh(scene: PerceivedObjects, view: ObjectView) -> Completion:
-    """The recorded mesh of the instance that covers most of the object's pixels; its pose is left to registration.
+    """Return the recorded mesh of the instance with most of the object's pixels; registration finds its pose.
 
     Raises:
         GeometryError: if nothing was recorded for it.

@@ -1,4 +1,4 @@
-"""Vertex colours from the picture: what was seen where it was seen, what is like it elsewhere."""
+"""Vertex colours from the picture: observed where visible, from similar points elsewhere."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,18 +11,18 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 NEIGHBOURS = 5
 SOURCES = 8000
 NORMAL_M = 0.03
-"""A surface that faces the opposite way counts as this much farther away, times two."""
+"""Half the extra distance of a surface that faces the opposite way [m]."""
 COPY_M = 0.008
-"""A colour borrowed from the opposite side counts as this much farther away than one that was seen."""
+"""Extra distance of a colour borrowed from the opposite side [m]."""
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
-"""As seen, by half a turn about the vertical, and mirrored in the two upright planes of the object's own frame."""
+"""Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame."""
 
 
 def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> TriangleMesh:
-    """The mesh with a colour per vertex.
+    """Paint each vertex of the mesh.
 
-    A vertex takes the colours of the observed points nearest in place and direction. The points are offered a
-    second time turned by half and mirrored in the object's own upright frame, a little farther away: so the back
+    A vertex takes the colours of the observed points nearest in position and direction. The points also count turned
+    by half and mirrored in the object's own upright frame, a little farther away: so the back
     looks like the front, and the outside of a cup does not run into its inside.
     """
     step = max(1, len(view.points) // SOURCES)
@@ -42,7 +42,7 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> Triangle
 
 
 def compute_vertex_normals(mesh: TriangleMesh) -> Points:
-    """Unit normals, the mean of the adjacent faces weighted by area; zero where a vertex has none. Shape (n, 3)."""
+    """Compute unit normals, the area-weighted mean of adjacent faces; zero where a vertex has none. Shape (n, 3)."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     normals = np.zeros_like(mesh.vertices)
@@ -54,7 +54,7 @@ def compute_vertex_normals(mesh: TriangleMesh) -> Points:
 
 
 def _extract_heading(pose: Pose) -> Float64[np.ndarray, "4"]:
-    """The turn about the vertical alone of an orientation."""
+    """Extract the rotation about the vertical of an orientation."""
     w, z = pose.quaternion_wxyz[0], pose.quaternion_wxyz[3]
     length = float(np.hypot(w, z))
     return np.array([w, 0.0, 0.0, z]) / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])

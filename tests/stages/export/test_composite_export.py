@@ -31,7 +31,9 @@ COPIES = 4
 def bowl_of_lemons(tmp_path_factory: pytest.TempPathFactory) -> ExportedScene:
     """A bowl with one lemon seen and four counted, and a block beside it."""
 
-    def thing(name: str, label: str, model: GeneratedObject, at: tuple[float, float, float], **more: Any) -> PlacedObject:
+    def thing(
+        name: str, label: str, model: GeneratedObject, at: tuple[float, float, float], **more: Any
+    ) -> PlacedObject:
         pose = Pose(np.array(at), np.array([1.0, 0.0, 0.0, 0.0]))
         return PlacedObject(name, label, 1.0, model.mesh, more.pop("scale", 1.0), pose, **more)
 

@@ -1,4 +1,4 @@
-"""The doors behind which things are found: who detects, who turns a box into a mask, and what they answer."""
+"""Protocols of detectors and box segmenters, and their answers."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,21 +13,20 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.table_view import TableView
 
 PixelBox = tuple[float, float, float, float]
-"""xmin, ymin, xmax, ymax in pixels of the picture."""
+"""xmin, ymin, xmax, ymax [px]."""
 
 TABLE_ID = -1
-"""Of the table-top in a picture of ids."""
+"""Value of table-top pixels in an image of ids."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One thing that a detector names.
+    """One object named by a detector.
 
     Attributes:
-        box: Where it is, in pixels.
-        instance: Its id in the picture of ids; 0 where it has no pixels there.
-        container: Index of the candidate that holds it, among the same answer; or None.
-        count: How many of it there are; the box is that of one.
+        instance: Its value in the image of ids; 0 where it has no pixels there.
+        container: Index of the candidate that contains it; None for none.
+        count: Number of such objects; the box is that of one.
     """
 
     label: str
@@ -43,11 +42,10 @@ class DetectionResult(Frozen):
     """A detector's whole answer.
 
     Attributes:
-        candidates: Every object once; containers before their contents; never the table itself.
-        table_box: Where the detector sees the table-top, in pixels; None where it does not say.
-        record: How the answer of a model came about; None where none was asked.
-        ids: The instance at each pixel, shape (h, w); None where the detector gives boxes only, and a BoxSegmenter
-            goes on. A mask for each candidate would take a picture's pixels once for each of them.
+        candidates: Every object once, containers before their contents, without the table.
+        table_box: Box of the table-top [px]; None where the detector gives none.
+        record: Origin of a model's answer; None where no model was asked.
+        ids: The instance at each pixel, shape (h, w); None where the detector gives boxes only, for a BoxSegmenter.
     """
 
     candidates: tuple[Candidate, ...]
@@ -57,23 +55,23 @@ class DetectionResult(Frozen):
 
 
 class Detector(Protocol):
-    """Finds the things on the table."""
+    """Finds the objects on the table."""
 
     def __call__(
         self, view: TableView, config: PerceiveConfig, rng: np.random.Generator, services: Services
     ) -> DetectionResult | Dropped:
-        """What it finds, or why the picture is of no use."""
+        """Detect the objects, or tell why the picture is unusable."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class BoxPrompts:
-    """Boxes whose masks are wanted.
+    """Boxes to be segmented.
 
     Attributes:
-        objects: Of the objects.
-        holders: For each object the index of the one that holds it, or None.
-        table: Of the table-top; None where the detector does not say.
+        objects: Box of each object.
+        holders: Index of the object that contains each object, or None.
+        table: Box of the table-top, where the detector gives one.
     """
 
     objects: tuple[PixelBox, ...]
@@ -87,7 +85,7 @@ class BoxSegmenter(Protocol):
     def __call__(
         self, view: TableView, boxes: BoxPrompts, config: Config, rng: np.random.Generator, services: Services
     ) -> IdImage:
-        """At each pixel `k + 1` of the k-th object, `TABLE_ID` where the table-top is seen, else 0; shape (h, w).
+        """Return an image of `k + 1` for the k-th object, `TABLE_ID` for the table-top, else 0; shape (h, w).
 
         An object has no pixels where nothing in its box stands on the table.
         """

@@ -1,4 +1,4 @@
-"""An observation as points over a table: what every detector and segmenter looks at."""
+"""An observation as points over a table: the input of every detector and segmenter."""
 
 from dataclasses import dataclass, replace
 
@@ -14,16 +14,16 @@ MIN_NEIGHBOURS = 3
 
 
 def compute_depth_noise(depth: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
-    """Standard deviation of a structured-light sensor's axial noise [m] (Nguyen, Izadi and Lovell 2012)."""
+    """Compute the standard deviation of a structured-light sensor's axial noise [m] (Nguyen, Izadi and Lovell 2012)."""
     z = np.asarray(depth, dtype=np.float64)
     noise: Float64[np.ndarray, "*shape"] = 0.0012 + 0.0019 * (z - 0.4) ** 2
     return noise
 
 
 def fill_depth_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
-    """The depth with gaps of a pixel or two filled by a reading beside them, never by a mean over a step [m].
+    """Fill gaps of a pixel or two with a neighbouring reading, never with a mean over a step [m].
 
-    Sensors lose readings along the edges of things, just where one thing must be told from another.
+    Sensors lose readings along the edges of objects, where one object must be separated from another.
     """
     filled = np.asarray(depth, dtype=np.float64)
     for _ in range(FILL_ROUNDS):
@@ -42,17 +42,17 @@ def fill_depth_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableView(Frozen):
-    """The picture, its points, and the table they stand on.
+    """The picture, its points, and the table below them.
 
     Attributes:
-        points_camera: Shape (h, w, 3) [m]; the origin where there is no reading, small gaps filled (`fill_depth_gaps`).
-        valid: Where there is a reading or a filled gap.
-        plane: The table plane in the camera frame, its normal upwards.
-        axes: Rows: the table frame's x, y and z as camera directions.
+        points_camera: Points, the origin where there is no reading [m]. Shape (h, w, 3).
+        valid: Pixels with a reading or a filled gap.
+        plane: Table plane in the camera frame, its normal upwards.
+        axes: The table frame's x, y and z as camera directions, one per row.
         outline_xy: Convex outline of the visible table-top, counter-clockwise, see `xy` [m].
-        heights: Above the plane [m]; shape (h, w), 0 where there is no reading.
+        heights: Heights above the plane, 0 where there is no reading [m]. Shape (h, w).
         on_plane: Pixels of the table-top itself.
-        raised: Pixels clearly above the table-top, over it or not far beside it.
+        raised: Pixels clearly above the table-top or a little beside it.
     """
 
     observation: Observation
@@ -71,22 +71,14 @@ class TableView(Frozen):
         return self.points_camera[..., 2]
 
     def xy(self, points_camera: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 2"]:
-        """Coordinates along the table, their origin below the camera [m]."""
+        """Compute coordinates along the table, their origin below the camera [m]."""
         along: Float64[np.ndarray, "*shape 2"] = points_camera @ self.axes[:2].T
         return along
 
 
 @dataclass(frozen=True, slots=True)
 class ImageWindow:
-    """A part of the picture, every `stride`-th pixel of it.
-
-    Attributes:
-        top: First row.
-        left: First column.
-        height: Rows after thinning.
-        width: Columns after thinning.
-        stride: Pixels of the picture per pixel of the window.
-    """
+    """A part of the picture at every `stride`-th pixel; height and width count thinned pixels."""
 
     top: int
     left: int
@@ -96,7 +88,7 @@ class ImageWindow:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Which rows and columns of the picture are taken."""
+        """Rows and columns of the picture."""
         return (
             slice(self.top, self.top + self.height * self.stride, self.stride),
             slice(self.left, self.left + self.width * self.stride, self.stride),
@@ -104,7 +96,7 @@ class ImageWindow:
 
 
 def find_working_window(mask: Mask, max_pixels: int, margin: int) -> ImageWindow:
-    """A window around the mask, thinned so that the whole picture would have at most `max_pixels`."""
+    """Find a window around the mask, thinned so that the whole picture would have at most `max_pixels`."""
     stride = max(1, int(np.ceil(np.sqrt(mask.size / max_pixels))))
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     top, left = max(int(rows[0]) - margin * stride, 0), max(int(columns[0]) - margin * stride, 0)
@@ -113,8 +105,17 @@ def find_working_window(mask: Mask, max_pixels: int, margin: int) -> ImageWindow
     return ImageWindow(top, left, -(-(bottom - top) // stride), -(-(right - left) // stride), stride)
 
 
+def expand_window(mask: Mask, margin: int) -> tuple[slice, slice]:
+    """Find the rows and columns of a mask that is not empty, with a margin on either side [px]."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
+    )
+
+
 def crop_view(view: TableView, window: ImageWindow) -> TableView:
-    """The same view of fewer pixels."""
+    """Crop and thin the view to a window."""
     part, full = window.slices, view.observation
     camera = Camera(
         full.camera.fx / window.stride,
@@ -136,7 +137,7 @@ def crop_view(view: TableView, window: ImageWindow) -> TableView:
 
 
 def uncrop_ids(ids: IdImage, window: ImageWindow, shape: tuple[int, ...]) -> IdImage:
-    """An image of the window at the size of the picture, zero around it; each pixel stands for `stride` squared."""
+    """Scale an image of the window to the picture's size, zero around it."""
     large = np.kron(ids, np.ones((window.stride, window.stride), dtype=ids.dtype))
     full = np.zeros(shape, dtype=ids.dtype)
     target = full[window.top : window.top + large.shape[0], window.left : window.left + large.shape[1]]

@@ -1,4 +1,4 @@
-"""What lies in what: contents of bowls, boxes and cups, by their shapes alone."""
+"""Containment by outlines: contents of bowls, boxes and cups."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ WALL_M = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _RegionShape(Frozen):
-    """A sample of a region over the table, its convex footprint, and the heights of its foot and its rim [m]."""
+    """Sample of a region over the table, its convex footprint, and the heights of its foot and its rim [m]."""
 
     size: int
     xy: Points2
@@ -29,7 +29,7 @@ class _RegionShape(Frozen):
 
 
 def find_containers_by_outline(ids: IdImage, view: TableView) -> dict[int, int]:
-    """For each region that lies in the hollow of another, that other: the smallest one that qualifies."""
+    """Find the container of each region that lies in the hollow of another: the smallest one that qualifies."""
     shapes = {
         k: _describe_region(mask, view)
         for k in range(1, int(ids.max(initial=0)) + 1)
@@ -53,7 +53,7 @@ def _describe_region(mask: Mask, view: TableView) -> _RegionShape:
 
 
 def _lies_in(inner: _RegionShape, holder: _RegionShape) -> bool:
-    """Whether `inner` is over the holder's footprint, begins below its rim, and has its walls around."""
+    """Whether `inner` is over the holder's footprint, begins below its rim, and is surrounded by its walls."""
     if inner.low > holder.rim - BELOW_RIM_M:
         return False
     over = is_inside_outline(holder.footprint, inner.xy, -WALL_M)

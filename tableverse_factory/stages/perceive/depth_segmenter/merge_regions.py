@@ -1,4 +1,4 @@
-"""Regions that the picture shows apart although they are one thing: behind an occluder, or a hollow and its wall."""
+"""Merging of regions that belong to one object: parts behind an occluder, a vessel's inside, floor and wall."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from scipy import ndimage
 from skimage.draw import line
 
-from schemas.geometry import IdImage, Mask, Points
+from schemas.geometry import IdImage, Points
 from tableverse_factory.geometry.math.planes import Points2, compute_convex_outline, is_inside_outline
-from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, shift_image
 from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import (
     NEAR_PX,
@@ -48,18 +48,17 @@ MAX_IN_FRONT = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedRegion:
-    """What the joins need to know of one region.
+    """Features of one region.
 
     Attributes:
         size: Number of its pixels.
         pixels: Row and column of a regular sample of its pixels. Shape (n, 2).
-        points: Their points, camera frame [m].
-        normals: Their normals.
+        points: Points of the sample, camera frame [m].
+        normals: Normals of the sample.
         footprint: Convex outline over the table [m].
-        xy: The sample over the table [m].
-        near: Distance along the table, away from the camera, below which 5 % of it lie [m].
-        low: Height below which 5 % of it lie [m].
-        rim: Height below which 98 % of it lie [m].
+        xy: Sample over the table [m].
+        near: 5th percentile of the distance along the table, away from the camera [m].
+        rim: 98th percentile of the height [m].
     """
 
     size: int
@@ -69,19 +68,18 @@ class MergedRegion:
     footprint: Points2
     xy: Points2
     near: float
-    low: float
     rim: float
 
 
 def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[MergedRegion]:
-    """Each region from 1 on, by a sample of its pixels."""
+    """Describe each region from 1 on by a sample of its pixels."""
     xy, heights = view.xy(surface.points), view.plane.heights(surface.points)
     found = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         rows, columns = np.nonzero(ids == k)
         size = len(rows)
         step = max(1, size // SAMPLES)
-        low, rim = np.percentile(heights[rows, columns], (5, 98))
+        rim = float(np.percentile(heights[rows, columns], 98))
         footprint = compute_convex_outline(xy[rows, columns])
         rows, columns = rows[::step], columns[::step]
         found.append(
@@ -93,15 +91,14 @@ def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[Me
                 footprint,
                 xy[rows, columns],
                 float(np.percentile(xy[rows, columns, 1], 5)),
-                float(low),
-                float(rim),
+                rim,
             )
         )
     return found
 
 
 def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
-    """The regions with those made one that are parts of the same thing, numbered from 1 again.
+    """Merge regions that are parts of one object and renumber them from 1.
 
     Each region may join one other: a part seen behind an occluder the larger part, the inside of a vessel its wall.
     Then the floors of vessels join the walls around them.
@@ -123,7 +120,7 @@ def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdI
 
 
 def _find_other_part(regions: list[MergedRegion], b: int, surface: Surface) -> int | None:
-    """The region of which b is a smaller part, the two being seen apart because of something in front."""
+    """Find the region of which b is a smaller part, separated from it in the picture by an occluder."""
     for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
         if regions[a].size <= regions[b].size:
             return None
@@ -133,7 +130,7 @@ def _find_other_part(regions: list[MergedRegion], b: int, surface: Surface) -> i
 
 
 def _find_vessel(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray, "k k"]) -> int | None:
-    """The region whose inside b is; where several could be, the one nearest to the camera along the table.
+    """Find the region whose inside b is; of several, the one nearest to the camera along the table.
 
     Contents stand in front of the inside of their vessel, but behind its front wall.
     """
@@ -149,7 +146,7 @@ def _find_vessel(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray
 
 
 def _add_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view: TableView) -> IdImage:
-    """The regions with the floors of vessels added to the walls around them, which become one (in `into`)."""
+    """Add the floors of vessels to the walls around them, which are united in `into`."""
     proposals = find_floors(view)
     xy = view.xy(view.points_camera)
     result = ids.copy()
@@ -157,7 +154,7 @@ def _add_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view
         floor = (proposals == k) & (ids == 0)
         if not floor.any():
             continue
-        part = _expand_window(floor, NEAR_PX)
+        part = expand_window(floor, NEAR_PX)
         floor_there, ids_there, color = floor[part], ids[part], view.observation.color[part]
         around = np.unique(ids_there[ndimage.binary_dilation(floor_there, iterations=RIM_PX)])
         walls = [
@@ -174,15 +171,6 @@ def _add_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view
     return result
 
 
-def _expand_window(mask: Mask, margin: int) -> tuple[slice, slice]:
-    """The rows and columns that a mask that is not empty covers, and so many on either side."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
-    )
-
-
 def _unite(into: list[int], a: int, b: int) -> None:
     low, high = sorted((_find_root(into, a), _find_root(into, b)))
     into[high] = low
@@ -195,7 +183,7 @@ def _find_root(into: list[int], k: int) -> int:
 
 
 def measure_occlusion(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
-    """Entry (a, b): the length along which region a stands nearer to the camera than b beside it [px].
+    """Measure, as entry (a, b), the border along which region a is nearer to the camera than b beside it [px].
 
     The diagonal is not used; entry (a, b) + (b, a) is at most the length of their border.
     """
@@ -216,7 +204,7 @@ def is_hollow_of(
 ) -> bool:
     """Whether `inner`, whose `bulge` is `own_shape`, is the inside of `holder`, as of a bowl or a mug.
 
-    It does not bulge, as contents do, and the holder reaches as near to the camera. Besides, three signs count, each
+    It does not bulge, as contents do, and the holder reaches as near to the camera. Three more signs count, each
     sufficient with some of the others: it lies over the holder's footprint and not above its rim; it is seen over
     the holder's rim, never the other way round; it is a hollow by its own shape.
     """
@@ -234,7 +222,7 @@ def is_hollow_of(
 
 
 def measure_bulge(region: MergedRegion) -> float:
-    """How much the normals of a region spread: positive where it bulges towards the viewer, negative in a hollow."""
+    """Measure the spread of a region's normals: positive where it bulges towards the viewer, negative in a hollow."""
     step = max(1, len(region.points) // TANGENT_PLANES)
     points, normals = region.points[::step], region.normals[::step]
     across, turn = points[:, None] - points[None], normals[:, None] - normals[None]
@@ -244,9 +232,9 @@ def measure_bulge(region: MergedRegion) -> float:
 
 
 def is_continuation(a: MergedRegion, b: MergedRegion) -> bool:
-    """Whether the one lies in the tangent planes of the other's points, facing the same way.
+    """Whether two regions continue each other: their points lie in the other's tangent planes, facing the same way.
 
-    Either most of both do, or nearly all of one that is a part of the other's many faces.
+    Either most of both do, or nearly all of one that continues one of the other's faces.
     """
     less, more = sorted((_measure_continuation(a, b), _measure_continuation(b, a)))
     return less >= CONTINUED or (more >= PART_CONTINUED and less >= WHOLE_CONTINUED)
@@ -261,10 +249,10 @@ def _measure_continuation(a: MergedRegion, b: MergedRegion) -> float:
 
 
 def is_hidden_between(a: MergedRegion, b: MergedRegion, surface: Surface) -> bool:
-    """Whether something in front hides where the two meet, and what is seen allows them to be one.
+    """Whether an occluder hides where the two meet, and the visible depth allows them to be one object.
 
-    Looks along chords in the picture, from points of the one to points of the other. Nearly none may show anything
-    behind the chord (the two together are about convex), and a good part must run behind what is nearer.
+    Chords in the picture lead from points of the one to points of the other. Nearly none may show anything behind the
+    chord (the two together are about convex), and a good part must run behind what is nearer.
     """
     gaps = np.linalg.norm(a.points[:, None] - b.points[None], axis=-1)
     if float(gaps.min()) > MAX_GAP_M:
@@ -276,7 +264,7 @@ def is_hidden_between(a: MergedRegion, b: MergedRegion, surface: Surface) -> boo
 
 
 def _trace_chord(a: MergedRegion, i: int, b: MergedRegion, j: int, surface: Surface) -> tuple[bool, bool]:
-    """Whether a line from point i of a to point j of b shows nothing behind their surface, and is mostly hidden."""
+    """Whether a line from point i of a to point j of b shows nothing behind their surface, and whether it is hidden."""
     (r0, c0), (r1, c1) = a.pixels[i].astype(int), b.pixels[j].astype(int)
     rows, columns = line(r0, c0, r1, c1)
     expected = 1.0 / np.linspace(1.0 / a.points[i, 2], 1.0 / b.points[j, 2], len(rows))

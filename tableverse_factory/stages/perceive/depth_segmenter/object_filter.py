@@ -1,4 +1,4 @@
-"""Which regions are things on the table: not walls, not its edge, not the furniture behind."""
+"""Filters that keep regions of objects on the table: no walls, no table edge, no furniture behind."""
 
 from collections.abc import Collection
 
@@ -23,7 +23,7 @@ RAGGED_EDGE_M = 0.03
 
 
 def keep_regions_over_table(ids: IdImage, view: TableView) -> IdImage:
-    """Only the regions that lie over the table's outline, numbered from 1 again: no wall, no floor, no other table."""
+    """Keep the regions over the table's outline, renumbered from 1: no wall, no floor, no other table."""
     xy = view.xy(view.points_camera)
     over = view.valid & (is_inside_outline(view.outline_xy, xy, -EDGE_M) | _find_feet_below_image(view))
     sizes = np.bincount(ids[view.valid], minlength=int(ids.max(initial=0)) + 1)
@@ -32,9 +32,9 @@ def keep_regions_over_table(ids: IdImage, view: TableView) -> IdImage:
 
 
 def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) -> IdImage:
-    """Only the regions that are large enough to be trusted and that something carries, numbered from 1 again.
+    """Keep the regions that are large enough and supported, renumbered from 1.
 
-    Of `contents`, which stand in the opening of a vessel, less is asked: no table is there for noise to raise.
+    `contents`, which stand in the opening of a vessel, may be smaller: no table is there for noise to raise.
     """
     inner = is_inside_outline(view.outline_xy, view.xy(view.points_camera), -RAGGED_EDGE_M)
     kept = []
@@ -47,7 +47,7 @@ def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) 
 
 
 def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:
-    """The kept ids as 1, 2, … in the order given; the others become 0."""
+    """Renumber the kept ids as 1, 2, … in the order given; the others become 0."""
     number = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.int32)
     number[kept] = np.arange(1, len(kept) + 1)
     result: IdImage = number[ids]
@@ -55,7 +55,7 @@ def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:
 
 
 def measure_area(mask: Mask, view: TableView) -> float:
-    """Area of the region's picture at its distance, across the line of sight [m²]."""
+    """Measure the region's area across the line of sight at its distance [m²]."""
     camera = view.observation.camera
     return float(np.sum(view.depth[mask] ** 2)) / (camera.fx * camera.fy)
 
@@ -69,7 +69,7 @@ def is_large_enough(mask: Mask, view: TableView, least_m2: float = MIN_AREA_M2) 
 
 
 def _find_feet_below_image(view: TableView) -> Mask:
-    """Where the point of the table under a pixel's point lies below the picture: the table may well reach there."""
+    """Find pixels whose foot on the table lies below the picture, where the table may well continue."""
     feet = view.points_camera - view.heights[..., None] * view.plane.normal
     rows = project(feet.reshape(-1, 3), view.observation.camera)[:, 1].reshape(view.valid.shape)
     below: Mask = np.nan_to_num(rows, nan=np.inf) > view.valid.shape[0] - 1
@@ -77,10 +77,10 @@ def _find_feet_below_image(view: TableView) -> Mask:
 
 
 def is_carried(mask: Mask, view: TableView) -> bool:
-    """Whether something is seen, or may be hidden, that carries the region.
+    """Whether the region has a visible or possibly hidden support.
 
-    Nothing is asked of a region that comes near the table. Of a higher one the lower contour is looked at: below it
-    there must be the table, something that it touches, or something nearer to the camera that hides what carries it.
+    A region near the table passes. Below the lower contour of a higher one there must be the table, a surface that it
+    touches, or something nearer to the camera that may hide its support.
     """
     if float(np.percentile(view.heights[mask], 2)) < HANGING_M:
         return True

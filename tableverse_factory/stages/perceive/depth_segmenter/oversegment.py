@@ -1,4 +1,4 @@
-"""Over-segmentation along borders, then merging across the weakest ones: what is left apart are things."""
+"""Over-segmentation along borders, then merging across the weakest ones into objects."""
 
 import heapq
 from collections.abc import Iterator
@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from skimage.segmentation import watershed
 
 from schemas.geometry import IdImage, Mask
+from tableverse_factory.stages.perceive.depth_segmenter.object_filter import renumber_regions
 from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, measure_border, shift_image
 
 SEED_SPACING_M = 0.013
@@ -20,11 +21,11 @@ SHORT_BORDER = 2.0
 MAX_GAP_PX = 4
 
 Links = dict[int, dict[int, tuple[float, int]]]
-"""For each patch its neighbours, with the sum of the border's strength and its length [px]."""
+"""Neighbours of each patch, with the sum of the border's strength and its length [px]."""
 
 
 def oversegment(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
-    """Small patches that respect borders: a compact watershed from a regular grid of seeds. 0 outside `mask`."""
+    """Split the mask into small patches that respect borders by a compact watershed from a grid of seeds."""
     spacing = int(np.clip(round(SEED_SPACING_M / pitch_m), 6, 16))
     seeds = np.zeros(mask.shape, dtype=np.int32)
     grid = seeds[spacing // 2 :: spacing, spacing // 2 :: spacing]
@@ -36,10 +37,10 @@ def oversegment(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
 
 
 def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
-    """Patches merged, the weakest border first, until every border between two is strong along its whole length.
+    """Merge patches, the weakest border first, until every border is strong along its whole length.
 
     The strength of a border is its mean over all pixels along which the two regions touch, so that a short gap in a
-    crease does not join two things that have grown on either side of it; where large regions touch in a few pixels
+    crease does not join two objects that have grown on either side of it; where large regions touch in a few pixels
     only, it counts for more (`_compute_strength`).
     """
     links = _build_links(ids, surface)
@@ -67,11 +68,16 @@ def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
         for c, link in links[a].items():
             low, high = min(a, c), max(a, c)
             heapq.heappush(heap, (_compute_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
-    return _renumber(ids, into)
+    root = np.arange(len(into))
+    for k in range(len(into)):  # a patch only ever goes into one with a lower or equal final root: follow the chain
+        while into[root[k]] != root[k]:
+            root[k] = into[root[k]]
+    result: IdImage = root[ids].astype(np.int32)
+    return result
 
 
 def _compute_strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
-    """Mean strength of a border, raised where it is short for the size of the smaller region."""
+    """Compute the mean strength of a border, raised where it is short for the size of the smaller region."""
     total, length = link
     return float(total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length))
 
@@ -107,7 +113,7 @@ def _encode_pairs(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int6
 def _find_gap_links(
     ids: IdImage, surface: Surface, direction: tuple[int, int], count: int
 ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
-    """Borders along which a few pixels give no reading, as sensors do where the surface steps back."""
+    """Find borders across a few pixels without a reading, as sensors leave where the surface steps back."""
     nothing = surface.points[..., 2] == 0
     open_gap = np.ones(ids.shape, dtype=bool)
     for distance in range(2, MAX_GAP_PX + 1):
@@ -130,34 +136,19 @@ def _merge_links(links: Links, a: int, b: int) -> None:
     del links[a][b]
 
 
-def _renumber(ids: IdImage, into: list[int]) -> IdImage:
-    root = np.arange(len(into))
-    for k in range(len(into)):  # a patch only ever goes into one with a lower or equal final root: follow the chain
-        j = k
-        while into[j] != j:
-            j = into[j]
-        root[k] = j
-    result: IdImage = root[ids].astype(np.int32)
-    return result
-
-
 def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:
-    """Regions of at least `least_pixels`, numbered from 1, and every other pixel of `mask` given to one of them.
+    """Keep regions of at least `least_pixels`, numbered from 1, and attach every other pixel of `mask` to one of them.
 
-    The pixels along borders are too few to be a thing of their own. Each goes where the way over neighbouring pixels
-    has the smallest jump in depth (a minimum spanning forest); what no way reaches stays together as a region of its
-    own if it is large enough, else it is dropped. Shape (h, w), 0 elsewhere.
+    The pixels along borders are too few to be an object. Each goes where the path over neighbouring pixels has the
+    smallest jump in depth (a minimum spanning forest); unreachable ones form a region of their own if it is large
+    enough, else they are dropped. Shape (h, w), 0 elsewhere.
     """
-    sizes = np.bincount(ids.ravel())
-    large = np.flatnonzero(sizes >= least_pixels)
-    large = large[large > 0]
-    number = np.zeros(len(sizes), dtype=np.int64)
-    number[large] = np.arange(1, len(large) + 1)
-    cores = number[ids] * mask
-    nodes = np.where(mask & (cores == 0), np.cumsum(mask & (cores == 0)).reshape(mask.shape) + len(large), cores)
+    large = _keep_large(ids, least_pixels)
+    cores, n_large = large * mask, int(large.max(initial=0))
+    nodes = np.where(mask & (cores == 0), np.cumsum(mask & (cores == 0)).reshape(mask.shape) + n_large, cores)
     a, b, jump = _build_pixel_graph(nodes, mask, surface)
     count = int(nodes.max(initial=0)) + 1
-    roots = np.arange(1, len(large) + 1)
+    roots = np.arange(1, n_large + 1)
     graph = coo_array(
         (
             np.concatenate([jump, np.full(len(roots), 1e-12)]),
@@ -169,13 +160,13 @@ def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixel
     inner = (forest.row > 0) & (forest.col > 0)
     split = coo_array((forest.data[inner], (forest.row[inner], forest.col[inner])), shape=(count, count))
     _, trees = connected_components(split, directed=False)
-    return _number_trees(trees[nodes] * (nodes > 0) + (nodes > 0), least_pixels)
+    return _keep_large(trees[nodes] * (nodes > 0) + (nodes > 0), least_pixels)
 
 
 def _build_pixel_graph(
     nodes: Int64[np.ndarray, "h w"], mask: Mask, surface: Surface
 ) -> tuple[Int64[np.ndarray, " e"], Int64[np.ndarray, " e"], Float64[np.ndarray, " e"]]:
-    """Neighbouring nodes and the least jump in depth between them [m], each pair once."""
+    """Build the edges between neighbouring nodes with the least jump in depth [m], each pair once."""
     depth = surface.points[..., 2]
     first, second, jumps = [], [], []
     for rows, columns in DIRECTIONS:
@@ -192,11 +183,7 @@ def _build_pixel_graph(
     return a[once], b[once], jump[once]
 
 
-def _number_trees(trees: Int64[np.ndarray, "h w"], least_pixels: int) -> IdImage:
-    sizes = np.bincount(trees.ravel())
-    kept = np.flatnonzero(sizes >= least_pixels)
-    kept = kept[kept > 0]
-    number = np.zeros(len(sizes), dtype=np.int32)
-    number[kept] = np.arange(1, len(kept) + 1)
-    result: IdImage = number[trees]
-    return result
+def _keep_large(ids: Int64[np.ndarray, "h w"] | IdImage, least_pixels: int) -> IdImage:
+    """Renumber the ids with enough pixels from 1, in their order; the others become 0."""
+    kept = np.flatnonzero(np.bincount(ids.ravel()) >= least_pixels)
+    return renumber_regions(ids, kept[kept > 0].tolist())

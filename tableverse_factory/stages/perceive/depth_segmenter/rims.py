@@ -1,7 +1,7 @@
-"""Round rims of open vessels: level circles over which the picture looks into a hollow, and never through a wall.
+"""Round rims of open vessels: level circles over which the picture shows a hollow, and never looks through a wall.
 
-The near wall of a bowl is seen from outside and its far wall from inside, so that contents may part them in the
-picture altogether. What they share is the rim: one circle at one height.
+The near wall of a bowl is seen from outside and its far wall from inside, so that contents may separate them in the
+picture. They share the rim: one circle at one height.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from schemas.geometry import Frozen, IdImage, Mask
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.planes import Points2
-from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise
+from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise, expand_window
 
 UPWARDS_PX = 2
 MAX_CONTOUR = 250
@@ -42,11 +42,11 @@ class Rim(Frozen):
     """A level circle over the table, in the coordinates of `TableView.xy`.
 
     Attributes:
-        center: [m].
-        radius: [m].
-        height: Above the table [m].
-        floor: Height below which 5 % of what is seen inside lie [m].
-        sectors: How many of 36 directions show it.
+        center: Centre [m].
+        radius: Radius [m].
+        height: Height above the table [m].
+        floor: 5th percentile of the heights inside [m].
+        sectors: Number of the 36 directions in which it is visible.
         within: Pixels seen through its disc, below its height.
         window: Rows and columns with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around.
     """
@@ -60,12 +60,12 @@ class Rim(Frozen):
     window: tuple[slice, slice]
 
     def distance(self, xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
-        """How far from its axis [m]."""
+        """Compute the distance from its axis [m]."""
         return _compute_length(xy[..., 0] - self.center[0], xy[..., 1] - self.center[1])
 
 
 def find_rims(ids: IdImage, view: TableView) -> list[Rim]:
-    """The rims that the upper contours of the regions show, the most complete first, none twice."""
+    """Find the rims along the upper contours of the regions, the most complete first, without duplicates."""
     contour = _find_upper_contour(ids, view.valid)
     rows, columns = np.nonzero(contour)
     if len(rows) < MIN_CONTOUR:
@@ -94,7 +94,7 @@ Circle = tuple[float, float, float, float]
 
 
 def _find_upper_contour(ids: IdImage, valid: Mask) -> Mask:
-    """Pixels of regions above which, in the picture, another region or nothing is seen."""
+    """Find the pixels of regions with another region or none above them in the picture."""
     above = np.zeros_like(ids)
     above[UPWARDS_PX:] = ids[:-UPWARDS_PX]
     contour: Mask = (ids > 0) & (above != ids) & valid
@@ -105,7 +105,7 @@ def _find_upper_contour(ids: IdImage, valid: Mask) -> Mask:
 def _find_circle(
     xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float, rng: np.random.Generator
 ) -> Circle | None:
-    """The level circle through three points with which most others agree."""
+    """Find the level circle through three points with which most others agree (RANSAC)."""
     picks = rng.integers(0, len(xy), (TRIES, 3))
     a, b, c = xy[picks[:, 0]], xy[picks[:, 1]], xy[picks[:, 2]]
     level = np.ptp(heights[picks], axis=1) < 2 * tolerance
@@ -137,7 +137,7 @@ def _is_on_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"
 
 
 def _refine_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
-    """The circle of least squares (Kåsa 1976) through all contour points near it; None where they make none."""
+    """Fit a circle by least squares (Kåsa 1976) to all contour points near it; None where they form none."""
     near = _is_on_circle(circle, xy, heights, 1.5 * tolerance)
     if int(near.sum()) < MIN_CONTOUR:
         return None
@@ -153,7 +153,7 @@ def _refine_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n
 
 
 def _validate_rim(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h w 2"], view: TableView) -> Rim | None:
-    """The rim, if enough of the circle shows, a hollow is seen through it, no lid, and nothing beyond its walls."""
+    """Accept a rim if enough of it is visible, with a hollow inside, no lid, and nothing visible beyond its walls."""
     x, y, radius, height = circle
     turns = np.arctan2(shown_xy[:, 1] - y, shown_xy[:, 0] - x) / (2 * np.pi)
     sectors = len(np.unique(np.floor(turns * SECTORS)))
@@ -172,7 +172,7 @@ def _validate_rim(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h 
         return None
     within = seen & (view.heights < height) & ~through
     floor = float(np.percentile(view.heights[hollow], 5))
-    window = _window(within | (off < radius + BESIDE_M))
+    window = expand_window(within | (off < radius + BESIDE_M), BESIDE_PX)
     return Rim(np.array([x, y]), radius, height, floor, sectors, within, window)
 
 
@@ -183,17 +183,8 @@ def _compute_length(
     return length
 
 
-def _window(mask: Mask) -> tuple[slice, slice]:
-    """The box of a mask, a little wider."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return (
-        slice(max(int(rows[0]) - BESIDE_PX, 0), int(rows[-1]) + BESIDE_PX + 1),
-        slice(max(int(columns[0]) - BESIDE_PX, 0), int(columns[-1]) + BESIDE_PX + 1),
-    )
-
-
 def _measure_missing(circle: Circle, view: TableView) -> float:
-    """Share of the circle where the picture shows what lies behind it: nothing is there, and nothing hides it."""
+    """Measure the share of the circle where the picture shows what lies behind it, so that no wall is there."""
     x, y, radius, height = circle
     turns = np.linspace(0.0, 2 * np.pi, 2 * SECTORS, endpoint=False)
     level = np.full(len(turns), height + view.plane.offset)
@@ -211,7 +202,7 @@ def _measure_missing(circle: Circle, view: TableView) -> float:
 
 
 def _drop_duplicates(found: list[Rim]) -> list[Rim]:
-    """The most complete first, without those whose middle lies within one that is kept, at about its height."""
+    """Keep the most complete rims, without those whose centre lies within a kept one at about its height."""
     kept: list[Rim] = []
     for rim in sorted(found, key=lambda r: (-r.sectors, -r.radius)):
         if not any(

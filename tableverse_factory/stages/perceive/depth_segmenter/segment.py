@@ -50,7 +50,7 @@ def detect_from_depth(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
 ) -> DetectionResult:
-    """Every region of `segment` as a candidate without a name, the largest in the picture first."""
+    """Detect every region of `segment_depth` as an unnamed candidate, the largest in the picture first."""
     return to_detections(*segment_depth(view))
 
 
@@ -61,9 +61,9 @@ def segment_boxes_from_depth(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
 ) -> IdImage:
-    """For each box the regions that lie mostly in it and in no smaller box; else its part of the one it meets most.
+    """Assign to each box the regions mostly in it and in no smaller box; else its part of the one it overlaps most.
 
-    Of two boxes that want the same pixel the smaller one has it: contents lie in the box of their container.
+    Of two boxes with the same pixel the smaller one has it: contents lie in the box of their container.
     """
     regions, _ = segment_depth(view)
     sizes = np.bincount(regions.ravel())
@@ -83,7 +83,7 @@ def segment_boxes_from_depth(
 
 
 def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
-    """The things that stand on the table, and which lies in which.
+    """Segment the objects on the table, and find which contains which.
 
     Returns:
         Ids numbered from 1, the largest first, shape (h, w), 0 elsewhere; and for each id that lies in another's
@@ -114,7 +114,7 @@ def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
 
 
 def fill_holes(ids: IdImage) -> IdImage:
-    """The ids with small holes, such as lost readings leave, filled where only one id surrounds them."""
+    """Fill small holes, such as lost readings leave, where only one id surrounds them."""
     holes, count = ndimage.label(ids == 0)
     sizes = np.bincount(holes.ravel(), minlength=count + 1)
     result = ids.copy()
@@ -139,7 +139,7 @@ def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
 
 
 def _to_box(window: tuple[slice, slice] | None) -> PixelBox:
-    """The box of a part of the picture; all zero for an id that has none."""
+    """Convert a window to a box; all zero for an id without pixels."""
     if window is None:
         return 0.0, 0.0, 0.0, 0.0
     rows, columns = window
@@ -152,6 +152,5 @@ def _slice_box(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def _count_pixels(regions: IdImage, box: PixelBox, count: int) -> Int64[np.ndarray, " k"]:
-    """Pixels of each id inside the box."""
     counts: Int64[np.ndarray, " k"] = np.bincount(regions[_slice_box(box, regions.shape)].ravel(), minlength=count)
     return counts

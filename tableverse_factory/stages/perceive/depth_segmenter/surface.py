@@ -1,7 +1,7 @@
-"""The visible surface as depth shows it: normals, and where one thing ends and another begins.
+"""The visible surface: normals, and borders between objects.
 
-Two things meet where the surface steps back or where it bends inwards: a concave crease. A convex crease is the
-edge of one thing, and is no border (Stein et al. 2014, "Object partitioning using local convexity").
+Two objects meet where the surface steps back or at a concave crease. A convex crease is the edge of one object, and is
+no border (Stein et al. 2014, "Object partitioning using local convexity").
 """
 
 from dataclasses import dataclass
@@ -28,12 +28,12 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface(Frozen):
-    """What the depth image shows, smoothed.
+    """The smoothed surface of a depth image.
 
     Attributes:
-        points: Camera frame [m], shape (h, w, 3).
+        points: Points, camera frame [m]. Shape (h, w, 3).
         normals: Unit vectors towards the camera, zero where there are too few readings. Shape (h, w, 3).
-        borders: How much a pixel lies on a border between things: 0 not at all, 1 or more surely. Shape (h, w).
+        borders: Strength of the border between objects at each pixel: 0 for none, 1 or more for certain. Shape (h, w).
     """
 
     points: Float64[np.ndarray, "h w 3"]
@@ -42,7 +42,7 @@ class Surface(Frozen):
 
 
 def compute_surface(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Surface:
-    """The surface in a depth image, its scale set for things at `typical_depth_m` from the camera."""
+    """Compute the surface of a depth image, its scale set for objects at `typical_depth_m` from the camera."""
     pitch = typical_depth_m / camera.fx
     radius = int(np.clip(round(NORMAL_RADIUS_M / pitch), 2, 8))
     noise = compute_depth_noise(depth)
@@ -59,7 +59,7 @@ def compute_surface(depth: DepthImage, camera: Camera, typical_depth_m: float) -
 
 
 def measure_border(surface: Surface, first: Pixels, second: Pixels) -> Float64[np.ndarray, " n"]:
-    """How much of a border lies between pairs of pixels, as `Surface.borders`; 0 where a normal is not known."""
+    """Measure the border between pairs of pixels, as `Surface.borders`; 0 where a normal is unknown."""
     p, q, n, m = surface.points[first], surface.points[second], surface.normals[first], surface.normals[second]
     across = q - p
     step = np.minimum(np.abs(np.einsum("ij,ij->i", across, n)), np.abs(np.einsum("ij,ij->i", across, m)))
@@ -71,7 +71,7 @@ def measure_border(surface: Surface, first: Pixels, second: Pixels) -> Float64[n
 
 
 def shift_image(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """`result[y, x] = image[y + rows, x + columns]`, zero where that lies outside."""
+    """Shift an image: `result[y, x] = image[y + rows, x + columns]`, zero outside."""
     result = np.zeros_like(image)
     height, width = image.shape[:2]
     if abs(rows) >= height or abs(columns) >= width:
@@ -83,7 +83,7 @@ def shift_image(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
 
 
 def _smooth_depth(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
-    """Twice the mean over 3 x 3 pixels, without those that lie on another surface."""
+    """Average twice over 3 x 3 pixels, without those on another surface."""
     for _ in range(2):
         total, count = np.zeros_like(depth), np.zeros_like(depth)
         for rows in (-1, 0, 1):
@@ -99,7 +99,7 @@ def _smooth_depth(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, 
 def fit_normals(
     depth: Float64[np.ndarray, "h w"], camera: Camera, radius: int, reach: Float64[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "h w 3"]:
-    """Normals by regression over a disc of pixels: the inverse depth of a plane is linear in the pixel coordinates.
+    """Fit normals by regression over a disc of pixels: a plane's inverse depth is linear in the pixel coordinates.
 
     Args:
         depth: Depth [m], 0 where there is none. Shape (h, w).
@@ -151,7 +151,7 @@ def _has_normal(normals: Float64[np.ndarray, "h w 3"]) -> Mask:
 def _measure_concavity(
     points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"], radius: int
 ) -> Float64[np.ndarray, "h w"]:
-    """How much the normals lean towards each other across a pixel, at worst over four directions; 0 where convex.
+    """Measure how much the normals lean towards each other across a pixel, the most of four directions; 0 if convex.
 
     For a right-angled concave crease it is the square root of 2; beyond a step nothing is compared.
     """
@@ -173,7 +173,7 @@ def _measure_concavity(
 def _measure_steps(
     points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"]
 ) -> Float64[np.ndarray, "h w"]:
-    """How far the surface jumps at a pixel [m]: the points on either side lie off each other's tangent plane."""
+    """Measure the jump at a pixel [m]: the distance of the points on either side from each other's tangent plane."""
     known = _has_normal(normals)
     most = np.zeros(known.shape)
     for rows, columns in DIRECTIONS:

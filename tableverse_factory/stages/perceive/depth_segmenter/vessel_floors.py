@@ -1,4 +1,4 @@
-"""The floor of plates, pans and bowls: too near the table for depth to tell, so colour does."""
+"""Floors of plates, pans and bowls by colour: they are too near the table for depth."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,9 +27,9 @@ MIN_SECTORS = 8
 
 
 def find_floors(view: TableView) -> IdImage:
-    """Patches of the table plane that are no table by their colour, within the outline of what rises around them.
+    """Find patches of the table plane with another colour than the table, within the outline of what rises around them.
 
-    Numbered from 1; 0 elsewhere. A dark patch may be a shadow, so each is only a proposal: see `is_wall_of_floor`.
+    Numbered from 1; 0 elsewhere. A dark patch may be a shadow: each is a proposal, see `is_wall_of_floor`.
     """
     result = np.zeros(view.valid.shape, dtype=np.int32)
     inside = _find_inside_outlines(view)
@@ -51,7 +51,7 @@ def find_floors(view: TableView) -> IdImage:
 
 
 def _find_inside_outlines(view: TableView) -> Mask:
-    """Pixels of the plane that lie over the convex footprint of a connected part of what rises."""
+    """Find pixels of the plane over the convex footprint of a connected part of what rises."""
     inside = np.zeros(view.valid.shape, dtype=bool)
     parts, count = ndimage.label(view.raised)
     xy = view.xy(view.points_camera)
@@ -66,7 +66,7 @@ def _find_inside_outlines(view: TableView) -> Mask:
 
 
 def _find_unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
-    """Pixels whose colour is rarer on the table than all but a few per cent of the table's own pixels."""
+    """Find pixels whose colour is rarer on the table than all but a few per cent of the table's own pixels."""
     bins = np.floor((lab - np.array([0.0, -128.0, -128.0])) / np.array(LAB_BINS)).astype(np.int64)
     sizes = (int(100 / LAB_BINS[0]) + 2, int(256 / LAB_BINS[1]) + 2, int(256 / LAB_BINS[2]) + 2)
     index = np.ravel_multi_index(tuple(np.moveaxis(bins, -1, 0)), sizes, mode="clip")
@@ -96,7 +96,7 @@ def surrounds(walls_xy: Points2, center_xy: Float64[np.ndarray, "2"]) -> bool:
 
 
 def _build_chroma_histogram(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "44 44"]:
-    """Smoothed histogram of the colours without their lightness; sums to 1."""
+    """Build the smoothed histogram of a and b of CIELAB; sums to 1."""
     edges = np.arange(-132.0, 133.0, CHROMA_BIN)
     counts, _, _ = np.histogram2d(lab[:, 1], lab[:, 2], bins=(edges, edges))
     smooth: Float64[np.ndarray, "44 44"] = ndimage.gaussian_filter(counts, 0.7)

@@ -1,4 +1,4 @@
-"""Vessels by their rims: wall seen from outside, wall seen from inside, and floor are one thing, and hold others."""
+"""Vessels by their rims: outer wall, inner wall and floor are one object, which may contain others."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -33,21 +33,21 @@ UPRIGHT = 0.4
 HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3
 
 Distances = Float64[np.ndarray, "h w"]
-"""One to each pixel of a rim's window [m]."""
+"""A distance for each pixel of a rim's window [m]."""
 
 
 def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
-    """The regions with those made one that are the wall of one vessel, and contents cut off that had run into it.
+    """Merge the regions of each vessel's wall, and split off contents that were merged with it.
 
-    A vessel is round about the axis of its rim, so a pixel is its own or its contents' by where it lies (`_find_own_pixels`). A
-    region is the vessel's if most of its pixels are and some are at the rim.
+    A vessel is round about the axis of its rim, so the place of a pixel tells the vessel's from its contents'
+    (`_find_own_pixels`). A region is the vessel's if most of its pixels are and some are at the rim.
 
     Args:
         ids: The regions.
-        found: The rims that they show.
-        surface: Of the same view.
-        view: In which the regions are.
-        least: Pixels that a region of its own must have.
+        found: Their rims.
+        surface: Surface of the same view.
+        view: The view of the regions.
+        least: Least pixels of a region.
     """
     if not found:
         return ids
@@ -67,13 +67,13 @@ def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: T
 
 
 def _find_own_pixels(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
-    """Pixels of the rim's window that are the vessel's by where they lie: outside within its circle, inside its lining.
+    """Find the vessel's pixels in the rim's window by their place: outside within its circle, inside its lining.
 
     Args:
-        rim: The vessel's.
-        off: How far the pixels of its window are from its axis [m].
-        level: Pixels of its window whose surface is level.
-        view: Of the whole picture.
+        rim: The vessel's rim.
+        off: Distance of the window's pixels from its axis [m].
+        level: Pixels of the window whose surface is level.
+        view: The whole picture.
     """
     within, heights = rim.within[rim.window], view.heights[rim.window]
     beside = view.valid[rim.window] & (off < rim.radius + WALL_M) & (heights < rim.height + WALL_M)
@@ -83,7 +83,7 @@ def _find_own_pixels(rim: Rim, off: Distances, level: Mask, view: TableView) -> 
 
 
 def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
-    """What is seen of the vessel's inside: its floor, and at each height what is as far out as its wall there."""
+    """Find the visible inside of the vessel: its floor, and at each height what is as far out as its wall there."""
     within, steps = rim.within[rim.window], int(rim.height / STEP_M) + 1
     step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
     wall = np.zeros(steps + 1)
@@ -98,9 +98,9 @@ def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> M
 
 
 def _split_contents(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:
-    """Makes regions of their own of what is large enough and clearly content of a region that is vessel, too.
+    """Split large enough contents off regions that are also the vessel's, in place.
 
-    `own` and `over` are of the window `near`.
+    `own` and `over` are masks of the window `near`.
     """
     part_ids, largest = ids[near], int(ids.max(initial=0))
     vessel, content = (np.bincount(part_ids[mask], minlength=largest + 1) for mask in (own, ~own & over))
@@ -117,7 +117,7 @@ def _split_contents(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Ma
 
 
 def _find_walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
-    """Ids of the vessel's parts, the largest first."""
+    """Find the ids of the vessel's parts, the largest first."""
     near, count = ids[rim.window], int(ids.max(initial=0)) + 1
     sizes = np.bincount(ids[view.valid], minlength=count)
     at_rim = own & (np.abs(view.heights[rim.window] - rim.height) < 2 * WALL_M) & (off > rim.radius - WALL_M)
@@ -127,7 +127,7 @@ def _find_walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableVi
 
 
 def add_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
-    """The regions, and to each vessel what is seen inside its rim and belongs to nothing: its floor above all."""
+    """Add to each vessel the unassigned pixels inside its rim, its floor above all."""
     result, xy = ids.copy(), view.xy(view.points_camera)
     for rim in found:
         near, off = result[rim.window], rim.distance(xy[rim.window])
@@ -136,9 +136,9 @@ def add_insides(ids: IdImage, found: list[Rim], view: TableView) -> IdImage:
 
 
 def find_containers(ids: IdImage, found: list[Rim], view: TableView) -> dict[int, int]:
-    """What lies in what: in round vessels by their rims; in others, which no such vessel is in, by their outlines.
+    """Find the container of each region: round vessels by their rims, others, which contain no vessel, by outlines.
 
-    So no two things lie in each other: a vessel with a rim lies in none, and of two others the larger holds.
+    No two regions contain each other: a vessel with a rim lies in none, and of two others the larger is the container.
     """
     round_ones = find_vessels(ids, found, view)
     by_outline = {
@@ -148,10 +148,10 @@ def find_containers(ids: IdImage, found: list[Rim], view: TableView) -> dict[int
 
 
 def find_rim_contents(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
-    """For each region that stands in one of `find_vessels` or rises out of one, that; a vessel itself lies in none.
+    """Find the vessel, of `find_vessels`, of each region that stands in one or rises out of one.
 
-    What counts is where the lowest part that is seen stands: over the inside of the rim. What hides behind the wall
-    is lost to sight anywhere; what stands behind the vessel begins beyond the circle.
+    The lowest visible part decides: it stands over the inside of the rim. An object behind the vessel begins beyond
+    the circle. A vessel itself lies in none.
     """
     xy, holders = view.xy(view.points_camera), dict[int, int]()
     others = [k for k in range(1, int(ids.max(initial=0)) + 1) if k not in vessels]
@@ -166,7 +166,7 @@ def find_rim_contents(ids: IdImage, found: list[Rim], vessels: list[int], view: 
 
 
 def find_rising_contents(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
-    """The regions that stand in a vessel and reach well above its rim, as no wall of it does."""
+    """Find the regions that stand in a vessel and reach well above its rim, as no wall does."""
     vessels = find_vessels(ids, found, view)
     rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels, strict=True)}
     holders = find_rim_contents(ids, found, vessels, view)
@@ -175,13 +175,13 @@ def find_rising_contents(ids: IdImage, found: list[Rim], view: TableView) -> set
 
 
 def find_vessels(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
-    """The id of each rim's vessel; 0 where none shows it."""
+    """Find the id of each rim's vessel; 0 for none."""
     xy = view.xy(view.points_camera)
     return [_find_vessel(ids, rim, xy, view) for rim in found]
 
 
 def _find_vessel(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int:
-    """The id that shows most of the rim; 0 for none."""
+    """Find the id with most of the rim's pixels; 0 for none."""
     at_circle = np.abs(rim.distance(xy[rim.window]) - rim.radius) < WALL_M
     at_rim = at_circle & (np.abs(view.heights[rim.window] - rim.height) < WALL_M)
     near = ids[rim.window]
@@ -190,7 +190,7 @@ def _find_vessel(ids: IdImage, rim: Rim, xy: np.ndarray, view: TableView) -> int
 
 
 def _stands_in(seen: tuple[np.ndarray, ...], rim: Rim, xy: np.ndarray, view: TableView) -> bool:
-    """Whether what is seen of a region begins in the rim's opening, lies mostly over it, or points into it."""
+    """Whether the visible part of a region begins in the rim's opening, lies mostly over it, or points into it."""
     if not len(seen[0]):
         return False
     heights = view.heights[seen]
@@ -208,7 +208,7 @@ def _stands_in(seen: tuple[np.ndarray, ...], rim: Rim, xy: np.ndarray, view: Tab
 
 
 def _points_in(xy: Points2, heights: Float64[np.ndarray, " n"], rim: Rim) -> bool:
-    """Whether a long thing leans out of the rim: its axis, drawn on downwards, passes through the opening."""
+    """Whether a long object leans out of the rim: its axis, extended downwards, passes through the opening."""
     line = _fit_long_axis(xy, heights)
     if line is None or abs(line[1][2]) < UPRIGHT:
         return False
@@ -238,7 +238,7 @@ def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
 
 
 def _fit_long_axis(xy: Points2, heights: Float64[np.ndarray, " n"]) -> tuple[Vector3, Vector3, float] | None:
-    """The middle, the direction and about the breadth of a long thing; None for others."""
+    """Fit the middle, direction and approximate breadth of a long object; None for others."""
     if len(heights) < MIN_WALL_PX:
         return None
     points = np.column_stack([xy, heights])

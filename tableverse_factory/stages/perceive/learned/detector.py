@@ -1,7 +1,7 @@
-"""The `learned` detector: a small net, trained on our own synthetic depth, says which pixels are of one thing.
+"""The detector `learned`: a small network, trained on synthetic depth, groups pixels into objects.
 
-The idea of segmenting unseen objects from synthetic depth by votes for their centres is that of UOIS-Net-3D (Xie,
-Xiang, Mousavian and Fox, 2021); net, training and clustering are our own.
+Segmenting unseen objects by votes for their centres, learned from synthetic depth, follows UOIS-Net-3D (Xie, Xiang,
+Mousavian and Fox, 2021); network, training and clustering differ.
 """
 
 import numpy as np
@@ -44,17 +44,17 @@ def detect_with_network(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
 ) -> DetectionResult:
-    """Every thing that the net's votes agree on, as a candidate without a name, the largest in the picture first.
+    """Detect every object that the network's votes agree on as an unnamed candidate, the largest first.
 
     Raises:
-        ModelAccessError: if there is no net to ask.
-        ModelError: if it answers nonsense.
+        ModelAccessError: if there is no network.
+        ModelError: if its output is invalid.
     """
     return to_detections(*segment_with_network(view, load_net(config.detector_weights)))
 
 
 def segment_with_network(view: TableView, net: SegmentationNet) -> tuple[IdImage, dict[int, int]]:
-    """The things on the table, and which lies in which.
+    """Segment the objects on the table, and find which contains which.
 
     Returns:
         Ids numbered from 1, the largest first, shape (h, w), 0 elsewhere; and for each id that lies in another's
@@ -74,7 +74,7 @@ def segment_with_network(view: TableView, net: SegmentationNet) -> tuple[IdImage
 
 
 def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
-    """Points of the net's output that have a reading, and the thing of each from 1, 0 for none."""
+    """Compute the points of the network's output with a reading, and the object of each from 1, 0 for none."""
     table = compute_table_points(view)
     center = np.median(table[view.raised][:, :2], axis=0) if view.raised.any() else np.zeros(2)
     said = _run_network(net, compute_features(table, view.valid, center))
@@ -89,7 +89,7 @@ def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
 
 
 def compute_table_points(view: TableView) -> Points:
-    """The picture's points, x and y along the table, z above its plane [m]. Shape (h, w, 3)."""
+    """Compute the picture's points, x and y along the table, z above its plane [m]. Shape (h, w, 3)."""
     points: Points = np.concatenate([view.xy(view.points_camera), view.heights[..., None]], axis=-1)
     return points
 
@@ -100,7 +100,7 @@ def _run_network(net: SegmentationNet, inputs: Float32[np.ndarray, "7 h w"]) -> 
 
 
 def _remove_crumbs(ids: IdImage) -> IdImage:
-    """The ids without parts, of each, much smaller than its largest: strays that voted for something far away."""
+    """Remove parts much smaller than the largest of their id: strays that voted for a distant object."""
     result = ids.copy()
     for k in range(1, int(ids.max(initial=0)) + 1):
         parts, count = ndimage.label(ids == k, np.ones((3, 3)))
@@ -112,7 +112,7 @@ def _remove_crumbs(ids: IdImage) -> IdImage:
 
 
 def _spread_ids(view: TableView, points: Points, ids: IdImage) -> IdImage:
-    """The whole picture's pixels, each with the id of the voter nearest to it in space; 0 where there is none near."""
+    """Give each pixel of the picture the id of the nearest voter in space; 0 where none is near."""
     wanted: Mask = view.valid & (view.raised | (view.on_plane & (view.heights > LEAST_HEIGHT_M)))
     result = np.zeros(view.valid.shape, dtype=np.int32)
     if not len(points):

@@ -1,4 +1,4 @@
-"""What the learned segmenter sees of a picture: the same numbers in training and in use."""
+"""Input features of the learned segmenter, the same in training and in use."""
 
 from typing import Final
 
@@ -9,16 +9,16 @@ from scipy import ndimage
 from schemas.geometry import Mask
 
 FORMAT: Final = "tableverse-segmenter-1"
-"""In the metadata of the ONNX file: changes with the meaning of its input or output."""
+"""Format in the metadata of the ONNX file; changes with the meaning of its input or output."""
 CHANNELS: Final = 7
 OUTPUTS: Final = 4
 """Logit of being an object, then the offset to the object's centre in the table frame in units of `OFFSET_UNIT_M`."""
 MULTIPLE: Final = 16
-"""Height and width of the input are whole multiples of it."""
+"""Height and width of the input are multiples of it."""
 THINNING: Final = 2
 """Rows and columns of the input per row and column of the output, whose pixel k is the input's pixel 2k."""
 PIXELS: Final = 80_000
-"""Of the pictures that it is trained with, about; larger ones are thinned to it."""
+"""Approximate size of the training pictures; larger ones are thinned to it."""
 ALONG_UNIT_M: Final = 0.3
 HEIGHT_UNIT_M: Final = 0.15
 OFFSET_UNIT_M: Final = 0.1
@@ -28,12 +28,12 @@ _BOUND: Final = 4.0
 def compute_features(
     points_table: Float[np.ndarray, "h w 3"], valid: Mask, center_xy: Float[np.ndarray, "2"]
 ) -> Float32[np.ndarray, "7 h w"]:
-    """Place along the table, height, normal, and whether there is a reading; 0 where there is none.
+    """Compute position along the table, height, normal and validity; 0 where there is no reading.
 
     Args:
-        points_table: In axes whose z is height above the table plane [m].
-        valid: Where there is a reading.
-        center_xy: About which places are told: amid what stands on the table [m].
+        points_table: Points in axes whose z is the height above the table plane [m].
+        valid: Pixels with a reading.
+        center_xy: Origin of positions, amid the objects on the table [m].
     """
     result = np.zeros((CHANNELS, *valid.shape), dtype=np.float32)
     points = points_table.astype(np.float32)
@@ -47,7 +47,7 @@ def compute_features(
 
 
 def _compute_normals(points: Float32[np.ndarray, "h w 3"], valid: Mask) -> Float32[np.ndarray, "h w 3"]:
-    """Towards the camera, by differences of means over three pixels each way."""
+    """Compute normals towards the camera by differences of means over three pixels each way."""
     weight = np.maximum(ndimage.uniform_filter(valid.astype(np.float32), 3), 1e-6)
     smooth = ndimage.uniform_filter(points * valid[..., None], (3, 3, 1)) / weight[..., None]
     padded = np.pad(smooth, ((1, 1), (1, 1), (0, 0)), mode="edge")

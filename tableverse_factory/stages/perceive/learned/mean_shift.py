@@ -1,4 +1,4 @@
-"""Pixels that vote for the middle of their thing become things: mean shift over a grid of votes."""
+"""Clustering of pixels by their votes for the object's centre: mean shift over a grid of votes."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -13,13 +13,13 @@ ROUNDS = 12
 
 
 def cluster_votes(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
-    """Number of the thing of each vote from 0; -1 for those whose peak has too few.
+    """Cluster the votes: the cluster of each from 0, -1 for those whose peak has too few.
 
     The same votes in any order give the same clusters, numbered by falling size.
 
     Args:
-        votes: Where each pixel sees the middle of its thing, in the table frame [m].
-        least: Votes that make a thing.
+        votes: Centre that each pixel votes for, in the table frame [m].
+        least: Least votes of a cluster.
     """
     if not len(votes):
         return np.zeros(0, dtype=np.int64)
@@ -40,7 +40,7 @@ def cluster_votes(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
 
 
 def _climb(middles: Points, counts: Float64[np.ndarray, " c"]) -> Points:
-    """Where each cell comes to rest when it moves to the mean of the votes around it, again and again."""
+    """Move each cell repeatedly to the weighted mean of the votes around it."""
     tree, places = cKDTree(middles), middles
     for _ in range(ROUNDS):
         near = tree.query_ball_point(places, 2.5 * BANDWIDTH_M, return_sorted=True)
@@ -55,7 +55,7 @@ def _climb(middles: Points, counts: Float64[np.ndarray, " c"]) -> Points:
 
 
 def _merge_peaks(peaks: Points, counts: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
-    """Number of the thing of each cell: cells whose peaks lie together, the fullest cell's first."""
+    """Number the cells by peak: cells whose peaks lie together share a number, the fullest cell's first."""
     number = np.full(len(peaks), -1, dtype=np.int64)
     tree, count = cKDTree(peaks), 0
     for index in np.argsort(-counts, kind="stable"):

@@ -1,4 +1,4 @@
-"""The net of the `learned` detector: an ONNX file, run on one thread of the CPU."""
+"""Network of the detector `learned`: an ONNX file, run on one CPU thread."""
 
 import os
 from functools import cache
@@ -17,42 +17,42 @@ _KEY = "perceive.detector_weights"
 
 
 class SegmentationNet:
-    """A session of onnxruntime with one input and one output of the shapes that `learned_input` describes."""
+    """A session of onnxruntime with one input and one output as `compute_features` describes them."""
 
     def __init__(self, path: Path) -> None:
-        """Reads the file.
+        """Read the file.
 
         Raises:
-            ModelAccessError: without onnxruntime, or where the file is missing, or no net of `train segmenter`.
+            ModelAccessError: without onnxruntime, or if the file is missing or no network of `train segmenter`.
         """
         self._path = path
-        self._open_session = _open_session(path)
-        told = self._open_session.get_modelmeta().custom_metadata_map.get("format", "")
-        inputs, outputs = self._open_session.get_inputs(), self._open_session.get_outputs()
-        if told != FORMAT or len(inputs) != 1 or len(outputs) != 1 or inputs[0].shape[1:2] != [CHANNELS]:
+        self._session = _open_session(path)
+        file_format = self._session.get_modelmeta().custom_metadata_map.get("format", "")
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if file_format != FORMAT or len(inputs) != 1 or len(outputs) != 1 or inputs[0].shape[1:2] != [CHANNELS]:
             raise ModelAccessError(f"{_KEY} = {str(path)!r} is another net: give one of `tableverse train segmenter`")
         self._input = inputs[0].name
 
     def __call__(self, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
-        """What it says of a picture.
+        """Run the network.
 
         Raises:
-            ModelError: if it cannot be run, or says something of another shape, or what is no number.
+            ModelError: if it cannot be run, or its output has another shape or is not finite.
         """
         try:
-            said = self._open_session.run(None, {self._input: inputs[None]})[0]
+            output = self._session.run(None, {self._input: inputs[None]})[0]
         except Exception as error:  # onnxruntime's errors have no common base
             raise ModelError(f"{self._path.name} cannot be run: {_shorten_error(error)}") from error
         wanted = (1, OUTPUTS, inputs.shape[1] // THINNING, inputs.shape[2] // THINNING)
-        if said.shape != wanted or said.dtype != np.float32 or not np.isfinite(said).all():
-            raise ModelError(f"{self._path.name} answers {said.dtype} of shape {said.shape}; {wanted} is wanted")
-        result: Float32[np.ndarray, "4 h2 w2"] = said[0]
+        if output.shape != wanted or output.dtype != np.float32 or not np.isfinite(output).all():
+            raise ModelError(f"{self._path.name} answers {output.dtype} of shape {output.shape}; {wanted} is wanted")
+        result: Float32[np.ndarray, "4 h2 w2"] = output[0]
         return result
 
 
 @cache
 def load_net(weights: str) -> SegmentationNet:
-    """The net in this file, read once per process.
+    """Load the network in this file, once per process.
 
     Raises:
         ModelAccessError: see `SegmentationNet`.

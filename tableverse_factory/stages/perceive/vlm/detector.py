@@ -1,4 +1,4 @@
-"""The detectors `openai` and `gemini`: a model behind an address is shown the picture and names what stands in it."""
+"""The detectors `openai` and `gemini`: a model at an address names and boxes the objects in the picture."""
 
 import io
 
@@ -28,7 +28,7 @@ from tableverse_factory.stages.perceive.vlm.prompt import (
 )
 
 MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
-"""Bounds of the longer side of the picture that is sent. Above 1000, boxes in pixels reach beyond normalised ones."""
+"""Bounds of the longer side of the picture sent [px]. Above 1000, boxes in pixels differ from normalised ones."""
 
 _JPEG_QUALITY = 92
 
@@ -39,13 +39,13 @@ def detect_with_vlm(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,
 ) -> DetectionResult | Dropped:
-    """What the model sees, by the rules of appendix A; boxes without masks.
+    """Detect objects with the model, by the rules of the paper's appendix A; boxes without masks.
 
-    Drops: `detector_answer_invalid` (no answer of use, also after a round of repair), `detector_answer_refused` (the
-    model will not look at this picture), `no_table_detected`.
+    Drops: `detector_answer_invalid` (no usable answer, also after a round of repair), `detector_answer_refused` (the
+    model refuses this picture), `no_table_detected`.
 
     Raises:
-        ModelAccessError: if a person must act: key, permission, credit.
+        ModelAccessError: if key, permission or credit is missing.
         ModelError: if the server does not answer.
     """
     try:
@@ -59,11 +59,11 @@ def detect_with_vlm(
 
 
 def request_detections(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
-    """The model's answer for a picture, after the rules. It may hold no table; then it holds nothing of use.
+    """Request the model's answer for a picture and apply the rules; without a table it is unusable.
 
     Raises:
-        AnswerInvalidError: if it is no answer, also after a round of repair, or the model refuses.
-        ModelAccessError, ModelError: see `asked`.
+        AnswerInvalidError: if the answer is unusable, also after a round of repair, or the model refuses.
+        ModelAccessError, ModelError: see `detect_with_vlm`.
     """
     order = choose_box_order(config)
     picture, sent = encode_image(color)
@@ -78,7 +78,7 @@ def request_detections(color: Picture, config: PerceiveConfig, services: Service
 
 
 def encode_image(color: Picture) -> tuple[bytes, ImageSize]:
-    """The picture as it is sent, its longer side within the bounds, and its width and height."""
+    """Encode the picture as JPEG, its longer side within the bounds; also return its width and height."""
     picture = Image.fromarray(np.ascontiguousarray(color))
     longer = max(picture.size)
     wanted = min(max(longer, MIN_SIDE_PX), MAX_SIDE_PX)

@@ -1,4 +1,4 @@
-"""The box that explains an object best: upright on its support, or leaning."""
+"""Fit of a box that stands upright on the object's support."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ MIN_SIDE_M = 0.003
 CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
 PRIOR_M = 2e-4
-"""Weight of the prior on sides that the picture leaves open: small against a single pixel column of evidence."""
+"""Weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,8 +26,8 @@ class SolidBox(Frozen):
     """A box in the table frame.
 
     Attributes:
-        pose: Frame in its middle, along its sides.
-        half_size: [m].
+        pose: Frame at its centre, along its sides.
+        half_size: Half of each side [m].
         misfit: Mean disagreement with the picture [m].
     """
 
@@ -37,7 +37,7 @@ class SolidBox(Frozen):
 
 
 def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
-    """The best box that stands flat on the object's support.
+    """Fit the best box that stands flat on the object's support.
 
     Raises:
         GeometryError: if the points span no area.
@@ -47,14 +47,14 @@ def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
 
 
 def build_box_mesh(box: SolidBox) -> TriangleMesh:
-    """The box in its own frame, its faces divided so that vertex colours can show a picture."""
+    """Build the box in its own frame, its faces divided so that vertex colours can show the picture."""
     size = 2 * box.half_size
     solid = manifold3d.Manifold.cube(tuple(float(s) for s in size), True)
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
 
 
 def _propose_yaws(view: ObjectView) -> list[float]:
-    """Headings modulo a quarter turn: of the smallest rectangle, and of the upright faces' normals."""
+    """Propose headings modulo a quarter turn: of the smallest rectangle, and of the upright faces' normals."""
     yaws = [fit_min_rectangle(view.points[:, :2]).yaw]
     sideways = np.abs(view.normals[:, 2]) < 0.4
     if sideways.sum() > 20:
@@ -90,7 +90,7 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
 
 
 def _penalize_uncarried(view: ObjectView, pose: Pose, half: Vector3) -> float:
-    """Price of what stands on the object and is not above the box: it hides how far the box goes on [m]."""
+    """Compute the penalty for what stands on the object but not above the box, which hides the box's extent [m]."""
     carried = view.support.carried
     if len(carried) == 0:
         return 0.0
@@ -99,6 +99,6 @@ def _penalize_uncarried(view: ObjectView, pose: Pose, half: Vector3) -> float:
 
 
 def _decode_box(x: Float64[np.ndarray, "6"], support_z: float) -> tuple[Pose, Vector3]:
-    """Centre x and y, logarithms of the sides, yaw: as a pose and half sizes."""
+    """Decode centre x and y, logarithms of the sides and yaw to a pose and half sizes."""
     half = np.clip(np.exp(x[2:5]), MIN_SIDE_M, 2.0) / 2
     return Pose(np.array([x[0], x[1], support_z + half[2]]), quaternion_about_z(float(x[5]))), half

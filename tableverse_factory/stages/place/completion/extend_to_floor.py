@@ -1,4 +1,4 @@
-"""Long things that lean in a container: the hidden end is drawn out to the floor."""
+"""Extension of long objects that lean in a container: the hidden end is drawn out to the floor."""
 
 import numpy as np
 from manifold3d import Manifold
@@ -9,7 +9,7 @@ from tableverse_factory.geometry.math.transforms import invert_pose, transform_p
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
 
 END_SHARE = 0.15
-"""Part of the length over which the thickness of the lower end is measured."""
+"""Share of the length over which the thickness of the lower end is measured."""
 RADIUS_RANGE_M = (0.002, 0.008)
 MIN_GAP_M = 0.008
 MIN_SLOPE = 0.4
@@ -17,9 +17,9 @@ OVERLAP_M = 0.01
 
 
 def extend_to_floor(mesh: TriangleMesh, pose: Pose, points: Points, support_z: float) -> TriangleMesh:
-    """The mesh, reaching down to `support_z` along the direction in which its points spread; in its own frame.
+    """Extend the mesh down to `support_z` along the direction in which its points spread; in its own frame.
 
-    Unchanged where it reaches there already, or lies too flat to say where its end would be.
+    Unchanged where it reaches there already, or is too flat to tell where its end would be.
     """
     vertices = transform_points(pose, mesh.vertices)
     gap = float(vertices[:, 2].min()) - support_z
@@ -46,7 +46,7 @@ def extend_to_floor(mesh: TriangleMesh, pose: Pose, points: Points, support_z: f
 
 
 def _find_downward_axis(points: Points) -> Vector3:
-    """The direction in which the points spread most, pointing down."""
+    """Find the direction in which the points spread most, pointing down."""
     _, _, directions = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     down: Vector3 = -directions[0] if directions[0, 2] > 0.0 else directions[0]
     return down

@@ -1,4 +1,4 @@
-"""How wide a flat shape is at each of its cells."""
+"""Local width of a flat shape."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,7 +10,7 @@ LEVELS = 12
 
 
 def compute_half_width(inside: Cells) -> Cells:
-    """Radius of the largest disc within the shape that covers each cell.
+    """Compute the radius of the largest disc within the shape that covers each cell.
 
     Args:
         inside: Distance of each cell to the shape's border, 0 outside [cells].

@@ -1,4 +1,4 @@
-"""The box that explains an object best when it does not stand flat: a leaning book, a cube on its edge."""
+"""Fit of a box that does not stand flat: a leaning book, a cube on its edge."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -20,14 +20,14 @@ NORMALS = 400
 AGREE_COS = 0.965
 MIN_SECOND_SHARE = 0.08
 THICKNESS_M = 0.008
-"""A hidden side starts with this much."""
+"""Initial length of a hidden side [m]."""
 SINK_WEIGHT = 0.2
-"""Price of the corners that lie below the support, against rays that disagree."""
+"""Weight of corners below the support, against the misfit of rays."""
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
 def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
-    """The best box in any orientation, started along the faces that the normals show.
+    """Fit the best box in any orientation, started along the faces that the normals show.
 
     Raises:
         GeometryError: if the points span no area.
@@ -59,14 +59,14 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
 
 
 def _decode_box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> tuple[Pose, Vector3]:
-    """Centre, logarithms of the sides, small turn: as a pose and half sizes."""
+    """Decode centre, logarithms of the sides and a small turn to a pose and half sizes."""
     turn = normalize_quaternion(np.concatenate([[1.0], x[6:9] / 2]))
     half = np.clip(np.exp(x[3:6]), MIN_SIDE_M, 2.0) / 2
     return Pose(x[:3], normalize_quaternion(multiply_quaternions(base, turn))), half
 
 
 def _estimate_axes(view: ObjectView) -> Matrix3:
-    """Three orthogonal directions as columns: the normal shared by most points, then the next across it."""
+    """Estimate three orthogonal axes as columns: the normal shared by most points, then the next across it."""
     step = max(1, len(view.normals) // NORMALS)
     normals = view.normals[::step]
     agreement = np.abs(normals @ normals.T) > AGREE_COS
@@ -79,18 +79,13 @@ def _estimate_axes(view: ObjectView) -> Matrix3:
         angles = np.arctan2(across @ up, across @ side)
         turn = float(np.angle(np.exp(4j * angles).mean()) / 4)
     else:
-        turn = _outline_yaw(view.points, side, up)
+        turn = fit_min_rectangle(np.stack([view.points @ side, view.points @ up], axis=1)).yaw
     second = np.cos(turn) * side + np.sin(turn) * up
     return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
 def _average_direction(normals: Points) -> Vector3:
-    """The common direction of normals whose signs may differ."""
+    """Average the direction of normals whose signs may differ."""
     _, vectors = np.linalg.eigh(normals.T @ normals)
     direction: Vector3 = vectors[:, 2]
     return direction
-
-
-def _outline_yaw(points: Points, side: Vector3, up: Vector3) -> float:
-    """Heading, within a plane, of the smallest rectangle around the points."""
-    return fit_min_rectangle(np.stack([points @ side, points @ up], axis=1)).yaw

@@ -1,4 +1,4 @@
-"""The half section of a surface of revolution: carved by free space over all azimuths, with the cavity seen."""
+"""Profile curve of a surface of revolution, carved by free space over all azimuths, with its observed cavity."""
 
 from dataclasses import dataclass, replace
 
@@ -24,17 +24,17 @@ DETAIL_M = 0.0002
 HIDDEN_SHARE = 0.3
 SWELLINGS = (0.0, 0.4, 0.8)
 NOISY_HOLLOW_SHARE = 0.25
-"""Part of the height that a cavity must have to be believed in noise."""
+"""Least depth of a cavity in noise, as a share of the height."""
 
 BORED_SHARE = 0.6
-"""A cavity at most this part as wide as the body is a hole in a solid; a wider one has a wall around it."""
+"""Widest hole in a solid as a share of the body's width; a wider cavity has a wall around it."""
 LID_WIDTH, LID_DEPTH, LID_POINTS = 0.6, 0.25, 20
-"""The middle of a mouth, as part of its radius; how far below the rim a lid may be, as part of the cavity's depth; and
-how many points of it have to be seen. A wall that slants from the middle of the floor to the rim is no lid."""
+"""Middle of a mouth as a share of its radius; depth of a lid below the rim as a share of the cavity's; and least points
+of a lid. A wall that slants from the middle of the floor to the rim is no lid."""
 FOOT_RING_M = 0.0025
-"""Least width of the ring on which a floor above the support stands."""
+"""Least width of the ring on which a floor above the support stands [m]."""
 HOLLOW_FOOT_M = (0.0008, 0.008)
-"""Gaps below a floor that are hollow: narrower ones are filled, taller ones are something else than a foot ring."""
+"""Range of hollow gaps below a floor [m]: narrower ones are filled, taller ones are no foot ring."""
 
 Field = Float64[np.ndarray, "nr nz"]
 Cells = Bool[np.ndarray, "nr nz"]
@@ -46,10 +46,10 @@ class _Votes(Frozen):
     """A field over distance from the axis and height along it.
 
     Attributes:
-        field: Mean signed distance to the surface where azimuths were seen [m], positive inside; NaN elsewhere.
-        hidden: Cells that were not seen because something else stands before or in the object.
+        field: Mean signed distance to the surface over the observed azimuths [m], positive inside; else NaN.
+        hidden: Cells hidden by another object.
         cell: Spacing [m]; sample (i, k) lies at distance (i + 1/2) cell and height bottom + (k + 1/2) cell.
-        bottom: [m].
+        bottom: Height of the bottom [m].
         band: Clamp of the field [m].
     """
 
@@ -61,7 +61,7 @@ class _Votes(Frozen):
 
 
 def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
-    """The section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
+    """Fit the section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
     points = transform_points(invert_pose(axis), view.points)
     normals = view.normals @ rotation_matrix(axis.quaternion_wxyz)
     profile = np.stack([np.linalg.norm(points[:, :2], axis=1), points[:, 2]], axis=1)
@@ -88,7 +88,7 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
 
 
 def _collect_votes(view: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
-    """Where each ring of the solid was seen, over all azimuths."""
+    """Average the observed free space of each ring over all azimuths."""
     low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
     upright = axis.quaternion_wxyz[0] > 1.0 - 1e-9
     bottom = min(view.support_z - axis.position[2], top - 0.003) if upright else low
@@ -117,7 +117,7 @@ def _collect_votes(view: ObjectView, axis: Pose, profile: Profile) -> _Votes | N
 
 
 def _find_cavity_cells(votes: _Votes, least: float) -> Cells | None:
-    """The empty cells of a cavity that opens upward around the axis; None where none is `least` deep [m]."""
+    """Find the empty cells of a cavity that opens upward around the axis; None where none is `least` deep [m]."""
     solid = votes.field > 0.0
     rows = np.flatnonzero(solid.any(axis=0))
     if len(rows) == 0:
@@ -141,7 +141,7 @@ def _find_cavity_cells(votes: _Votes, least: float) -> Cells | None:
 
 
 def _measure_wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
-    """Thickness of a wall that was seen from both sides [m], measured across it; a usual one where it was not."""
+    """Measure the thickness of a wall seen from both sides [m], across it; a usual one for others."""
     slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
     found: list[float] = []
     for k in np.unique(slices):
@@ -163,7 +163,7 @@ def _build_thin_wall(
     wall: float,
     swelling: float,
 ) -> tuple[CrossSection, CrossSection]:
-    """Outer surface where it was seen, else a wall around the cavity; a foot below; the cavity taken out."""
+    """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
     outer = _find_outer_profile(profile, outward)
     completed, floor_z = _complete_cavity(votes, cavity, outer, wall)
     hole = _build_cavity(votes, completed, swelling)
@@ -191,7 +191,7 @@ def _build_thin_wall(
 
 
 def _has_lid(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
-    """Whether the middle of the mouth was seen to be closed: what hides most of a can leaves votes for a cavity."""
+    """Whether the middle of the mouth was seen to be closed: an occluder of a can leaves votes for a cavity."""
     rows = np.flatnonzero(cavity.any(axis=0))
     mouth = votes.cell * float(cavity[:, max(int(rows[-1]) - 3, 0) : int(rows[-1]) + 1].sum(axis=0).max())
     rim, depth = votes.bottom + votes.cell * (int(rows[-1]) + 1), votes.cell * (int(rows[-1]) + 1 - int(rows[0]))
@@ -206,19 +206,19 @@ def _is_bored(votes: _Votes, cavity: Cells) -> bool:
 
 
 def _build_solid(votes: _Votes) -> CrossSection:
-    """The largest section that the votes allow: what was not seen is solid."""
+    """Build the largest section that the votes allow: what was not seen is solid."""
     return _trace_outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
 
 
 def _build_cavity(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
-    """The section of a cavity, open at the top."""
+    """Build the section of a cavity, open at the top."""
     inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
     inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
     return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
 
 
 def _find_outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
-    """Distance of the outer surface by height, from slices in which it was seen; lowest first."""
+    """Find the distance of the outer surface by height, from slices in which it was seen, lowest first."""
     slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
     outer = outward > 0.3
     rows = [k for k in np.unique(slices[outer]) if (outer & (slices == k)).sum() >= 5]
@@ -226,7 +226,7 @@ def _find_outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) ->
 
 
 def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) -> tuple[Cells, float]:
-    """The cavity with the cells that its own wall hid, down to the floor seen, else to one wall above the bottom."""
+    """Complete the cavity by cells that its own wall hid, down to the visible floor or to a wall above the bottom."""
     nr = cavity.shape[0]
     unknown = np.isnan(votes.field)
     rows = np.flatnonzero(cavity.any(axis=0))
@@ -258,7 +258,7 @@ def _touches_wall(votes: _Votes, cavity: Cells, row: int) -> bool:
 
 
 def _trace_outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSection:
-    """The largest region of positive (or, for a cavity open at the top, negative) cells as a section [m]."""
+    """Trace the largest region of positive (or, for a cavity open at the top, negative) cells as a section [m]."""
     inside = -field if open_top else field
     nr = inside.shape[0]
     if open_top:
@@ -280,7 +280,7 @@ def _trace_outline(field: Field, votes: _Votes, *, open_top: bool = False) -> Cr
 
 
 def _fill_profile(outer: Profile) -> CrossSection:
-    """All within the outer profile, over the heights where it was seen."""
+    """Fill the outer profile over the heights where it was seen."""
     section = CrossSection()
     for run in np.split(outer, np.flatnonzero(np.diff(outer[:, 1]) > 3.5 * SLICE_M) + 1):
         right = np.vstack([[run[0, 0], run[0, 1] - SLICE_M / 2], run, [run[-1, 0], run[-1, 1] + SLICE_M / 2]])

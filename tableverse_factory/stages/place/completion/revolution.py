@@ -1,4 +1,4 @@
-"""The surface of revolution that explains an object best."""
+"""Fit of a surface of revolution, with handles."""
 
 from dataclasses import dataclass
 
@@ -14,16 +14,16 @@ from tableverse_factory.stages.place.completion.revolution_axis import propose_a
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MAX_SPREAD_M = 0.0025
-"""An axis from which the points of a slice lie at distances that spread more is no axis."""
+"""Most spread of the distances of a slice's points from an axis [m]."""
 SEGMENTS = 40
 MAX_FACES = 3200
 TOLERANCE_M = 0.00005
 AXIS_FREEDOM_M = (0.0, 1e-4, 3e-4)
-"""Prices of an upright, a lying and a free axis: of shapes that explain a ball, the upright one is taken."""
+"""Costs of an upright, a lying and a free axis [m]: of shapes that fit a ball, the upright one wins."""
 HANDLE_FREEDOM = 0.2
-"""Price of handles by what they explain: they mend a nearly right body, they do not save a wrong one."""
+"""Cost of handles as a share of the misfit that they remove: they complete a good body, not a wrong one."""
 WORTH_HANDLES_M = 0.004
-"""Beyond this disagreement the body is wrong, and what it leaves unexplained is no handle."""
+"""Misfit from which the body is wrong and the rest is no handle [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,30 +31,30 @@ class Revolution(Frozen):
     """A solid of revolution in the table frame.
 
     Attributes:
-        mesh: In its own frame, z along the axis, the origin in the middle of its box; handles included.
+        mesh: Mesh in its own frame, z along the axis, the origin at the centre of its box; with handles.
         pose: Its own frame in the table frame.
         hollow: Whether it has a cavity that opens upward.
-        price: Mean disagreement with the picture [m], and more for a free axis and for handles.
+        cost: Misfit, plus costs of a free axis and of handles [m].
     """
 
     mesh: TriangleMesh
     pose: Pose
     hollow: bool
-    price: float
+    cost: float
 
 
 def fit_revolution(view: ObjectView, rays: RaySample) -> Revolution | None:
-    """The best over the candidate axes, or None where none gives a solid."""
+    """Fit the best over the candidate axes; None where none gives a solid."""
     found = [
         fit_about_axis(view, rays, axis, freedom)
         for (axis, spread), freedom in zip(propose_axes(view), AXIS_FREEDOM_M, strict=False)
         if spread < MAX_SPREAD_M
     ]
-    return min((fit for fit in found if fit is not None), key=lambda fit: fit.price, default=None)
+    return min((fit for fit in found if fit is not None), key=lambda fit: fit.cost, default=None)
 
 
 def fit_about_axis(view: ObjectView, rays: RaySample, axis: Pose, freedom: float = 0.0) -> Revolution | None:
-    """The solid about one axis (a frame with z along it); None where free space leaves nothing of it."""
+    """Fit the solid about one axis (a frame with z along it); None where free space leaves nothing of it."""
     sections = fit_profile(view, axis)
     if sections is None:
         return None
@@ -63,21 +63,21 @@ def fit_about_axis(view: ObjectView, rays: RaySample, axis: Pose, freedom: float
     if body.is_empty():
         return None
     bare = _to_frame(body, axis)
-    price = compute_misfit(rays, cast_on_mesh(rays, bare, axis))
+    cost = compute_misfit(rays, cast_on_mesh(rays, bare, axis))
     hollow = not sections[1].is_empty()
-    if price < WORTH_HANDLES_M:
+    if cost < WORTH_HANDLES_M:
         hole = Manifold.revolve(sections[1], SEGMENTS).transform(to_table) if hollow else None
         whole = simplify_solid(add_handles(view, body, hole), MAX_FACES, TOLERANCE_M)
         mesh = _to_frame(whole, axis)
         better = compute_misfit(rays, cast_on_mesh(rays, mesh, axis))
-        if better < price:
-            bare, price = mesh, better + HANDLE_FREEDOM * (price - better)
+        if better < cost:
+            bare, cost = mesh, better + HANDLE_FREEDOM * (cost - better)
     middle = (bare.vertices.min(axis=0) + bare.vertices.max(axis=0)) / 2
     pose = Pose(transform_points(axis, middle[None])[0], axis.quaternion_wxyz)
-    return Revolution(TriangleMesh(bare.vertices - middle, bare.faces), pose, hollow, price + freedom)
+    return Revolution(TriangleMesh(bare.vertices - middle, bare.faces), pose, hollow, cost + freedom)
 
 
 def _to_frame(solid: Manifold, axis: Pose) -> TriangleMesh:
-    """A solid of the table frame in the frame of its axis."""
+    """Convert a solid of the table frame to the frame of its axis."""
     mesh = from_manifold(solid)
     return TriangleMesh(transform_points(invert_pose(axis), mesh.vertices), mesh.faces)

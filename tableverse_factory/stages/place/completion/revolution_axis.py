@@ -22,13 +22,13 @@ SLICES = 24
 WORST_SPREAD_M = 0.01
 UPRIGHT_COS = 0.998
 KEPT_SHARE = 0.8
-"""Part of the points that has to agree: the rest may be a handle."""
+"""Share of the points that has to agree: the rest may be a handle."""
 
 
 def propose_axes(view: ObjectView) -> list[tuple[Pose, float]]:
-    """Frames with z along a possible axis: upright, lying along the object, and where the normals point.
+    """Propose frames with z along a possible axis: upright, lying along the object, and by the normals.
 
-    Beside each the mean spread of the points' distances from the axis within slices across it [m].
+    Each comes with the mean spread of the points' distances from the axis within slices across it [m].
     """
     step = max(1, len(view.points) // FIT_POINTS)
     points, normals = view.points[::step], view.normals[::step]
@@ -40,14 +40,14 @@ def propose_axes(view: ObjectView) -> list[tuple[Pose, float]]:
 
 
 def _find_long_direction(points: Points) -> Vector3:
-    """The horizontal direction along which the points spread most."""
+    """Find the horizontal direction along which the points spread most."""
     flat = points[:, :2] - points[:, :2].mean(axis=0)
     _, vectors = np.linalg.eigh(flat.T @ flat)
     return np.array([vectors[0, 1], vectors[1, 1], 0.0])
 
 
 def _fit_normal_line(points: Points, normals: Points) -> Vector3 | None:
-    """Direction of the line that all normals meet, outliers weighted down; None where that is undecided."""
+    """Fit the direction of the line that all normals meet, outliers weighted down; None where it is undecided."""
     middle = points.mean(axis=0)
     size = float(np.abs(points - middle).max())
     rows = np.concatenate([np.cross((points - middle) / size, normals), normals], axis=1)
@@ -65,7 +65,7 @@ def _fit_normal_line(points: Points, normals: Points) -> Vector3 | None:
 
 
 def _fit_axis_position(points: Points, normals: Points, direction: Vector3) -> Pose:
-    """The line of this direction that the normals meet best (least squares, outliers weighted down)."""
+    """Fit the line of this direction that the normals meet best (least squares, outliers weighted down)."""
     frame = _build_frame(points.mean(axis=0), direction)
     rotation = rotation_matrix(frame.quaternion_wxyz)
     local, turned = ((points - frame.position) @ rotation)[:, :2], (normals @ rotation)[:, :2]
@@ -83,7 +83,7 @@ def _fit_axis_position(points: Points, normals: Points, direction: Vector3) -> P
 
 
 def _refine_axis(points: Points, normals: Points, axis: Pose) -> tuple[Pose, float]:
-    """Moves the axis sideways until the points of each slice lie at one distance from it; the spread left [m]."""
+    """Move the axis sideways until the points of each slice lie at one distance from it; return the spread left [m]."""
     local = transform_points(invert_pose(axis), points)
     turned = normals @ rotation_matrix(axis.quaternion_wxyz)
     side = np.linalg.norm(turned[:, :2], axis=1) > 0.5
@@ -114,7 +114,7 @@ def _shift_axis(axis: Pose, center: Float64[np.ndarray, "2"]) -> Pose:
 
 
 def _build_frame(origin: Vector3, direction: Vector3) -> Pose:
-    """A frame with z along `direction`, upward, and x horizontal."""
+    """Build a frame with z along `direction`, upward, and x horizontal."""
     z = direction if direction[2] >= 0.0 else -direction
     x = np.cross(z, [0.0, 0.0, 1.0])
     x = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(x) < 1e-9 else x / np.linalg.norm(x)

@@ -1,11 +1,11 @@
-"""The embedded default MeshModel: the simplest of five kinds of shape that explains the picture."""
+"""The mesh model `carved`: the simplest of five kinds of shape that explains the picture."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import Frozen, Pose, TriangleMesh
+from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
@@ -19,31 +19,20 @@ from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 BOX_DISCOUNT_M = 0.0008
-"""Flat faces carry the whole error of a depth camera: a free shape follows it, a box must not pay for it."""
+"""Most misfit forgiven to boxes [m]: flat faces carry the whole error of a depth camera, which a free shape follows."""
 BOX_DISCOUNT = 0.4
-
-
 HOLLOW_BONUS_M = 0.0012
-"""A cavity seen is evidence of its own: a thin wall in noise must not lose against a solid that follows the noise."""
+"""Bonus of an observed cavity [m]: a thin wall in noise must not lose against a solid that follows the noise."""
 UNAVOIDABLE_M = 0.0003
-"""Even the true shape disagrees by about this much: a kind whose freedom alone costs more is not tried."""
+"""Misfit of even the true shape [m]: a kind whose freedom alone costs more is not tried."""
 
 RAGGED_M = 0.002
-"""Price of a surface as large as the hull's beyond a smooth one [m]."""
+"""Cost of surface area beyond a smooth solid's, per area of the hull [m]."""
 SMOOTH = 1.03
-"""Half-turned solids that were seen whole have 0.98 to 1.03 of their hull's surface; what free space tore, 1.15."""
+"""Surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones."""
 
 Shape = tuple[TriangleMesh, Pose, float]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ShapeCandidate(Frozen):
-    """A shape and its price: its disagreement with the picture, and more for each freedom it has [m]."""
-
-    method: str
-    price: float
-    mesh: TriangleMesh
-    pose: Pose
+"""Mesh, pose, and cost: disagreement with the picture [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +40,9 @@ class _ShapeKind:
     """A kind of shape.
 
     Attributes:
-        method: Its name in the records.
-        freedom: What it pays for following the picture more freely than a simpler kind [m].
-        make: Its best shape, and the disagreement with the picture [m]; None or an error where it has none.
+        method: Its name in the dataset.
+        freedom: Cost of following the picture more freely than a simpler kind [m].
+        make: Fits its best shape; None or GeometryError where there is none.
     """
 
     method: str
@@ -62,31 +51,30 @@ class _ShapeKind:
 
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
-    """The best explanation among boxes, a surface of revolution, a half-turn symmetric solid and columns.
+    """Fit boxes, a surface of revolution, a half-turn symmetric solid and columns, and select the best.
 
     Raises:
-        GeometryError: if the points carry no solid.
+        GeometryError: if no shape fits the points.
     """
     rays = sample_rays(view)
-    found: list[_ShapeCandidate] = []
+    best: tuple[float, str, TriangleMesh, Pose] | None = None
     reasons: list[str] = []
     for kind in KINDS:
-        if found and min(candidate.price for candidate in found) < kind.freedom + UNAVOIDABLE_M:
+        if best is not None and best[0] < kind.freedom + UNAVOIDABLE_M:
             continue
         try:
             shape = kind.make(view, rays)
         except GeometryError as error:
             reasons.append(str(error))
             continue
-        if shape is not None:
-            found.append(_ShapeCandidate(kind.method, shape[2] + kind.freedom, shape[0], shape[1]))
-    if not found:
+        if shape is not None and (best is None or shape[2] + kind.freedom < best[0]):
+            best = (shape[2] + kind.freedom, kind.method, shape[0], shape[1])
+    if best is None:
         raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
-    best = min(found, key=lambda candidate: candidate.price)
-    if not view.support.leaning:
-        return Completion(best.mesh, best.pose, best.method)
-    stemmed = extend_to_floor(best.mesh, best.pose, view.points, view.support_z)
-    return Completion(stemmed, best.pose, best.method)
+    _, method, mesh, pose = best
+    if view.support.leaning:
+        mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
+    return Completion(mesh, pose, method)
 
 
 def _make_upright_box(view: ObjectView, rays: RaySample) -> Shape:
@@ -103,7 +91,7 @@ def _discount_box(box: SolidBox) -> Shape:
 
 def _make_revolution(view: ObjectView, rays: RaySample) -> Shape | None:
     fit = fit_revolution(view, rays)
-    return None if fit is None else (fit.mesh, fit.pose, fit.price - (HOLLOW_BONUS_M if fit.hollow else 0.0))
+    return None if fit is None else (fit.mesh, fit.pose, fit.cost - (HOLLOW_BONUS_M if fit.hollow else 0.0))
 
 
 def _make_half_turn(view: ObjectView, rays: RaySample) -> Shape:
@@ -112,7 +100,7 @@ def _make_half_turn(view: ObjectView, rays: RaySample) -> Shape:
 
 
 def _measure_raggedness(mesh: TriangleMesh) -> float:
-    """What a solid pays for being torn by free space around something that stood before it [m]."""
+    """Compute the cost of a solid torn by free space around an occluder [m]."""
     try:
         hull = float(ConvexHull(mesh.vertices).area)
     except QhullError as error:
@@ -132,4 +120,4 @@ KINDS = (
     _ShapeKind("carved/half_turn", 5e-4, _make_half_turn),
     _ShapeKind("carved/columns", 2.0e-3, _make_columns),
 )
-"""In the order in which they are tried: the fewer freedoms a kind has, the earlier and the cheaper."""
+"""Kinds in the order of trial: the fewer freedoms a kind has, the earlier and the cheaper."""

@@ -1,8 +1,8 @@
-"""Where things that were seen from above end below: sheets, bars, and all that goes down to its support.
+"""Underside of objects seen from above: sheets, bars, and all that reaches down to the support.
 
-The picture shows the edges that face the camera, and under a raised edge it shows what lies behind: that says how
-thick the thing is there. Narrow parts (handles, tines, blades) are taken for their own mirror image about the
-height of their edges; wide parts with thin raised edges are sheets of that thickness; all else reaches the support.
+The picture shows the edges that face the camera, and under a raised edge the background: that tells the thickness
+there. Narrow parts (handles, tines, blades) are mirrored about the height of their edges; wide parts with thin raised
+edges are sheets of that thickness; all else reaches the support.
 """
 
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ from tableverse_factory.stages.place.completion.half_width import compute_half_w
 
 MIN_THICKNESS_M = 0.002
 BAR_HALF_WIDTH_M = 0.0125
-"""Parts at most twice as wide are bars, wider ones sheets or solids."""
+"""Greatest half width of a bar [m]; wider parts are sheets or solids."""
 BAR_SHAPE = 3.2
-"""A bar is at most so many times its half width thick: what is thicker stands, and is no bar."""
+"""Most thickness of a bar in half widths: a thicker part stands, and is no bar."""
 SHEET_SHARE = 0.3
 SHEET_M = 0.008
-"""A sheet's edge is at most that part of its half width, and at most so thick: round bodies have thicker ones."""
+"""Most thickness of a sheet's edge, in half widths and [m]: round bodies have thicker ones."""
 SETTLED_M = 0.004
-"""An edge seen to end this near to the support rests on it."""
+"""Height above the support up to which an edge rests on it [m]."""
 FACING_COS = 0.1
-"""Edges that turn away from the camera by more hide what they end in."""
+"""Least cosine between an edge's outward direction and the camera: others hide their end."""
 EDGES = 12
 MEDIAN_CELLS = 5
 STEEP = 0.35
@@ -39,11 +39,11 @@ Values = Float64[np.ndarray, " n"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint(Frozen):
-    """What was seen from above, over a grid of columns.
+    """Observations from above over a grid of columns.
 
     Attributes:
         cell: Spacing [m].
-        closed: Columns that hold something.
+        closed: Columns of the object.
         top: Highest point seen in each column, of the nearest one where none was [m].
         lowest: Lowest point seen in each column, infinite where none was [m].
         empty_to: Highest point below the top of each column that was seen empty, the support where none was [m].
@@ -60,7 +60,7 @@ class Footprint(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Edges(Frozen):
-    """The seen border of a footprint, an entry a column.
+    """The visible border of a footprint, one entry per column.
 
     Attributes:
         at: Row and column. Shape (n, 2).
@@ -78,7 +78,7 @@ class _Edges(Frozen):
 
 
 def estimate_underside(footprint: Footprint, support: float) -> Map:
-    """Where each column ends [m]; `support` is the height of what carries the thing [m]."""
+    """Estimate the lower end of each column [m]; `support` is the height of the object's support [m]."""
     under = np.full(footprint.top.shape, support)
     width = compute_half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
     upright = _compute_uprightness(footprint)
@@ -134,7 +134,7 @@ def _find_edges(footprint: Footprint, width: Map, upright: Map, support: float) 
 def _sample_inward(
     footprint: Footprint, heights: Map, at: Int64[np.ndarray, "n 2"], inward: Float64[np.ndarray, "n 2"], steps: Values
 ) -> Values:
-    """Heights so many steps inward from each border column [m]."""
+    """Sample heights some steps inward from each border column [m]."""
     there = np.rint(at + inward * steps[:, None]).astype(int)
     there = np.clip(there, 0, np.array(footprint.top.shape) - 1)
     inside = footprint.closed[tuple(there.T)]
@@ -143,7 +143,7 @@ def _sample_inward(
 
 
 def _compute_uprightness(footprint: Footprint) -> Map:
-    """Cosine between the top surface's normal and the vertical."""
+    """Compute the cosine between the top surface's normal and the vertical."""
     weight = ndimage.gaussian_filter(footprint.closed.astype(float), SMOOTHING_CELLS)
     top = np.where(footprint.closed, footprint.top, 0.0)
     smooth = ndimage.gaussian_filter(top, SMOOTHING_CELLS) / np.maximum(weight, 1e-6)

@@ -1,7 +1,7 @@
-"""Free-form completion on a voxel grid: what the picture leaves possible, closed by a prior on what it hides.
+"""Free-form completion by voxel carving with a prior on the hidden side.
 
-Two priors: columns from the observed top down to the support, and a half turn about a vertical axis (things that
-stand on tables look much the same from behind). Both are carved by all space that was seen to be empty.
+Two priors: columns from the observed top down to the support, and a half turn about a vertical axis (objects on tables
+look much the same from behind). Both are carved by all free space.
 """
 
 import numpy as np
@@ -40,18 +40,18 @@ CELLS_UP = 30
 PIXELS_A_CELL = 1.5
 EMPTY_M = 0.0005
 TORN_SHARE = 0.1
-"""A second part with this share of the volume is no crumb."""
+"""Least volume share of a second part that counts."""
 MIN_STEP_M = 0.0008
 SMOOTHING_CELLS = 0.8
 MAX_FACES = 3000
 TURN_POINTS = 800
 WORST_TURN_M = 0.01
 SLACK = 0.05
-"""Weight of loose fit against carved-away points in the search for the axis of the half turn."""
+"""Weight of distance from free space against depth in it, in the search for the axis of the half turn."""
 
 
 def fit_own_frame(view: ObjectView) -> tuple[Pose, Vector3, Vector3]:
-    """The object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
+    """Fit the object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
 
     Raises:
         GeometryError: if the points span no area.
@@ -65,7 +65,7 @@ def fit_own_frame(view: ObjectView) -> tuple[Pose, Vector3, Vector3]:
 
 
 def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
-    """The solid below the observed points, without the space seen empty; down to the support or to its underside.
+    """Carve the solid below the observed points by free space, down to the support or its underside.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
@@ -82,7 +82,7 @@ def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
 
 
 def carve_half_turn(view: ObjectView) -> tuple[TriangleMesh, Pose]:
-    """What free space leaves of the object when its hidden side is its seen side, turned by half about a vertical.
+    """Carve the solid by free space, and by the same turned by half about a vertical axis for the hidden side.
 
     Raises:
         GeometryError: if the points span no area or nothing is left.
@@ -118,7 +118,7 @@ def _extract_mesh(field: Field, grid: VoxelGrid) -> TriangleMesh:
 
 
 def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
-    """Where the vertical axis stands: turned points must not lie in free space, and as near to it as they can."""
+    """Find the vertical axis: turned points must not lie in free space, but near it."""
     step = max(1, len(view.points) // TURN_POINTS)
     points = view.points[::step]
 
@@ -140,14 +140,14 @@ def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
 
 
 def _is_torn(field: Field) -> bool:
-    """Whether the solid falls into parts of which more than one counts."""
+    """Whether the solid falls into more than one part that counts."""
     labels, _ = ndimage.label(field > 0.0)
     sizes = np.sort(np.bincount(labels.ravel())[1:])
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
 
 
 def _build_flat_grid(view: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
-    """A grid whose heights are stretched by the second answer: flat things need finer steps up than along."""
+    """Build a grid and the stretch of its heights: flat objects need finer vertical steps."""
     size = high - low
     pixel = float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) / view.camera.fx
     cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
@@ -160,7 +160,7 @@ def _build_flat_grid(view: ObjectView, low: Vector3, high: Vector3) -> tuple[Vox
 def _compute_column_field(
     view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
 ) -> Field:
-    """Signed distance to the columns below the observed points [m]."""
+    """Compute the signed distance to the columns below the observed points [m]."""
     local = transform_points(invert_pose(pose), view.points)
     z = grid.axes()[2] / stretch
     index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
@@ -196,7 +196,7 @@ def _compute_column_field(
 def _bridge_gaps(
     closed: Bool[np.ndarray, "nx ny"], top: Float64[np.ndarray, "nx ny"], free: Field, z: Float64[np.ndarray, " nz"]
 ) -> tuple[Bool[np.ndarray, "nx ny"], Float64[np.ndarray, "nx ny"]]:
-    """Parts that were seen apart, joined over the columns between them that were hidden; and the tops of all."""
+    """Join separate parts over the hidden columns between them; return the columns and their tops."""
     between = np.argwhere(~closed)
     heights = LinearNDInterpolator(np.argwhere(closed), top[closed])(between)
     spanned = np.isfinite(heights)

@@ -1,4 +1,4 @@
-"""Pixels whose reading a sensor lost, judged by their colour: more of the object, or what lies past it."""
+"""Colour model of an object against its background, for pixels without a reading."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,16 +10,16 @@ from schemas.geometry import Mask, Picture
 
 SAMPLES = 400
 NEAR = 12.0
-"""Colours within this distance in CIELAB are alike."""
+"""Distance in CIELAB within which colours are alike."""
 RARITY = 4.0
-"""A colour is of what lies past the object where it is so many times as frequent there, or unknown to the object."""
+"""Ratio of frequencies from which a colour is the background's; so is one that the object lacks."""
 INSET_PX = 2
 
 
 def find_foreign_colors(color: Picture, own: Mask, past: Mask, asked: Mask) -> Mask:
-    """Which of the pixels `asked` about are of no colour that the object has, or of one far more usual beside it.
+    """Find the `asked` pixels whose colour the object lacks, or is far more frequent in the background.
 
-    Sensors lose what is black, shiny or at a steep step, on the object and beside it; the picture knows more.
+    Sensors lose black and shiny surfaces and steep steps, on the object and beside it; the colour still tells.
     """
     answer = np.zeros(own.shape, dtype=bool)
     core = ndimage.binary_erosion(own, iterations=INSET_PX)
@@ -34,7 +34,7 @@ def find_foreign_colors(color: Picture, own: Mask, past: Mask, asked: Mask) -> M
 def compute_color_share(
     colors: Float64[np.ndarray, "n 3"], known: Float64[np.ndarray, "m 3"]
 ) -> Float64[np.ndarray, " n"]:
-    """Share of the known colours that are like each of `colors`."""
+    """Compute the share of the known colours that are like each of `colors`."""
     sample = known[:: max(1, -(-len(known) // SAMPLES))]
     if len(sample) == 0:
         return np.zeros(len(colors))

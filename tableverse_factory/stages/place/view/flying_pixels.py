@@ -1,4 +1,4 @@
-"""Readings along an object's outline that no surface gave: sensors and filters smear depth over the edges of things."""
+"""Flying pixels: false readings along an object's outline, where sensors and filters smear depth over an edge."""
 
 import numpy as np
 from scipy import ndimage
@@ -10,11 +10,11 @@ from tableverse_factory.stages.place.view.color_model import INSET_PX, RARITY, c
 from tableverse_factory.stages.place.view.object_pixels import compute_pixel_normals, filter_depth
 
 CORE_SHARE = 0.35
-"""The core of a mask is farther from its outline than this share of the farthest pixel."""
+"""Depth of a mask's core below its outline, as a share of the deepest pixel's."""
 MIN_OFF = 0.05
-"""Share of the colours beside the object that has to be like a pixel's before it counts as smeared."""
+"""Least share of the colours beside the object that are like a flying pixel's."""
 SAME_HUE = 6.0
-"""Where most of the surroundings differ less than this in hue from the object, shade alone tells nothing."""
+"""Least median difference of hue between object and surroundings; below it, shade alone tells nothing."""
 SMEARED_PX = 4
 MOST_SMEARED = 0.5
 RAMP_FACING = 0.25
@@ -25,17 +25,16 @@ MOSTLY = 0.6
 
 
 def find_flying_pixels(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
-    """Which of the object's pixels have the colours of what lies beside it: their readings were smeared over its edge.
+    """Find the object's pixels with the colours of what lies beside it: their readings were smeared over its edge.
 
-    Sensors and their filters interpolate between a thing and what lies behind it. Taken for pixels like these are
-    those near the outline, and whole patches whose readings run on without a step into what lies beside; never more
-    than half of the object.
+    Sensors and their filters interpolate between an object and its background. Such pixels lie near the outline, or in
+    whole patches whose readings continue into the background without a step; never more than half of the object.
 
     Args:
-        color: Of the window.
+        color: Picture of the window.
         raw: Depth of the window [m].
         own: The object's pixels.
-        beside: Pixels of the table and of what nobody claims.
+        beside: Pixels of the table and of the unlabelled background.
     """
     nothing = np.zeros(own.shape, dtype=bool)
     inset = ndimage.distance_transform_edt(np.pad(own, 1))[1:-1, 1:-1]
@@ -57,14 +56,14 @@ def find_flying_pixels(color: Picture, raw: DepthImage, own: Mask, beside: Mask)
 
 
 def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
-    """Readings near the outline on a surface seen almost edge-on: a sensor's ramp from the object to what lies behind.
+    """Find readings near the outline on a surface seen almost edge-on: a sensor's ramp to the background.
 
-    A real surface at such an angle says little about the shape; a ramp is no surface at all.
+    A real surface at such an angle tells little about the shape; a ramp is no surface.
 
     Args:
         raw: Depth of the window [m].
         own: The object's pixels.
-        trusted: Those with a reading that survived the denoising.
+        trusted: Its pixels with a denoised reading.
         window: Intrinsics of the window.
     """
     depth = filter_depth(raw, trusted)
@@ -80,7 +79,7 @@ def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) 
 
 
 def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Mask:
-    """Those patches whose readings go on with less than a step along most of their border with what lies beside."""
+    """Find patches whose readings continue without a step along most of their border with the background."""
     labels, count = ndimage.label(patches)
     if count == 0:
         return patches

@@ -1,4 +1,4 @@
-"""The pixels around one object: which are its own, which show what lies past it, and what they measure."""
+"""Pixels around one object: its own, those that see past it, their depth and normals."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -15,18 +15,18 @@ THINNED_PX = 2.0
 THINNED_STEP_M = 0.006
 LOST_HEIGHT_M = 0.01
 FAR_M = 10.0
-"""Where a ray ends of which nothing is known but that it passes the object and meets no table."""
+"""End of a ray that passes the object and meets no table [m]."""
 LOST_STEP_M = 0.03
 OCCLUDER_STEP_M = 0.01
-"""A neighbouring object's pixel hides ours where it is at least this much nearer."""
+"""Least step by which a neighbouring object's pixel is nearer and occludes this one [m]."""
 SPILL_HEIGHT_M = 0.01
 SPILL_AWAY_M = 0.006
 TALL_M = 0.04
-"""Beside an object at least this tall, pixels at the height of its support are a spilling mask, not a flat part."""
+"""Least height of an object beside which pixels at its support's height are mask bleed, not a flat part [m]."""
 
 
 def find_denoised_pixels(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
-    """Pixels whose reading survived the denoising, and their near neighbours, for large clouds come thinned."""
+    """Find the pixels with a denoised reading, and their near neighbours, because large clouds come thinned."""
     pixels = project(points_camera, window)
     column, row = np.rint(pixels[:, 0]).astype(int), np.rint(pixels[:, 1]).astype(int)
     height, width = raw.shape
@@ -43,7 +43,7 @@ def find_denoised_pixels(points_camera: Points, window: Camera, raw: DepthImage)
 
 
 def filter_depth(raw: DepthImage, trusted: Mask) -> DepthImage:
-    """Depth averaged over near pixels of near depth (a bilateral filter), within the trusted pixels alone."""
+    """Average depth over near pixels of near depth (a bilateral filter), within the trusted pixels alone."""
     middle = float(np.median(raw[trusted])) if trusted.any() else 1.0
     tolerance = 0.004 + 0.004 * middle * middle
     total = np.zeros(raw.shape)
@@ -63,14 +63,14 @@ def filter_depth(raw: DepthImage, trusted: Mask) -> DepthImage:
 def find_free_pixels(
     raw: DepthImage, color: Picture, ids: IdImage, own: Mask, trusted: Mask, window: Camera, camera_to_table: Pose
 ) -> tuple[Mask, DepthImage]:
-    """Pixels that show what lies behind or beside the object, not what hides it; and where the rays end [m]."""
+    """Find the pixels that see past the object, not those of an occluder; and the ends of the rays [m]."""
     if not trusted.any():
         return np.zeros(own.shape, dtype=bool), raw
     nearest = ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     own_depth = raw[nearest[0], nearest[1]]
     end = _compute_ray_ends(raw, ids, window, camera_to_table)
     hides = (ids > 0) & (end < own_depth - OCCLUDER_STEP_M)
-    # A pixel that nobody claims, above the table and as far as our nearest: the mask may have lost it.
+    # An unlabelled pixel above the table, about as far as the nearest own one: the mask may have lost it.
     up = rotation_matrix(camera_to_table.quaternion_wxyz)[2]
     height = backproject(end, window) @ up + camera_to_table.position[2]
     lost = (ids <= 0) & (height > LOST_HEIGHT_M) & (np.abs(end - own_depth) < LOST_STEP_M)
@@ -81,14 +81,14 @@ def find_free_pixels(
 
 
 def _compute_ray_ends(raw: DepthImage, ids: IdImage, window: Camera, camera_to_table: Pose) -> DepthImage:
-    """Where rays end: the reading, or the table's plane for table pixels without one."""
+    """Compute the ends of rays: the reading, or the table's plane for table pixels without one."""
     hole = (ids == TABLE_ID) & (raw <= 0.0)
     plane = _intersect_table(window, camera_to_table)
     return np.where(hole & np.isfinite(plane), plane, raw)
 
 
 def _intersect_table(window: Camera, camera_to_table: Pose) -> DepthImage:
-    """Depth at which each ray meets the table's plane [m], infinite where it does not."""
+    """Compute the depth at which each ray meets the table's plane [m], infinite where it does not."""
     rays = backproject(np.ones((window.height, window.width)), window)
     down = rays @ rotation_matrix(camera_to_table.quaternion_wxyz)[2]
     depth: DepthImage = np.where(down < -1e-6, -camera_to_table.position[2] / np.minimum(down, -1e-6), np.inf)
@@ -96,7 +96,7 @@ def _intersect_table(window: Camera, camera_to_table: Pose) -> DepthImage:
 
 
 def compute_outline_distance(past: Mask) -> DepthImage:
-    """Distance to the outline [px]: positive on the object's side, negative where the camera sees past."""
+    """Compute the distance to the silhouette [px], negative where the camera sees past."""
     if not past.any():
         return np.full(past.shape, 1e6)
     inside = ndimage.distance_transform_edt(~past)
@@ -108,7 +108,7 @@ def compute_outline_distance(past: Mask) -> DepthImage:
 def compute_pixel_normals(
     cloud: Float64[np.ndarray, "h w 3"], known: Mask, eye: Points
 ) -> Float64[np.ndarray, "h w 3"]:
-    """Unit normals from neighbouring pixels, towards the camera; NaN where the pixel itself has no depth."""
+    """Compute unit normals from neighbouring pixels, towards the camera; NaN where the pixel has no depth."""
     points = np.where(known[..., None], cloud, np.nan)
     with np.errstate(invalid="ignore"):
         du, dv = _compute_slope(points, axis=1), _compute_slope(points, axis=0)
@@ -122,7 +122,7 @@ def compute_pixel_normals(
 
 
 def _compute_slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[np.ndarray, "h w 3"]:
-    """Central difference over two pixels to each side, one-sided where only one side is known."""
+    """Compute central differences over two pixels to each side, one-sided where only one side is known."""
     step = 2
     ahead = np.full_like(points, np.nan)
     back = np.full_like(points, np.nan)
@@ -142,7 +142,7 @@ def _compute_slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[n
 
 
 def find_background_bleed(points: Points, support_z: float) -> Mask:
-    """Which points of the table frame a sloppy mask took from the support beside a tall object. Shape (n,)."""
+    """Find the points of the table frame that a mask took from the support beside a tall object. Shape (n,)."""
     height = points[:, 2] - support_z
     low = height < SPILL_HEIGHT_M
     if not low.any() or low.all() or float(np.quantile(height, 0.95)) < TALL_M:

@@ -1,4 +1,4 @@
-"""What one picture says about one object: its points in the table frame, and where space was seen to be empty."""
+"""Evidence of one picture about one object: its points in the table frame, and free space."""
 
 from dataclasses import dataclass
 
@@ -43,9 +43,9 @@ class ObjectView(Frozen):
         own: Pixels of the object in the window.
         depth: Smoothed depth of the window [m]; 0 where unknown.
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
-        past: Pixels through which the camera sees past the object; the rest is the object or what hides it.
-        outline_px: Distance of each pixel to the border of `past` [px], negative within `past`.
-        support: What carries the object, and what it carries.
+        past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
+        outline_px: Distance of each pixel to the silhouette, the border of `past` [px]; negative within `past`.
+        support: Support of the object, and what it supports.
     """
 
     instance_id: int
@@ -63,7 +63,7 @@ class ObjectView(Frozen):
 
     @property
     def support_z(self) -> float:
-        """Height of what carries the object [m], table frame."""
+        """Height of the object's support [m], table frame."""
         return self.support.height
 
     @property
@@ -73,7 +73,7 @@ class ObjectView(Frozen):
 
 
 def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSupport) -> ObjectView:
-    """Crops the picture around one object and classes its pixels.
+    """Crop the picture around one object and classify its pixels.
 
     Raises:
         GeometryError: if no pixel of the picture is the object's.
@@ -114,12 +114,16 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
 
 
 def measure_free_space(view: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
-    """How far each point lies from space seen to be empty [m]: negative inside of that space.
+    """Measure the distance of points from free space [m], negative inside it. Shape (n,).
 
     All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
-    then it is empty as well. Beside the outline the distance to the outline counts, so that the field is continuous
-    across it. Rays without depth say nothing. Shape (n,). `frame` is where the points are given, the table frame if
-    none is.
+    then it is empty as well. Near the silhouette the distance to it counts, so that the field is continuous across it.
+    Rays without depth tell nothing.
+
+    Args:
+        view: The object's view.
+        points: Points in `frame` [m].
+        frame: Frame of the points in the table frame; None for the table frame itself.
     """
     return measure_clearances(view, points, frame)[0]
 
@@ -127,7 +131,7 @@ def measure_free_space(view: ObjectView, points: Points, frame: Pose | None = No
 def measure_clearances(
     view: ObjectView, points: Points, frame: Pose | None = None
 ) -> tuple[Distances, Distances, Bool[np.ndarray, " n"]]:
-    """`emptiness`; how far behind the object's own surface each point lies; whether something else may hide it.
+    """Measure free space, the depth of points behind the object's surface, and whether another object may hide them.
 
     The second is infinite where the object's surface was not seen [m].
     """
@@ -151,7 +155,7 @@ def measure_clearances(
 
 
 def _crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """Intrinsics of a part of the picture."""
+    """Compute the intrinsics of a part of the picture."""
     size = columns.stop - columns.start, rows.stop - rows.start
     return Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
 
@@ -159,7 +163,7 @@ def _crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
 def _remove_bleed(
     own: Mask, trusted: Mask, raw: DepthImage, window: Camera, camera_to_table: Pose, support_z: float
 ) -> tuple[Mask, Mask]:
-    """Both masks without the pixels that show the support beside the object."""
+    """Remove the pixels of the support beside the object from both masks."""
     points = transform_points(camera_to_table, backproject(raw, window)[trusted])
     kept = trusted.copy()
     kept[trusted] = ~find_background_bleed(points, support_z)
@@ -167,7 +171,7 @@ def _remove_bleed(
 
 
 def _project_columns(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distances, Distances, Distances]:
-    """Column, row and depth of points, one array each: several times faster than by rows, and this is the hot loop."""
+    """Project points to column, row and depth, one array each: several times faster than by rows in this hot loop."""
     r, t = rotation_matrix(to_camera.quaternion_wxyz), to_camera.position
     x, y, z = (points[:, k] for k in range(3))
     along = [r[k, 0] * x + r[k, 1] * y + r[k, 2] * z + t[k] for k in range(3)]

@@ -1,4 +1,4 @@
-"""What carries each object: the table, or the top of another object, read from the observed heights."""
+"""Support of each object, the table or the top of another object, from the observed heights."""
 
 from dataclasses import dataclass
 
@@ -11,34 +11,35 @@ from schemas.objects import PerceivedObjects
 from tableverse_factory.geometry.math.transforms import transform_points
 
 ABOVE_M = 0.03
-"""The lowest seen points of an object may lie this far above what carries it: its foot can be hidden."""
+"""Most height of an object's lowest visible points above its support [m]: its foot can be hidden."""
 BELOW_M = 0.012
-"""And this far below, for noise and for smeared pixels at the seam."""
+"""Most depth of them below it [m], for noise and flying pixels."""
 TABLE_M = 0.012
-"""Tops lower than this are the table's own noise."""
+"""Least height of a top above the table's noise [m]."""
 NEAR_M = 0.01
 MIN_POINTS = 20
 MIN_OVERLAP = 0.1
 CONTAINER_FLOOR_M = 0.005
-"""Height of the unseen floor of a container above the table."""
+"""Height of the hidden floor of a container above the table [m]."""
 LONG_RATIO, STEEP_RATIO = 2.5, 1.9
-"""Contents so much longer than broad lean on the rim and reach the floor; of what rises steeply more is hidden."""
+"""Least length over breadth of contents that lean on the rim and reach the floor; less for steep ones, which are more
+hidden."""
 STEEP = 0.9
-"""Least sine of the elevation of the longest axis of what rises steeply."""
+"""Least sine of the elevation of a steep object's longest axis."""
 CORE = 0.5
-"""Part of a carried object's footprint, about its middle, that has to be carried."""
+"""Share of a supported object's footprint, about its middle, that has to be supported."""
 
 Points2 = Float64[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSupport(Frozen):
-    """How one object is carried, and what it carries.
+    """Support of one object, and what it supports.
 
     Attributes:
-        height: Of what the object stands on [m], table frame; 0 is the table.
+        height: Height of the support [m], table frame; 0 is the table.
         carried: Corners of the middle part of the footprints of all that stands on the object, table frame [m].
-        leaning: Whether it is a long thing in a container.
+        leaning: Whether it is a long object in a container.
     """
 
     height: float
@@ -47,7 +48,7 @@ class DepthSupport(Frozen):
 
 
 def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
-    """The support of each object, by object id."""
+    """Find the support of each object, by object id."""
     clouds = {o.object_id: transform_points(scene.camera_to_table, o.points_camera) for o in scene.objects}
     clouds = {name: cloud for name, cloud in clouds.items() if len(cloud) >= MIN_POINTS}
     heights = {o.object_id: 0.0 for o in scene.objects}
@@ -73,10 +74,10 @@ def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
 
 
 def _find_top_below(own: Points, other: Points) -> float:
-    """Height of `other` where `own` stands on it [m], else 0.
+    """Find the height of `other` where `own` stands on it [m], else 0.
 
-    It carries where its top, beside the footprint of `own`, lies about at the lowest points of `own`, and some of
-    that footprint lies within its outline.
+    It is the support where its top, beside the footprint of `own`, lies about at the lowest points of `own`, and some
+    of that footprint lies within its outline.
     """
     lowest = float(np.quantile(own[:, 2], 0.02))
     low, high = own[:, :2].min(axis=0) - NEAR_M, own[:, :2].max(axis=0) + NEAR_M
@@ -90,7 +91,7 @@ def _find_top_below(own: Points, other: Points) -> float:
 
 
 def _measure_share_within(points: Points2, outline: Points2) -> float:
-    """Part of the points that lie within the convex hull of others."""
+    """Measure the share of the points within the convex hull of others."""
     try:
         sides = ConvexHull(outline).equations
     except (QhullError, ValueError):
@@ -100,7 +101,7 @@ def _measure_share_within(points: Points2, outline: Points2) -> float:
 
 
 def _shrink_footprint(footprint: Points2) -> Points2:
-    """Corners of the middle part of a footprint's box."""
+    """Compute the corners of the middle part of a footprint's box."""
     low, high = np.quantile(footprint, 0.02, axis=0), np.quantile(footprint, 0.98, axis=0)
     middle, half = (low + high) / 2, CORE * (high - low) / 2
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -114,7 +115,7 @@ def _is_long(cloud: Points) -> bool:
 
 
 def _guess_bottom(cloud: Points) -> float:
-    """Bottom of a thing in a container, whose foot is hidden: no taller than broad, and not above what was seen [m]."""
+    """Guess the hidden bottom of contents [m]: no taller than broad, and not above what was seen."""
     low, high = np.quantile(cloud, 0.02, axis=0), np.quantile(cloud, 0.98, axis=0)
     guess = high[2] - float((high - low)[:2].max())
     return float(np.clip(guess, min(CONTAINER_FLOOR_M, max(low[2], 0.0)), max(low[2], 0.0)))

@@ -12,15 +12,15 @@ import pytest
 
 from schemas.config import Config
 from tableverse_factory.core.errors import ModelAccessError
-from tableverse_factory.models.local.device import Device, torch_here
-from tableverse_factory.models.local.model_daemon import hang_up
-from tableverse_factory.models.local.pixels import picture_on, pixel_values
+from tableverse_factory.models.local.device import Device, import_torch
+from tableverse_factory.models.local.model_daemon import close_connections
+from tableverse_factory.models.local.pixels import compute_pixel_values, upload_image
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, BoxPrompts, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.perceive import segment_boxes
-from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, ids_of, levels
-from tableverse_factory.stages.perceive.sam.model import load
-from tableverse_factory.stages.perceive.sam.process import ids_from_process
-from tableverse_factory.stages.perceive.sam.segmenter import question_of
+from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, compute_id_image, group_by_depth
+from tableverse_factory.stages.perceive.sam.model import load_sam
+from tableverse_factory.stages.perceive.sam.process import segment_in_daemon
+from tableverse_factory.stages.perceive.sam.segmenter import build_question
 from tableverse_factory.stages.perceive.table import find_table, refit_table_to_mask
 from tests.helpers.loopback import serving
 from tests.helpers.sam_models import save_tiny
@@ -38,7 +38,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=["sam2", "sam3"])
 def sam(request, folders):
-    return load(request.param, str(folders[request.param][0]), CPU)
+    return load_sam(request.param, str(folders[request.param][0]), CPU)
 
 
 def question(seed=0, boxes=BOXES, holders=(-1, 0, -1), size=(120, 160)):
@@ -47,10 +47,10 @@ def question(seed=0, boxes=BOXES, holders=(-1, 0, -1), size=(120, 160)):
 
 
 def test_scores_are_those_of_the_models_own_forward(sam, folders):
-    torch = torch_here()
+    torch = import_torch()
     asked, (_, original) = question(), next(v for v in folders.values() if type(v[1]) is type(sam._model))
     side = original.config.prompt_encoder_config.image_size
-    pixels = pixel_values([picture_on(asked.color, CPU)], (side, side), sam._normal, CPU)
+    pixels = compute_pixel_values([upload_image(asked.color, CPU)], (side, side), sam._normal, CPU)
     boxes = asked.boxes * [side / 160, side / 120, side / 160, side / 120]  # SAM's processors keep no aspect
     with torch.inference_mode():
         theirs = original.eval()(
@@ -64,9 +64,9 @@ def test_scores_are_those_of_the_models_own_forward(sam, folders):
 def test_the_same_picture_gives_the_same_ids_whoever_is_beside_it(sam):
     few = [question(k, size=(120, 160)) for k in range(3)]
     many = question(9, np.tile(BOXES, (3, 1)), (-1,) * 12, size=(100, 90))
-    alone = [sam.ids([asked], 1)[0] for asked in (*few, many)]
-    together = sam.ids([*few, many], 4)
-    turned = sam.ids([many, *few[::-1]], 3)
+    alone = [sam.segment([asked], 1)[0] for asked in (*few, many)]
+    together = sam.segment([*few, many], 4)
+    turned = sam.segment([many, *few[::-1]], 3)
     for k in range(4):
         assert np.array_equal(alone[k], together[k])
         assert np.array_equal(alone[k], [turned[3], turned[2], turned[1], turned[0]][k])
@@ -74,8 +74,8 @@ def test_the_same_picture_gives_the_same_ids_whoever_is_beside_it(sam):
 
 
 def test_a_size_that_does_not_fit_is_tried_once(folders, monkeypatch):
-    torch, sizes = torch_here(), []
-    sam = load("sam2", str(folders["sam2"][0]), CPU)
+    torch, sizes = import_torch(), []
+    sam = load_sam("sam2", str(folders["sam2"][0]), CPU)
     embed = sam._model.get_image_embeddings
 
     def small_memory(pixels):
@@ -86,7 +86,7 @@ def test_a_size_that_does_not_fit_is_tried_once(folders, monkeypatch):
 
     monkeypatch.setattr(sam._model, "get_image_embeddings", small_memory)
     for _ in range(2):
-        sam.ids([question()], 8)
+        sam.segment([question()], 8)
     assert sizes == [8, 4, 4]
 
 
@@ -95,7 +95,7 @@ def test_boxes_scale_with_the_picture(sam):
     boxes = np.array([[5.0, 10, 35, 50], [40, 20, 75, 55]])
     small = BoxQuestion(np.full((60, 80, 3), 90, dtype=np.uint8), boxes, np.array([-1, -1]))
     large = BoxQuestion(np.full((240, 160, 3), 90, dtype=np.uint8), boxes * [2, 4, 2, 4], np.array([-1, -1]))
-    a, b = sam.ids([small, large], 1)
+    a, b = sam.segment([small, large], 1)
     assert len(np.unique(a)) > 1
     assert np.mean(a.repeat(4, 0).repeat(2, 1) == b) > 0.93  # but for what interpolation does along borders
 
@@ -105,47 +105,47 @@ def test_boxes_that_are_none_have_no_pixels_and_change_nothing(sam):
     nan, inf = float("nan"), float("inf")
     bad = [[500, 500, 600, 600], [-90, 0, -10, 50], [30, 30, 30, 60], [60, 60, 40, 40], [nan, 0, 9, 9], [0, 0, inf, 9]]
     both = BoxQuestion(there.color, np.vstack([there.boxes, bad]), np.full(8, -1))
-    ids = sam.ids([both], 1)[0]
+    ids = sam.segment([both], 1)[0]
     assert ids.max() <= 2
-    assert np.array_equal(ids, sam.ids([there], 1)[0])
-    assert not sam.ids([question(3, np.zeros((0, 4)), ())], 1)[0].any()
+    assert np.array_equal(ids, sam.segment([there], 1)[0])
+    assert not sam.segment([question(3, np.zeros((0, 4)), ())], 1)[0].any()
 
 
 def test_one_pixel_boxes_and_sixty_of_them(sam):
     boxes = [[x, y, x + 1, y + 1] for x in range(0, 160, 16) for y in range(0, 120, 20)]
-    ids = sam.ids([question(4, boxes, (-1,) * 60)], 1)[0]
+    ids = sam.segment([question(4, boxes, (-1,) * 60)], 1)[0]
     assert ids.shape == (120, 160)
     assert 0 <= ids.min() <= ids.max() <= 60
 
 
 def test_a_large_picture(folders):
-    ids = load("sam2", str(folders["sam2"][0]), CPU).ids([question(5, BOXES * 25, size=(3000, 4000))], 1)[0]
+    ids = load_sam("sam2", str(folders["sam2"][0]), CPU).segment([question(5, BOXES * 25, size=(3000, 4000))], 1)[0]
     assert ids.shape == (3000, 4000)
     assert set(np.unique(ids)) <= {-1, 0, 1, 2, 3}
 
 
 def test_half_precision_keeps_boxes_exact(folders, sam):
-    torch = torch_here()
+    torch = import_torch()
     name = "sam2" if type(sam._model).__name__ == "Sam2Model" else "sam3"
-    half = load(name, str(folders[name][0]), Device("cpu", "bfloat16"))
+    half = load_sam(name, str(folders[name][0]), Device("cpu", "bfloat16"))
     boxes = torch.tensor([[[100.0, 90, 111, 108]]])
     ours, exact = (model._model.get_prompt_embeddings(input_boxes=boxes)[0] for model in (half, sam))
     assert torch.equal(ours, exact)
     assert next(half._model.vision_encoder.parameters()).dtype is torch.bfloat16
-    picture = [picture_on(question().color, CPU)]
+    picture = [upload_image(question().color, CPU)]
     seen = [
         model._model.get_image_embeddings(
-            pixel_values(picture, (model._side, model._side), model._normal, model._device)
+            compute_pixel_values(picture, (model._side, model._side), model._normal, model._device)
         )[-1].float()
         for model in (half, sam)
     ]
     assert torch.nn.functional.cosine_similarity(seen[0].flatten(), seen[1].flatten(), dim=0) > 0.99
-    assert half.ids([question()], 1)[0].shape == (120, 160)
+    assert half.segment([question()], 1)[0].shape == (120, 160)
 
 
 def scores(height, width, *areas, inside=4.0):
     """Score images of a square model for a picture of this size, `inside` within each area of the picture."""
-    found = torch_here().full((len(areas), 64, 64), -4.0)
+    found = import_torch().full((len(areas), 64, 64), -4.0)
     for image, (x0, y0, x1, y1) in zip(found, areas, strict=True):
         image[round(y0 * 64 / height) : round(y1 * 64 / height), round(x0 * 64 / width) : round(x1 * 64 / width)] = (
             inside
@@ -159,17 +159,17 @@ def test_contents_cover_their_container_and_stay_near_it():
     # the apple's scores are lower, and spill all over the picture
     spilled = scores(120, 160, bowl, [40, 40, 160, 120])
     spilled[1] *= 0.5
-    ids = ids_of(spilled, asked).numpy()
+    ids = compute_id_image(spilled, asked).numpy()
     assert (ids[45:95, 45:95] == 2).all()
     assert (ids[25:38, 25:95] == 1).all()
     assert not ids[:, 130:].any()  # a quarter of 80 pixels beyond the bowl
-    assert (ids_of(spilled, question(0, [bowl, apple], (-1, -1))).numpy()[60:110, 130:150] == 2).all()
+    assert (compute_id_image(spilled, question(0, [bowl, apple], (-1, -1))).numpy()[60:110, 130:150] == 2).all()
 
 
 @pytest.mark.parametrize("seen", [[0.0, 0, 0, 0], [20.0, 20, 100, 24]])
 def test_contents_stay_where_the_mask_of_their_container_fails(seen):
     bowl, apple = [20.0, 20, 100, 100], [50.0, 50, 70, 70]
-    ids = ids_of(scores(120, 160, seen, [50, 50, 160, 70]), question(0, [bowl, apple], (-1, 0))).numpy()
+    ids = compute_id_image(scores(120, 160, seen, [50, 50, 160, 70]), question(0, [bowl, apple], (-1, 0))).numpy()
     assert (ids[55:65, 55:110] == 2).all()
     assert not ids[:, 130:].any()  # a quarter of 80 pixels beyond the bowl's box
 
@@ -178,30 +178,30 @@ def test_neighbours_share_no_pixel_and_the_surer_one_has_it():
     left, right = [10.0, 10, 90, 110], [60.0, 10, 150, 110]
     both = scores(120, 160, left, right)
     both[1] *= 2
-    ids = ids_of(both, question(0, [left, right], (-1, -1))).numpy()
+    ids = compute_id_image(both, question(0, [left, right], (-1, -1))).numpy()
     assert (ids[20:100, 62:88] == 2).all()
     assert (ids[20:100, 12:56] == 1).all()
 
 
 def test_the_table_is_what_no_object_covers():
     table, cup = [0.0, 40, 160, 120], [60.0, 50, 80, 70]
-    ids = ids_of(scores(120, 160, cup, table), question(0, [cup, table], (-1,))).numpy()
+    ids = compute_id_image(scores(120, 160, cup, table), question(0, [cup, table], (-1,))).numpy()
     assert (ids[53:67, 63:77] == 1).all()
     assert (ids[80:, :] == -1).all()
     assert not ids[:35].any()
 
 
 def test_containers_in_containers_have_levels_and_circles_none():
-    assert levels(np.array([-1, 0, 1, -1])) == [[0, 3], [1], [2]]
-    assert levels(np.array([1, 0, 2, 9])) == [[0, 1, 2, 3]]
-    assert levels(np.array([], dtype=np.int64)) == []
+    assert group_by_depth(np.array([-1, 0, 1, -1])) == [[0, 3], [1], [2]]
+    assert group_by_depth(np.array([1, 0, 2, 9])) == [[0, 1, 2, 3]]
+    assert group_by_depth(np.array([], dtype=np.int64)) == []
 
 
 def test_a_scene_goes_through_the_door(folders):
     view = find_table(look([Box(0.0, 0.0, (0.1, 0.08, 0.12))])[0], np.random.default_rng(0))
     perceive = {"detector": "replay", "segmenter": "sam2", "segmenter_weights": str(folders["sam2"][0])}
     config = Config.model_validate({"models": {"device": "cpu"}, "perceive": perceive})
-    asked = question_of(view, BoxPrompts(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
+    asked = build_question(view, BoxPrompts(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
     assert (asked.has_table, asked.boxes.shape, asked.holders.tolist()) == (True, (2, 4), [-1])
     bowl = Candidate("bowl", 1.0, (100.0, 60.0, 220.0, 180.0))
     apple = Candidate("apple", 1.0, (120.0, 80.0, 180.0, 140.0), container=0)
@@ -235,7 +235,7 @@ def test_the_plane_is_looked_for_in_what_is_seen_as_the_table_top():
 
 def refused(weights, name="sam2"):
     with pytest.raises(ModelAccessError, match=r"perceive\.segmenter_weights") as told:
-        load(name, str(weights), CPU)
+        load_sam(name, str(weights), CPU)
     assert "\n" not in str(told.value)
     return str(told.value)
 
@@ -261,15 +261,15 @@ def test_the_process_answers_with_the_bytes_of_the_model_in_this_one(folders, tm
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     folder = str(folders["sam2"][0])
     asked = [question(k) for k in range(6)]
-    alone = load("sam2", folder, CPU).ids(asked, 1)
+    alone = load_sam("sam2", folder, CPU).segment(asked, 1)
 
     def worker(one):
-        return ids_from_process("sam2", folder, CPU, 4, one)
+        return segment_in_daemon("sam2", folder, CPU, 4, one)
 
     monkeypatch.chdir(folders["sam2"][0].parent)
-    first = ids_from_process("sam2", folders["sam2"][0].name, CPU, 4, asked[0])
+    first = segment_in_daemon("sam2", folders["sam2"][0].name, CPU, 4, asked[0])
     found = [worker(one) for one in asked]
-    hang_up()
+    close_connections()
     assert np.array_equal(first, alone[0])
     assert all(np.array_equal(a, b) for a, b in zip(found, alone, strict=True))
 

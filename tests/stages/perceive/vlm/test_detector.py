@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import time
 from dataclasses import replace
 
@@ -136,8 +137,8 @@ def test_the_model_is_shown_the_picture_and_told_every_rule(look, server, detect
     text, schema = json.dumps(question), build_detection_schema(order)
     assert json.dumps(build_detection_prompt(order))[1:-1] in text
     assert json.dumps(schema) in text
-    start = text.index("/9j/")
-    picture = Image.open(io.BytesIO(base64.b64decode(text[start : text.index('"', start)])))
+    (encoded,) = re.findall(r"[/_]9j[/_][\w/+=-]+", text)  # one protocol sends base64, the other its URL-safe form
+    picture = Image.open(io.BytesIO(base64.urlsafe_b64decode(encoded.replace("+", "-").replace("/", "_"))))
     assert (picture.format, picture.size) == ("JPEG", (1280, 960))
     assert "sk-very-secret" not in text
 
