@@ -26,10 +26,7 @@ SCENES = pa.schema(
         ("source", pa.string()),
         ("uri", pa.string()),
         ("licence", pa.string()),
-        (
-            "licence_verdict",
-            pa.string(),
-        ),  # tableverse_factory.dataset.licences.LicenceVerdict, of the picture and the meshes together
+        ("licence_verdict", pa.string()),  # dataset.licences.LicenceVerdict of the picture and the meshes together
         ("content_sha256", pa.string()),  # of the input, as the manifest saw it
         ("status", pa.string()),  # done | dropped | failed
         ("stage", pa.string()),  # the last stage that ran

@@ -1,79 +1,33 @@
-"""Records as bytes and back, without pickle: a tree of JSON beside its arrays, in one Arrow IPC message.
+"""Codec of records without pickle: a tree of JSON beside its arrays, in one Arrow IPC message.
 
-What crosses a process boundary is data, never code: only the record types listed in `RECORD_TYPES` decode.
-Equal records give equal bytes.
+What crosses a process boundary is data, never code: only the record types in `RECORD_TYPES` decode. Equal records give
+equal bytes.
 """
 
 import json
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel
 
+from schemas import geometry, objects, observation, outcome, scene, trajectories, work
 from schemas.curation import Assessment
 from schemas.detection import DetectionRecord, Detections
-from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
 from schemas.manifest import ImageRow
-from schemas.objects import (
-    Evidence,
-    FitUncertainty,
-    PerceivedObject,
-    PerceivedObjects,
-    PlacedObject,
-    PlacedObjects,
-    Table,
-)
-from schemas.observation import Observation
-from schemas.outcome import Allowance, Done, Dropped, Failed, ModelCost
-from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
-from schemas.trajectories import Grasps, Motion, Placement, Verdict
-from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
+
+_MODULES = (geometry, objects, observation, outcome, scene, trajectories, work)
 
 RECORD_TYPES: dict[str, type[Any]] = {
     kind.__name__: kind
     for kind in (
-        Allowance,
-        Assessment,
-        Camera,
-        Certificate,
-        StageChain,
-        StageChainReport,
-        ConvexPieces,
-        CuratedScene,
-        DetectionRecord,
-        Detections,
-        Done,
-        Dropped,
-        Evidence,
-        ExportedScene,
-        Failed,
-        FitUncertainty,
-        Grasps,
-        ImageRow,
-        Motion,
-        Observation,
-        PerceivedObject,
-        PerceivedObjects,
-        PlacedObject,
-        PlacedObjects,
-        Placement,
-        Pose,
-        RectifiedLayout,
-        SandboxSetup,
-        SceneResult,
-        SettledScene,
-        ModelCost,
-        StageCall,
-        StageReport,
-        StageTiming,
-        Table,
-        Texture,
-        TriangleMesh,
-        Verdict,
+        *(kind for module in _MODULES for kind in vars(module).values() if isinstance(kind, type)),
+        *(Assessment, DetectionRecord, Detections, ImageRow),
     )
+    if is_dataclass(kind) or issubclass(kind, BaseModel)
 }
+"""All dataclasses that flow between stages and processes, and the models that they hold, by name."""
 
 _ARRAY_KINDS = "biufc"
 
@@ -94,20 +48,20 @@ _SCHEMA = pa.schema([("tree", pa.large_binary()), ("blobs", pa.list_(pa.large_bi
 
 
 def encode(record: Any) -> bytes:
-    """Bytes of a record of `RECORD_TYPES` (or a tuple, mapping or scalar made of them).
+    """Encode a record of `RECORD_TYPES`, or a tuple, mapping or scalar made of them.
 
     Raises:
         TypeError: if anything inside is of a type that is not listed.
     """
     blobs: list[bytes | memoryview] = []
     tree = json.dumps(_to_tree(record, blobs), separators=(",", ":")).encode()
-    batch = pa.record_batch([pa.array([tree], pa.large_binary()), _one_list(blobs)], _SCHEMA)
+    batch = pa.record_batch([pa.array([tree], pa.large_binary()), _make_list(blobs)], _SCHEMA)
     message: bytes = batch.serialize().to_pybytes()
     return message
 
 
 def decode(data: bytes) -> Any:
-    """The record that `encode` was given.
+    """Decode the record that `encode` was given.
 
     Raises:
         ValueError: if the bytes are not such a message or name an unknown type.
@@ -121,8 +75,8 @@ def decode(data: bytes) -> Any:
         raise ValueError(f"not a message of records: {type(error).__name__}: {error}"[:300]) from error
 
 
-def _one_list(blobs: list[bytes | memoryview]) -> pa.ListArray:
-    """A list of all blobs as one value; Arrow, told them one by one, would copy them as often as its buffer grows."""
+def _make_list(blobs: list[bytes | memoryview]) -> pa.ListArray:
+    """Make a list of all blobs as one value; appended one by one, Arrow would copy them whenever its buffer grows."""
     ends = np.cumsum([0, *(len(blob) for blob in blobs)], dtype=np.int64)
     buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(blobs))]
     values = pa.Array.from_buffers(pa.large_binary(), len(blobs), buffers)
@@ -131,7 +85,7 @@ def _one_list(blobs: list[bytes | memoryview]) -> pa.ListArray:
 
 def _to_tree(value: Any, blobs: list[bytes | memoryview]) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
-        return value if type(value) in (type(None), bool, int, float, str) else _plain(value)
+        return value if type(value) in (type(None), bool, int, float, str) else _to_scalar(value)
     if isinstance(value, bytes):
         blobs.append(value)
         return {"$bytes": len(blobs) - 1}
@@ -148,14 +102,14 @@ def _to_tree(value: Any, blobs: list[bytes | memoryview]) -> Any:
         return {"$dict": [[_to_tree(k, blobs), _to_tree(v, blobs)] for k, v in value.items()]}
     name = type(value).__name__
     if RECORD_TYPES.get(name) is not type(value):
-        raise TypeError(f"{type(value).__qualname__} is no record type: list it in schemas.codec.RECORD_TYPES")
+        raise TypeError(f"{type(value).__qualname__} is no record type (see schemas.codec.RECORD_TYPES)")
     if isinstance(value, BaseModel):
         return {"$model": name, "json": value.model_dump_json(by_alias=True)}
     return {"$record": name, "fields": [_to_tree(getattr(value, f.name), blobs) for f in fields(value)]}
 
 
-def _plain(value: Any) -> Any:
-    """A subclass of a scalar (an enum, a numpy float) as the scalar itself."""
+def _to_scalar(value: Any) -> Any:
+    """Convert a subclass of a scalar (an enum, a numpy float) to the scalar."""
     return value.item() if isinstance(value, np.generic) else value.value
 
 

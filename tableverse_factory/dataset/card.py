@@ -1,4 +1,4 @@
-"""The dataset card, OUT/README.md: what is in the dataset, where scenes were lost, and under which licences."""
+"""Dataset card, OUT/README.md: content of the dataset, where scenes were lost, and licences."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -32,25 +32,25 @@ model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel""
 
 
 def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]) -> str:
-    """The card as Markdown under the head that the Hub reads: the same for the same dataset.
+    """Make the card as Markdown with the Hub's front matter: the same for the same dataset.
 
     Args:
         out: The dataset.
         run: Its `run.json`.
-        shards: Numbers of the committed shards, of which alone it speaks.
+        shards: Numbers of the committed shards, the only ones it covers.
     """
-    scenes = _scenes(out, shards)
+    scenes = _read_scenes(out, shards)
     rows = {table: _count_rows(out, table, shards) for table in ("objects", "tasks")}
     status = Counter(scenes["status"].to_pylist())
     motions = summarize_trajectories(out, shards)
-    bound = _done(scenes, "licence", "mesh_licences")
+    bound = _select_done(scenes, "licence", "mesh_licences")
     licences = [name for row in bound for name in (row["licence"] or "", *(row["mesh_licences"] or ()))]
     tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
     parts = [
         make_front_matter(scenes.num_rows, licences, tables),
         "# Table-top scenes for MuJoCo",
         "Made by TableVerse Factory from pictures; every scene was settled, and certified on the exported XML.",
-        _table(
+        _format_table(
             ("what", "count"),
             [
                 ("scenes in the manifest", scenes.num_rows),
@@ -64,86 +64,88 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
             ],
         ),
         "## Where scenes were lost",
-        _funnel(scenes),
-        *_trajectories(motions),
+        _format_funnel(scenes),
+        *_format_trajectories(motions),
         "## Licences",
-        _licences(scenes),
+        _format_licences(scenes),
         "## Sources",
-        _sources(scenes),
+        _format_sources(scenes),
         "## Models",
-        _models(scenes, summarize_judgements(out, shards), read_model_costs(out, shards)),
+        _format_models(scenes, summarize_judgements(out, shards), read_model_costs(out, shards)),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
         f"Seed {run['seed']}, configuration `{run['fingerprint'][:16]}`; `run.json` holds every value and version.",
-        *_published(run),
+        *_describe_profile(run),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _published(run: Mapping[str, Any]) -> list[str]:
-    """Where this is a dataset that `tableverse export` wrote, under which profile."""
+def _describe_profile(run: Mapping[str, Any]) -> list[str]:
+    """Name the profile of a dataset that `tableverse export` wrote."""
     if "published" not in run:
         return []
     return [f"Only scenes of the profile `{run['published']['profile']}` are in here; the others were left out."]
 
 
-def _funnel(scenes: pa.Table) -> str:
+def _format_funnel(scenes: pa.Table) -> str:
     lost = scenes.filter(pc.not_equal(scenes["status"], "done"))
     if not lost.num_rows:
         return "None was."
     whys = [row["reason"] or row["error_kind"] for row in lost.select(["reason", "error_kind"]).to_pylist()]
     counts = Counter(zip(lost["status"].to_pylist(), lost["stage"].to_pylist(), whys, strict=True))
-    return _table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _largest(counts)])
+    return _format_table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _sort_by_count(counts)])
 
 
-def _trajectories(motions: TrajectorySummary) -> list[str]:
-    """How many tasks a robot was tried on, and where it failed; nothing where no trajectories were asked for."""
+def _format_trajectories(motions: TrajectorySummary) -> list[str]:
+    """Format how many tasks a robot tried, and where it failed; nothing without trajectories."""
     if not motions.tasks:
         return []
     share = motions.succeeded / motions.tasks
     parts = ["## Trajectories", f"{motions.succeeded} of {motions.tasks} tasks that were tried succeed ({share:.0%})."]
     if motions.failed:
-        failed = [(*key, count) for key, count in _largest(motions.failed)]
-        parts.append(_table(("failed in", "why", "tasks"), failed))
+        failed = [(*key, count) for key, count in _sort_by_count(motions.failed)]
+        parts.append(_format_table(("failed in", "why", "tasks"), failed))
     return parts
 
 
-def _licences(scenes: pa.Table) -> str:
-    """By verdict and by name: a scene is an adaptation of its picture, so the picture's licence binds it.
+def _format_licences(scenes: pa.Table) -> str:
+    """Count licences by verdict and by name.
 
-    So do those of meshes that models made.
+    A scene is an adaptation of its picture, so the picture's licence binds it, and those of generated meshes.
     """
-    done = _done(scenes, "licence_verdict", "licence", "mesh_licences")
+    done = _select_done(scenes, "licence_verdict", "licence", "mesh_licences")
     verdicts = Counter(row["licence_verdict"] or "unknown" for row in done)
-    names = Counter((_named(row), row["licence_verdict"] or "unknown") for row in done)
-    by_verdict = _table(("verdict", "done scenes"), _largest(verdicts))
-    by_name = _table(("licence", "verdict", "done scenes"), [(*key, count) for key, count in _largest(names)])
+    names = Counter((_name_licences(row), row["licence_verdict"] or "unknown") for row in done)
+    by_verdict = _format_table(("verdict", "done scenes"), _sort_by_count(verdicts))
+    by_name = _format_table(
+        ("licence", "verdict", "done scenes"), [(*key, count) for key, count in _sort_by_count(names)]
+    )
     note = "Sorted by name, not by a lawyer; `tableverse export` writes a dataset without what may not be passed on."
     return f"{by_verdict}\n\n{by_name}\n\n{note}"
 
 
-def _named(row: Mapping[str, Any]) -> str:
-    """What binds a scene, by name."""
+def _name_licences(row: Mapping[str, Any]) -> str:
+    """Name the licences that bind a scene."""
     meshes = row["mesh_licences"]
     return (row["licence"] or "not stated") + (f"; meshes: {', '.join(meshes)}" if meshes else "")
 
 
-def _sources(scenes: pa.Table) -> str:
-    sources = Counter(row["source"] or "not stated" for row in _done(scenes, "source"))
-    return _table(("source", "done scenes"), _largest(sources))
+def _format_sources(scenes: pa.Table) -> str:
+    sources = Counter(row["source"] or "not stated" for row in _select_done(scenes, "source"))
+    return _format_table(("source", "done scenes"), _sort_by_count(sources))
 
 
-def _models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:
-    """Who found the objects and who judged, what that cost, and how far the rules agree."""
-    found = Counter(row["perception"] or "none" for row in _done(scenes, "perception"))
-    rows = [("perception", name, count) for name, count in _largest(found)]
-    rows += [("judge", name, count) for name, count in _largest(verdicts.judges)]
-    parts = [_table(("door", "answered by", "done scenes"), rows)]
+def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:
+    """Format who found the objects and who judged, what that cost, and how far the rules agree."""
+    found = Counter(row["perception"] or "none" for row in _select_done(scenes, "perception"))
+    rows = [("perception", name, count) for name, count in _sort_by_count(found)]
+    rows += [("judge", name, count) for name, count in _sort_by_count(verdicts.judges)]
+    parts = [_format_table(("door", "answered by", "done scenes"), rows)]
     if spent:
         parts.append("What their answers cost when they were first given:")
         parts.append(
-            _table(
+            _format_table(
                 ("asked by the", "calls", "tokens read", "tokens written", "USD"),
                 [
                     (asker, cost.calls, cost.input_tokens, cost.output_tokens, f"{cost.usd:.4g}" if cost.usd else "–")
@@ -159,20 +161,20 @@ def _models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelC
         )
     if verdicts.remarks:
         parts.append("Not taken as answered:")
-        parts.append(_table(("remark", "times"), _largest(verdicts.remarks)))
+        parts.append(_format_table(("remark", "times"), _sort_by_count(verdicts.remarks)))
     return "\n\n".join(parts)
 
 
-def _done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
+def _select_done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = scenes.filter(pc.equal(scenes["status"], "done")).select(columns).to_pylist()
     return rows
 
 
-def _largest(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
+def _sort_by_count(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
 
 
-def _scenes(out: StoragePath, shards: Sequence[int]) -> pa.Table:
+def _read_scenes(out: StoragePath, shards: Sequence[int]) -> pa.Table:
     tables = read_shards(out, "scenes", shards, _COLUMNS)
     return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
 
@@ -181,12 +183,12 @@ def _count_rows(out: StoragePath, table: str, shards: Sequence[int]) -> int:
     return sum(found.num_rows for found in read_shards(out, table, shards, ["scene_id"]))
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+def _format_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(_escape_cell(cell) for cell in line) + " |" for line in lines)
 
 
-def _cell(value: object) -> str:
-    """Licences and reasons may be somebody else's text: one line, and no markup."""
+def _escape_cell(value: object) -> str:
+    """Escape markup in licences and reasons, which are untrusted, on one line."""
     text = sanitize_line(str(value))
     return "".join("\\" + c if c in "|`*<>[]#\\" and text != "---" else c for c in text)

@@ -1,5 +1,6 @@
-"""The head of a dataset card, in the YAML that the Hugging Face Hub reads: licences, sizes, and a table per config."""
+"""YAML front matter of a dataset card for the Hugging Face Hub: licences, sizes, and a table per config."""
 
+import re
 from collections.abc import Iterable, Sequence
 
 import yaml
@@ -7,45 +8,12 @@ import yaml
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
 _TAGS = ("mujoco", "simulation", "robotics", "table-top", "3d")
 
-_HUB_LICENCES = frozenset(
-    [
-        "apache-2.0",
-        "mit",
-        "bsd",
-        "bsd-2-clause",
-        "bsd-3-clause",
-        "cc0-1.0",
-        "cc-by-2.0",
-        "cc-by-2.5",
-        "cc-by-3.0",
-        "cc-by-4.0",
-        "cc-by-sa-3.0",
-        "cc-by-sa-4.0",
-        "cc-by-nc-2.0",
-        "cc-by-nc-3.0",
-        "cc-by-nc-4.0",
-        "cc-by-nc-sa-2.0",
-        "cc-by-nc-sa-3.0",
-        "cc-by-nc-sa-4.0",
-        "cc-by-nd-4.0",
-        "cc-by-nc-nd-3.0",
-        "cc-by-nc-nd-4.0",
-        "cdla-permissive-1.0",
-        "cdla-permissive-2.0",
-        "cdla-sharing-1.0",
-        "gfdl",
-        "gpl-3.0",
-        "isc",
-        "ncsa",
-        "odbl",
-        "odc-by",
-        "pddl",
-        "unlicense",
-        "wtfpl",
-        "zlib",
-    ]
+_HUB_LICENCES = re.compile(
+    r"apache-2\.0|mit|bsd(-[23]-clause)?|isc|ncsa|unlicense|wtfpl|zlib|gfdl|gpl-3\.0|odbl|odc-by|pddl"
+    r"|cc0-1\.0|cc-by-(2\.0|2\.5|3\.0|4\.0)|cc-by-sa-[34]\.0|cc-by-nc-[234]\.0|cc-by-nc-sa-[234]\.0|cc-by-nd-4\.0"
+    r"|cc-by-nc-nd-[34]\.0|cdla-permissive-[12]\.0|cdla-sharing-1\.0"
 )
-"""Names of licences that the Hub knows."""
+"""Licence names that the Hub knows."""
 
 _HUB_NAMES = {
     "cc0": "cc0-1.0",
@@ -55,20 +23,20 @@ _HUB_NAMES = {
     "gpl-3.0-only": "gpl-3.0",
     "gpl-3.0-or-later": "gpl-3.0",
 }
-"""What the Hub calls some SPDX identifiers."""
+"""Names on the Hub of some SPDX identifiers."""
 
 
 def make_front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[str]) -> str:
-    """The head, between its two lines of dashes.
+    """Make the front matter, with its two lines of dashes.
 
     Args:
-        n_scenes: How many scenes the dataset has.
-        licences: What binds them, by name; empty where none is stated.
-        tables: Which tables have rows; the first is shown first.
+        n_scenes: Number of scenes in the dataset.
+        licences: Names of the licences that bind them; empty if none is stated.
+        tables: Tables that have rows; the first is the default.
     """
     head = {
         "pretty_name": "Table-top scenes for MuJoCo",
-        **_licence(licences),
+        **_make_license_keys(licences),
         "size_categories": [next((name for limit, name in SIZES if n_scenes < limit), "1M<n<10M")],
         "task_categories": ["robotics"],
         "tags": list(_TAGS),
@@ -84,14 +52,10 @@ def make_front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[s
     return f"---\n{yaml.safe_dump(head, sort_keys=False)}---"
 
 
-def _licence(licences: Iterable[str]) -> dict[str, object]:
-    """One name or several that the Hub knows; `other` where it does not know them all."""
-    names = sorted({_hub_name(licence) for licence in licences})
-    if not names or not _HUB_LICENCES.issuperset(names):
+def _make_license_keys(licences: Iterable[str]) -> dict[str, object]:
+    """Name the licences as the Hub does; `other` if it does not know them all."""
+    plain = ("-".join(licence.lower().split()) for licence in licences)
+    names = sorted({_HUB_NAMES.get(name, name) for name in plain})
+    if not names or not all(map(_HUB_LICENCES.fullmatch, names)):
         return {"license": "other", "license_name": "stated-for-each-scene"}
     return {"license": names[0] if len(names) == 1 else names}
-
-
-def _hub_name(licence: str) -> str:
-    name = "-".join(licence.lower().split())
-    return _HUB_NAMES.get(name, name)

@@ -1,4 +1,4 @@
-"""A scene of a committed shard as the record that it was written from: nothing that is at rest is computed again."""
+"""Scene of a committed shard as the record that it was written from, so that nothing committed is recomputed."""
 
 from collections.abc import Hashable, Mapping
 from functools import lru_cache
@@ -26,53 +26,53 @@ ADDED_BY_COMMIT = frozenset(
         *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),
     }
 )
-"""Columns of scenes/ that the scene itself does not know."""
+"""Columns of scenes/ that the commit adds to those of the scene itself."""
 
 
 def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> ExportedScene | None:
-    """The scene as it left `export`, without the trajectories that came after it.
+    """Load a scene as it left `export`, without its trajectories.
 
     Args:
         out: The dataset.
-        shard: Where the scene stands.
+        shard: Of the scene.
         scene_id: Of the scene.
 
     Returns:
-        What the stage gave; None where the shard is not committed, or the scene has no files in it.
+        The stage's output; None if the shard is not committed, or the scene has no files in it.
 
     Raises:
         BuildError: if the shard is damaged.
         StoreError: if the store refuses or does not answer.
     """
     try:
-        tables = _tables(out, shard, _version(shard_path(out, "scenes", shard)))
-        scenes, objects, tasks = (_rows(table, scene_id) for table in tables)
+        tables = _read_tables(out, shard, _read_version(shard_path(out, "scenes", shard)))
+        scenes, objects, tasks = (_select_rows(table, scene_id) for table in tables)
         if not scenes or scenes[0]["tar_offset"] is None:
             return None
-        files = _files(out, shard, scene_id, scenes[0])
+        files = _read_files(out, shard, scene_id, scenes[0])
     except FileNotFoundError:
         return None
     row = {name: None if name in ADDED_BY_COMMIT else value for name, value in scenes[0].items()}
     try:
         certificate = read_meta(dict(files).get("meta.json", b"null")).certificate
     except InputError as error:
-        raise _damaged(out, shard, f"{scene_id}: {error}") from error
+        raise _damage_error(out, shard, f"{scene_id}: {error}") from error
     return ExportedScene(scene_id, strip_motions(files), certificate, row, tuple(objects), tuple(tasks))
 
 
 @lru_cache(maxsize=1)
-def _tables(out: StoragePath, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
-    """The tables of a shard: its scenes are asked for one after the other, and in a store each table is a download.
+def _read_tables(out: StoragePath, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
+    """Read the tables of a shard, cached: its scenes are loaded one after the other, and in a store each is a download.
 
     Args:
         out: The dataset.
         shard: Its number.
-        version: Of the table of scenes, which is removed first and written last when a shard is written again.
+        version: Of the table of scenes, which is removed first and written last when a shard is rewritten.
     """
     return tuple(read_shard(out, table, shard) for table in ("scenes", "objects", "tasks"))
 
 
-def _version(path: StoragePath) -> tuple[Hashable, ...]:
+def _read_version(path: StoragePath) -> tuple[Hashable, ...]:
     if isinstance(path, UPath):
         found = path.fs.info(path.path)
         return found["ETag"], found["LastModified"], found["size"]
@@ -80,23 +80,23 @@ def _version(path: StoragePath) -> tuple[Hashable, ...]:
     return found.st_ino, found.st_mtime_ns, found.st_size
 
 
-def _rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
+def _select_rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist()
     return rows
 
 
-def _files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
+def _read_files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:
     with open_stream(shard_path(out, "mjcf", shard)) as tar:
         tar.seek(row["tar_offset"])
         data = tar.read(row["tar_size"])
     if len(data) != row["tar_size"]:
-        raise _damaged(out, shard, f"{scene_id} is cut short")
+        raise _damage_error(out, shard, f"{scene_id} is cut short")
     try:
         return tuple(read_scene_files(scene_id, data).items())
     except InputError as error:
-        raise _damaged(out, shard, str(error)) from error
+        raise _damage_error(out, shard, str(error)) from error
 
 
-def _damaged(out: StoragePath, shard: int, what: str) -> BuildError:
+def _damage_error(out: StoragePath, shard: int, what: str) -> BuildError:
     path = shard_path(out, "mjcf", shard)
     return BuildError(f"{path} is damaged ({what}): {advise_repair(path)}")

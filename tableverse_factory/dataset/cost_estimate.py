@@ -1,9 +1,8 @@
-"""What a larger build will cost, from what each scene of a smaller one took: arithmetic, with intervals by bootstrap.
+"""Cost estimate of a larger build from the scenes of a smaller one, with bootstrap intervals.
 
-Every figure is the mean over the measured scenes times the scenes wanted. Scenes that were dropped early count with the
-little that they took, so the funnel is in the mean. The interval is that of the mean: a bootstrap of the scenes with
-Student's statistic, which suits the long tails of durations better than percentiles do (Efron and Tibshirani 1993,
-section 12.5).
+Every figure is the mean over the measured scenes times the scenes wanted; scenes that were dropped early count with the
+little that they took. The interval is that of the mean, by a bootstrap-t over the scenes, which suits the long tails of
+durations better than percentiles do (Efron and Tibshirani 1993, section 12.5).
 """
 
 import math
@@ -21,10 +20,9 @@ MIN_SCENES = 50
 LEVEL = 0.95
 SEED = 20260
 PRICES = ("cpu_hour", "gpu_hour", "gb_month", "input_mtok", "output_mtok")
-"""What can have a price: an hour of a CPU or GPU, a GB kept for a month, a million tokens read or written."""
+"""Names of prices: per hour of a CPU or GPU, GB stored for a month, million tokens read or written."""
 
-_MAX_RESAMPLES = 1000
-_MIN_RESAMPLES = 200
+_MIN_RESAMPLES, _MAX_RESAMPLES = 200, 1000
 _MAX_DRAWS = 20_000_000
 _DRAWS_AT_ONCE = 1_000_000
 _LEAST_DEVIATION = 0.1
@@ -35,13 +33,13 @@ Values: TypeAlias = Float[np.ndarray, " n"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageTimes:
-    """What one stage took of every measured scene [s]; 0 where a scene did not come so far.
+    """Times of one stage on every measured scene; 0 for scenes that did not reach it.
 
     Attributes:
-        name: The stage.
-        pool: Of workers that run it.
-        cpu_s: CPU time. Shape (n,).
-        wall_s: Wall time. Shape (n,).
+        name: Of the stage.
+        pool: Pool of workers that runs it.
+        cpu_s: CPU time. Shape (n,) [s].
+        wall_s: Wall time. Shape (n,) [s].
     """
 
     name: str
@@ -52,14 +50,14 @@ class StageTimes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BuildSample:
-    """What the scenes of a build took, one entry per scene; storage and tokens may be known of fewer scenes.
+    """Measured costs of a build, one entry per scene; storage and tokens may be known of fewer scenes.
 
     Attributes:
         stages: In the order in which they run.
         storage: Bytes per scene, by what holds them. Shape (m,) each.
-        input_tokens: Read by models. Shape (m,).
-        output_tokens: Written by models. Shape (m,).
-        notes: What could not be measured, in words.
+        input_tokens: Shape (m,).
+        output_tokens: Shape (m,).
+        notes: What could not be measured.
     """
 
     stages: tuple[StageTimes, ...]
@@ -70,13 +68,13 @@ class BuildSample:
 
     @property
     def scenes(self) -> int:
-        """On how many scenes the times stand."""
+        """Number of measured scenes."""
         return len(self.stages[0].cpu_s) if self.stages else 0
 
 
 @dataclass(frozen=True, slots=True)
 class ClusterSize:
-    """What a build may use."""
+    """CPUs and GPUs of a cluster."""
 
     cpus: float
     gpus: float = 0.0
@@ -90,35 +88,33 @@ class IntervalEstimate:
     low: float
     high: float
 
-    def times(self, factor: float) -> "IntervalEstimate":
-        """All three times a factor that is not negative."""
+    def scale(self, factor: float) -> "IntervalEstimate":
+        """Multiply by a factor that is not negative."""
         return IntervalEstimate(self.value * factor, self.low * factor, self.high * factor)
 
-    def plus(self, other: "IntervalEstimate") -> "IntervalEstimate":
-        """The sum; its interval is wide enough for both to be off to the same side."""
+    def add(self, other: "IntervalEstimate") -> "IntervalEstimate":
+        """Add another estimate; the interval allows both to be off to the same side."""
         return IntervalEstimate(self.value + other.value, self.low + other.low, self.high + other.high)
 
 
 @dataclass(frozen=True, slots=True)
 class CostEstimate:
-    """What so many scenes will take.
+    """Cost estimate of a build.
 
     Attributes:
-        scenes: How many are wanted.
-        measured: On how many it stands.
+        scenes: Scenes that are planned.
+        measured: Scenes that were measured.
         cpu_hours: CPU time that the stages use.
         cpu_hours_held: CPUs that actors hold, waiting included.
         gpu_hours: GPUs that actors hold.
-        waiting_share: Share of the wall time of the stages that is no CPU time.
+        waiting_share: Share of the stages' wall time that is no CPU time.
         storage: Bytes, by what holds them.
-        input_tokens: Read by models.
-        output_tokens: Written by models.
-        wall_hours: On the stated cluster, if no worker is ever idle; None where none was stated.
-        least_wall_hours: The same if nothing were waited for, neither a model nor a crowded machine.
-        bottleneck: What decides the wall time, in words.
-        costs: In the currency of the prices, by what they are for.
+        wall_hours: On the stated cluster if no worker is ever idle; None if no cluster was stated.
+        least_wall_hours: The same without waiting for models or crowded machines.
+        bottleneck: What limits the wall time.
+        costs: By purpose, in the currency of the prices.
         stages: CPU and wall time per scene that enters the build [s], by stage.
-        notes: What was left out, in words.
+        notes: What was left out.
     """
 
     scenes: int
@@ -141,14 +137,14 @@ class CostEstimate:
 def estimate_cost(
     measured: BuildSample, scenes: int, pools: Pools, cluster: ClusterSize | None, prices: Mapping[str, float]
 ) -> CostEstimate:
-    """What a build of so many scenes like the measured ones will take.
+    """Estimate the cost of a build of scenes like the measured ones.
 
     Args:
         measured: A finished or running build.
-        scenes: Rows of the manifest that is planned.
-        pools: What an actor of each pool holds.
+        scenes: Rows of the planned manifest.
+        pools: Resources that an actor of each pool holds.
         cluster: Where it will run, or None.
-        prices: By the names in `PRICES`; what is missing costs nothing.
+        prices: By the names in `PRICES`; missing ones are 0.
 
     Raises:
         BuildError: if fewer than `MIN_SCENES` scenes were measured, or the pools want GPUs and the cluster has none.
@@ -159,16 +155,17 @@ def estimate_cost(
             f"{MIN_SCENES}, better some hundreds, of the same kind first"
         )
     n = measured.scenes
-    cpu = _sum([stage.cpu_s for stage in measured.stages], n)
-    wall = _sum([stage.wall_s for stage in measured.stages], n)
+    cpu = _sum_times([stage.cpu_s for stage in measured.stages], n)
+    wall = _sum_times([stage.wall_s for stage in measured.stages], n)
     hours = {
-        name: bootstrap_total(values, scenes).times(1.0 / _HOUR_S) for name, values in _held(measured, pools).items()
+        name: bootstrap_total(values, scenes).scale(1.0 / _HOUR_S)
+        for name, values in _compute_held_seconds(measured, pools).items()
     }
-    cpu_hours = bootstrap_total(cpu, scenes).times(1.0 / _HOUR_S)
+    cpu_hours = bootstrap_total(cpu, scenes).scale(1.0 / _HOUR_S)
     storage = {name: bootstrap_total(values, scenes) for name, values in measured.storage.items()}
     tokens = bootstrap_total(measured.input_tokens, scenes), bootstrap_total(measured.output_tokens, scenes)
     wall_hours, bottleneck = (
-        (None, "") if cluster is None else _wall(measured, scenes, pools, cluster, hours, cpu_hours)
+        (None, "") if cluster is None else _find_bottleneck(measured, scenes, pools, cluster, hours, cpu_hours)
     )
     return CostEstimate(
         scenes=scenes,
@@ -181,9 +178,9 @@ def estimate_cost(
         input_tokens=tokens[0],
         output_tokens=tokens[1],
         wall_hours=wall_hours,
-        least_wall_hours=None if cluster is None else cpu_hours.times(1.0 / cluster.cpus),
+        least_wall_hours=None if cluster is None else cpu_hours.scale(1.0 / cluster.cpus),
         bottleneck=bottleneck,
-        costs=_costs(prices, hours, wall_hours, cluster, storage, tokens),
+        costs=_compute_costs(prices, hours, wall_hours, cluster, storage, tokens),
         stages={
             stage.name: (bootstrap_total(stage.cpu_s, 1), bootstrap_total(stage.wall_s, 1)) for stage in measured.stages
         },
@@ -192,10 +189,10 @@ def estimate_cost(
 
 
 def bootstrap_total(values: Values, scenes: int) -> IntervalEstimate:
-    """What so many scenes add up to, with the bootstrap interval of the mean; 0 where nothing was measured.
+    """Scale the mean of values to a number of scenes, with its bootstrap interval; 0 if there are no values.
 
-    Linear in `scenes`. The same values give the same interval: the generator starts from `SEED` every time. The
-    interval is that of the mean; the sum of few new scenes scatters more.
+    Linear in `scenes`. The generator starts from `SEED` every time, so equal values give equal intervals. The sum of
+    few new scenes scatters more than the interval, which is that of the mean.
     """
     n = len(values)
     if n == 0:
@@ -220,7 +217,7 @@ def bootstrap_total(values: Values, scenes: int) -> IntervalEstimate:
 
 
 def parse_amounts(text: Sequence[str], allowed: Sequence[str], option: str) -> dict[str, float]:
-    """`name=number` entries.
+    """Parse `name=number` entries.
 
     Raises:
         ConfigError: naming what is allowed.
@@ -238,27 +235,25 @@ def parse_amounts(text: Sequence[str], allowed: Sequence[str], option: str) -> d
     return found
 
 
-def _sum(parts: Sequence[Values], n: int) -> Values:
+def _sum_times(parts: Sequence[Values], n: int) -> Values:
     return np.sum(parts, axis=0) if parts else np.zeros(n)
 
 
-def _spec(pools: Pools, pool: str) -> PoolSpec:
+def _get_spec(pools: Pools, pool: str) -> PoolSpec:
     spec: PoolSpec = getattr(pools, pool)
     return spec
 
 
-def _held(measured: BuildSample, pools: Pools) -> dict[str, Values]:
-    """CPU and GPU seconds that actors hold per scene: wall times, times what an actor of the stage's pool holds."""
-    specs = [_spec(pools, stage.pool) for stage in measured.stages]
-    held = list(zip(measured.stages, specs, strict=True))
-    n = measured.scenes
+def _compute_held_seconds(measured: BuildSample, pools: Pools) -> dict[str, Values]:
+    """Compute the CPU and GPU seconds that actors hold per scene: wall times times the resources of an actor."""
+    held = [(stage, _get_spec(pools, stage.pool)) for stage in measured.stages]
     return {
-        "CPU": _sum([stage.wall_s * spec.cpus for stage, spec in held], n),
-        "GPU": _sum([stage.wall_s * spec.gpus for stage, spec in held], n),
+        "CPU": _sum_times([stage.wall_s * spec.cpus for stage, spec in held], measured.scenes),
+        "GPU": _sum_times([stage.wall_s * spec.gpus for stage, spec in held], measured.scenes),
     }
 
 
-def _wall(
+def _find_bottleneck(
     measured: BuildSample,
     scenes: int,
     pools: Pools,
@@ -266,27 +261,27 @@ def _wall(
     hours: Mapping[str, IntervalEstimate],
     cpu_hours: IntervalEstimate,
 ) -> tuple[IntervalEstimate, str]:
-    """The longest of: CPUs held, CPU time used, GPUs held, and the pools that may not grow."""
+    """Find the longest of: CPUs held, CPU time used, GPUs held, and the pools of bounded size."""
     if hours["GPU"].value > 0 and cluster.gpus == 0:
         raise BuildError("the pools hold GPUs and the stated cluster has none: give gpus=NUMBER too")
     bounds = [
-        (hours["CPU"].times(1.0 / cluster.cpus), "the CPUs that actors hold"),
-        (cpu_hours.times(1.0 / cluster.cpus), "CPU time"),
+        (hours["CPU"].scale(1.0 / cluster.cpus), "the CPUs that actors hold"),
+        (cpu_hours.scale(1.0 / cluster.cpus), "CPU time"),
     ]
     if cluster.gpus:
-        bounds.append((hours["GPU"].times(1.0 / cluster.gpus), "the GPUs that actors hold"))
+        bounds.append((hours["GPU"].scale(1.0 / cluster.gpus), "the GPUs that actors hold"))
     for pool in dict.fromkeys(stage.pool for stage in measured.stages):
-        if (most := _spec(pools, pool).max) is not None:
-            values = _sum([stage.wall_s for stage in measured.stages if stage.pool == pool], measured.scenes)
+        if (most := _get_spec(pools, pool).max) is not None:
+            values = _sum_times([stage.wall_s for stage in measured.stages if stage.pool == pool], measured.scenes)
             bounds.append(
-                (bootstrap_total(values, scenes).times(1.0 / _HOUR_S / most), f"pool {pool} with at most {most} actors")
+                (bootstrap_total(values, scenes).scale(1.0 / _HOUR_S / most), f"pool {pool} with at most {most} actors")
             )
     longest, why = max(bounds, key=lambda bound: bound[0].value)
     ranges = [bound for bound, _ in bounds]
     return IntervalEstimate(longest.value, max(r.low for r in ranges), max(r.high for r in ranges)), why
 
 
-def _costs(
+def _compute_costs(
     prices: Mapping[str, float],
     hours: Mapping[str, IntervalEstimate],
     wall_hours: IntervalEstimate | None,
@@ -294,20 +289,20 @@ def _costs(
     storage: Mapping[str, IntervalEstimate],
     tokens: tuple[IntervalEstimate, IntervalEstimate],
 ) -> dict[str, IntervalEstimate]:
-    """Machines are paid for the whole cluster's time where one is stated, else for what is held."""
+    """Compute costs; machines are paid for the whole cluster's time if one is stated, else for what is held."""
     cpu_hour, gpu_hour = prices.get("cpu_hour", 0.0), prices.get("gpu_hour", 0.0)
     costs: dict[str, IntervalEstimate] = {}
     if cpu_hour or gpu_hour:
         if wall_hours is not None and cluster is not None:
-            costs["machines"] = wall_hours.times(cluster.cpus * cpu_hour + cluster.gpus * gpu_hour)
+            costs["machines"] = wall_hours.scale(cluster.cpus * cpu_hour + cluster.gpus * gpu_hour)
         else:
-            costs["machines"] = hours["CPU"].times(cpu_hour).plus(hours["GPU"].times(gpu_hour))
+            costs["machines"] = hours["CPU"].scale(cpu_hour).add(hours["GPU"].scale(gpu_hour))
     if "input_mtok" in prices or "output_mtok" in prices:
         read, written = (prices.get(name, 0.0) / 1e6 for name in ("input_mtok", "output_mtok"))
-        costs["models"] = tokens[0].times(read).plus(tokens[1].times(written))
+        costs["models"] = tokens[0].scale(read).add(tokens[1].scale(written))
     if "gb_month" in prices:
         kept = IntervalEstimate(0.0, 0.0, 0.0)
         for size in storage.values():
-            kept = kept.plus(size)
-        costs["storage per month"] = kept.times(prices["gb_month"] / 1e9)
+            kept = kept.add(size)
+        costs["storage per month"] = kept.scale(prices["gb_month"] / 1e9)
     return costs

@@ -1,4 +1,4 @@
-"""A dataset behind HTTP as a file system: what lies there is known from its plan, because HTTP has no folders."""
+"""Dataset behind HTTP as a file system, whose files are known from its plan because HTTP lists no folders."""
 
 import io
 import re
@@ -20,39 +20,39 @@ from tableverse_factory.dataset.shard_plan import MAX_SHARDS, PLAN
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE, shard_name
 
 MAX_WHOLE_BYTES = 512 * 1024**2
-"""Of a file that is read whole, such as the plan."""
+"""Largest file that is read whole, such as the plan."""
 
-_HEAD_BYTES = 64 * 1024
-_AT_ONCE = 16
-_MAY_LACK = frozenset({"scenes", MERGED, *SPARSE})
+_FIRST_READ_BYTES = 64 * 1024
+_N_THREADS = 16
+_OPTIONAL_FOLDERS = frozenset({"scenes", MERGED, *SPARSE})
 """Folders in which a dataset may lack a file."""
 
-_PLAIN = re.compile(r"[^\s\x00-\x1f\x7f\\]+")
+_ADDRESS_CHARS = re.compile(r"[^\s\x00-\x1f\x7f\\]+")
 
 
 class WebFolder(AbstractFileSystem):  # type: ignore[misc]
-    """The files of one dataset below an address; paths are whole addresses.
+    """Files of one dataset below an address; paths are whole addresses.
 
-    A file that has another version or length than when it was first read is an error, never a mixture; one that was not
-    there is not asked for again. Servers that may not list what they hold, as public buckets do, refuse what is not
-    there: beside a record that is readable, such a refusal means that a file which may be missing is.
+    A file whose version or length differs from the first read is an error, never a mixture; a missing file is not
+    requested again. Servers that may not list their content, such as public buckets, refuse missing files: beside a
+    readable record, such a refusal of an optional file means that it is missing.
     """
 
     protocol = "tableverse-web"
     cachable = False  # what was seen of a dataset ends with it
 
     def __init__(self, address: str, **options: Any) -> None:
-        """Asks for nothing yet.
+        """Send no request yet.
 
         Args:
-            address: Of the folder, as `check_web_address` gives it.
+            address: Of the folder, from `check_web_address`.
             options: Of fsspec.
         """
         super().__init__(address, **options)
         self.address = address
         self._ranges = HttpRangeReader(self.headers)
         self._versions: dict[str, tuple[int, str]] = {}
-        self._absent: set[str] = set()
+        self._missing: set[str] = set()
         self._refused: set[str] = set()
 
     @classmethod
@@ -60,17 +60,17 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         return path.rstrip("/")
 
     def headers(self) -> Mapping[str, str]:
-        """What the host of `address` is told with every question."""
+        """Return the headers of every request to the host of `address`."""
         return {}
 
     def isdir(self, path: str) -> bool:
-        """Whether there is a dataset, or one of its folders."""
+        """Return whether there is a dataset, or one of its folders."""
         if path.rstrip("/") == self.address:
             return self.exists(f"{self.address}/run.json")
         return bool(self.ls(path))
 
     def exists(self, path: str, **_: Any) -> bool:
-        """Whether there is such a file."""
+        """Return whether there is such a file."""
         try:
             self.info(path)
         except FileNotFoundError:
@@ -78,25 +78,25 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         return True
 
     def info(self, path: str, **_: Any) -> dict[str, Any]:
-        """Name, type and size [bytes] of a file; nothing of it is read."""
+        """Look up name, type and size [bytes] of a file without reading it."""
         if path not in self._versions:
-            self._asked(path, self._ranges.read_size)
+            self._request(path, self._ranges.read_size)
         return {"name": path, "type": "file", "size": self._versions[path][0]}
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
-        """The files in a folder that belong to shards; a question for each, sixteen at a time."""
+        """List the files of shards in a folder, with a request for each, sixteen at a time."""
         sizes = self.sizes(path.rstrip("/").removeprefix(self.address).strip("/"))
         found = [{"name": f"{path.rstrip('/')}/{name}", "type": "file", "size": sizes[name]} for name in sizes]
         return found if detail else [entry["name"] for entry in found]
 
     def sizes(self, folder: str) -> dict[str, int]:
-        """Names and sizes [bytes] of the shards' files in a folder of the dataset."""
+        """List the names and sizes [bytes] of the shards' files in a folder of the dataset."""
         if folder not in FOLDERS | SPARSE:
             return {}
         names = [shard_name(folder, number) for number in self.planned_shards]
         paths = {name: f"{self.address}/{folder}/{name}" for name in names}
-        with ThreadPoolExecutor(_AT_ONCE) as threads:
-            sizes = dict(zip(paths, threads.map(self._size, paths.values()), strict=True))
+        with ThreadPoolExecutor(_N_THREADS) as threads:
+            sizes = dict(zip(paths, threads.map(self._find_size, paths.values()), strict=True))
         found = {name: size for name, size in sizes.items() if size is not None}
         if folder == "scenes" and not found and (refused := self._refused.intersection(paths.values())):
             raise StoreError(
@@ -106,10 +106,10 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
 
     @cached_property
     def planned_shards(self) -> tuple[int, ...]:
-        """Numbers of the shards that the plan names, in order: never more than it has rows.
+        """Numbers of the shards in the plan, in order.
 
         Raises:
-            StoreError: if there is no plan, or it is none.
+            StoreError: if the plan is missing or malformed.
         """
         path = f"{self.address}/plan.parquet"
         try:
@@ -124,58 +124,58 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
         return tuple(shards)
 
     def cat_file(self, path: str, start: int | None = None, end: int | None = None, **_: Any) -> bytes:
-        """Some bytes of a file, and nothing else of it; without bounds all of it."""
+        """Read a byte range of a file and nothing else; without bounds all of it."""
         if end is not None:
-            return self._piece(path, start or 0, end).data
-        head = self._piece(path, start or 0, (start or 0) + _HEAD_BYTES)
+            return self._read_range(path, start or 0, end).data
+        head = self._read_range(path, start or 0, (start or 0) + _FIRST_READ_BYTES)
         if head.total > MAX_WHOLE_BYTES:
             raise StoreError(f"{redact_uri(path)}: {head.total} bytes; at most {MAX_WHOLE_BYTES} are read at once")
         read = (start or 0) + len(head.data)
-        return head.data if read >= head.total else head.data + self._piece(path, read, head.total).data
+        return head.data if read >= head.total else head.data + self._read_range(path, read, head.total).data
 
     def _open(self, path: str, mode: str = "rb", **_: Any) -> BinaryIO:
-        """A file that reads exactly what it is asked for; a small one is fetched at once."""
+        """Open a file that reads exactly what is asked for; a small one is fetched at once."""
         if mode != "rb":
             raise StoreError(f"{redact_uri(path)}: a dataset on the web is read only")
-        if path in self._versions and self._versions[path][0] > _HEAD_BYTES:
+        if path in self._versions and self._versions[path][0] > _FIRST_READ_BYTES:
             return _WebFile(self, path, size=self._versions[path][0], cache_type="none")
-        head = self._piece(path, 0, _HEAD_BYTES)
+        head = self._read_range(path, 0, _FIRST_READ_BYTES)
         whole = len(head.data) == head.total
         return io.BytesIO(head.data) if whole else _WebFile(self, path, size=head.total, cache_type="none")
 
-    def _size(self, path: str) -> int | None:
+    def _find_size(self, path: str) -> int | None:
         try:
             return int(self.info(path)["size"])
         except FileNotFoundError:
             return None
 
-    def _piece(self, path: str, start: int, stop: int) -> ByteRange:
+    def _read_range(self, path: str, start: int, stop: int) -> ByteRange:
         if stop <= start:
             return ByteRange(b"", self.info(path)["size"], "")
-        return self._asked(path, lambda address: self._ranges.read(address, start, stop))
+        return self._request(path, lambda address: self._ranges.read(address, start, stop))
 
-    def _asked(self, path: str, ask: Callable[[str], ByteRange]) -> ByteRange:
-        if path in self._absent:
+    def _request(self, path: str, ask: Callable[[str], ByteRange]) -> ByteRange:
+        if path in self._missing:
             raise FileNotFoundError(f"{redact_uri(path)}: there is no such file")
         try:
             piece = ask(self.address + quote(path.removeprefix(self.address)))
         except FileNotFoundError:
-            self._absent.add(path)
+            self._missing.add(path)
             raise
         except RefusedError:
-            if not self._may_lack(path):
+            if not self._may_be_missing(path):
                 raise
             self._refused.add(path)
-            self._absent.add(path)
+            self._missing.add(path)
             raise FileNotFoundError(f"{redact_uri(path)}: there is no such file") from None
-        return self._known(path, piece)
+        return self._check_version(path, piece)
 
-    def _may_lack(self, path: str) -> bool:
+    def _may_be_missing(self, path: str) -> bool:
         folder = path.removeprefix(self.address).strip("/").partition("/")[0]
-        return folder in _MAY_LACK and self.exists(f"{self.address}/run.json")
+        return folder in _OPTIONAL_FOLDERS and self.exists(f"{self.address}/run.json")
 
-    def _known(self, path: str, piece: ByteRange) -> ByteRange:
-        """The piece, if it is of the file that was seen first."""
+    def _check_version(self, path: str, piece: ByteRange) -> ByteRange:
+        """Return the range if it is of the version of the file that was seen first."""
         if self._versions.setdefault(path, (piece.total, piece.version)) != (piece.total, piece.version):
             raise StoreError(f"{redact_uri(path)}: it changed since the dataset was opened: open it again")
         return piece
@@ -188,17 +188,17 @@ class _WebFile(AbstractBufferedFile):  # type: ignore[misc]
 
 
 def check_web_address(text: str) -> str:
-    """The address of a dataset on the web, without a slash at its end.
+    """Check the address of a dataset on the web, and return it without a slash at its end.
 
     Raises:
-        InputError: if it is none, or holds a secret or a query.
+        InputError: if it is malformed, or holds a secret or a query.
     """
     try:
         parts = urlsplit(text)
         _ = parts.port
     except ValueError:
         raise InputError("that is no address: give https://HOST/PATH") from None
-    if len(text) > MAX_URI_CHARS or not _PLAIN.fullmatch(text) or not parts.hostname:
+    if len(text) > MAX_URI_CHARS or not _ADDRESS_CHARS.fullmatch(text) or not parts.hostname:
         raise InputError("that is no address: give https://HOST/PATH")
     if "@" in parts.netloc or parts.query or parts.fragment or "?" in text or "#" in text:
         raise InputError("give https://HOST/PATH alone, without user, query and fragment")

@@ -1,4 +1,4 @@
-"""What goes wrong with the Hub, in one line that says what to do and holds no token and no signed address."""
+"""Errors of the Hugging Face Hub as one line that says what to do and holds no token and no signed address."""
 
 import re
 from collections.abc import Iterator
@@ -28,19 +28,19 @@ _BY_STATUS = {
 
 
 class ChangedError(StoreError):
-    """The dataset on the Hub is not as it was when it was looked at."""
+    """Error of a dataset on the Hub that changed since it was inspected."""
 
 
 @contextmanager
 def translate_errors(what: str) -> Iterator[None]:
-    """Turns what huggingface_hub raises into one line; only its own calls stand inside.
+    """Translate what huggingface_hub raises into one line.
 
     Args:
-        what: What was asked about, at the head of the line.
+        what: Subject of the request, which begins the line.
 
     Raises:
         ChangedError: if a commit was to follow another than the newest.
-        StoreError: for every other failure of the Hub or the way to it.
+        StoreError: for every other failure of the Hub or the connection.
     """
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -61,12 +61,12 @@ def translate_errors(what: str) -> Iterator[None]:
 
 
 def unwrap_error(error: BaseException) -> BaseException:
-    """What went wrong itself: the library raises a RuntimeError over what went wrong with one of several files."""
+    """Return the cause of a RuntimeError, which the library raises over an error of one of several files."""
     return error.__cause__ if isinstance(error, RuntimeError) and error.__cause__ is not None else error
 
 
 def is_transient(error: BaseException) -> bool:
-    """Whether the Hub may answer the same question a little later."""
+    """Return whether the Hub may answer the same request a little later."""
     from huggingface_hub.errors import HfHubHTTPError
 
     inner = unwrap_error(error)
@@ -75,13 +75,13 @@ def is_transient(error: BaseException) -> bool:
     return isinstance(inner, HfHubHTTPError.__bases__[0])
 
 
-def wait_asked_for(error: BaseException) -> float | None:
-    """How long the Hub asks to wait [s], where it says so in seconds."""
+def get_retry_after(error: BaseException) -> float | None:
+    """Get the wait that the Hub asks for [s]; None if it asks for none."""
     response = getattr(unwrap_error(error), "response", None)
     return None if response is None else parse_retry_after(response.headers.get("retry-after"))
 
 
 def redact_secrets(text: str) -> str:
-    """One short line without tokens, users of addresses, and queries, which may be signatures."""
+    """Reduce a text to one short line without tokens, users in addresses, and queries, which may be signatures."""
     plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
     return sanitize_line(plain, 300)

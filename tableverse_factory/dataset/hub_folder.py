@@ -1,4 +1,4 @@
-"""A dataset on the Hugging Face Hub, read at one commit: what is pushed later does not mix into it."""
+"""Dataset on the Hugging Face Hub, read at one commit: later pushes do not mix into it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,15 +10,15 @@ from tableverse_factory.dataset.hub_names import LIBRARY, make_hub_api, parse_hu
 
 
 class HubFolder(WebFolder):
-    """The files of a dataset at a commit; the Hub lists them, and ranges of their bytes are read as from any server."""
+    """Files of a dataset at a commit; the Hub lists them, and byte ranges are read as from any server."""
 
     protocol = "tableverse-hub"
 
     def __init__(self, address: str, name: str, commit: str, **options: Any) -> None:
-        """Asks for nothing yet.
+        """Send no request yet.
 
         Args:
-            address: Where the files of the commit lie.
+            address: Of the files of the commit.
             name: As `OWNER/NAME`.
             commit: Its hash.
             options: Of fsspec.
@@ -27,18 +27,18 @@ class HubFolder(WebFolder):
         self._name, self._commit = name, commit
 
     def headers(self) -> Mapping[str, str]:
-        """The token, if there is one, for the Hub alone and never for where it sends us on to."""
+        """Return the token, if there is one, for the Hub alone and never for a redirection's target."""
         from huggingface_hub.utils import build_hf_headers
 
         headers: dict[str, str] = build_hf_headers(library_name=LIBRARY)
         return headers
 
     def sizes(self, folder: str) -> dict[str, int]:
-        """Names and sizes [bytes] of the files in a folder, as the Hub lists them."""
+        """List the names and sizes [bytes] of the files in a folder."""
         from huggingface_hub.errors import EntryNotFoundError
         from huggingface_hub.hf_api import RepoFile
 
-        def listed() -> list[Any]:
+        def list_files() -> list[Any]:
             try:
                 return list(
                     make_hub_api().list_repo_tree(self._name, folder, revision=self._commit, repo_type="dataset")
@@ -46,15 +46,15 @@ class HubFolder(WebFolder):
             except EntryNotFoundError:
                 return []
 
-        found = call_hub(f"hf://datasets/{self._name}", listed)
+        found = call_hub(f"hf://datasets/{self._name}", list_files)
         return {entry.path.rpartition("/")[2]: entry.size for entry in found if isinstance(entry, RepoFile)}
 
 
 def open_hub_folder(text: str) -> HubFolder:
-    """The dataset at `hf://datasets/OWNER/NAME[@REVISION]`, at the commit that the revision names now.
+    """Open the dataset at `hf://datasets/OWNER/NAME[@REVISION]` at the commit that the revision names now.
 
     Raises:
-        InputError: if the address is none, or huggingface_hub is not installed.
+        InputError: if the address is malformed, or huggingface_hub is not installed.
         StoreError: if the Hub refuses or does not answer.
     """
     asked, api = parse_hub_address(text), make_hub_api()

@@ -1,4 +1,4 @@
-"""Names of datasets on the Hugging Face Hub, and who may be asked about them."""
+"""Names of datasets on the Hugging Face Hub, and its client."""
 
 import re
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 LIBRARY = "tableverse-factory"
-"""As which the Hub is asked."""
+"""User agent of requests to the Hub."""
 
 _PART = r"(?!.*(?:--|\.\.))[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
 _NAME = re.compile(rf"{_PART}/{_PART}")
@@ -22,7 +22,7 @@ _REVISION = re.compile(r"(?!.*\.\.)[A-Za-z0-9][A-Za-z0-9._/-]{0,199}")
 
 @dataclass(frozen=True, slots=True)
 class HubAddress:
-    """A dataset on the Hub.
+    """Address of a dataset on the Hub.
 
     Attributes:
         name: As `OWNER/NAME`.
@@ -34,10 +34,10 @@ class HubAddress:
 
 
 def check_hub_name(name: str) -> str:
-    """The name unchanged.
+    """Return the name if it is an `OWNER/NAME`.
 
     Raises:
-        InputError: if it is no `OWNER/NAME`.
+        InputError: if it is not.
     """
     if not _NAME.fullmatch(name) or name.endswith(".git"):
         raise InputError(f"{sanitize_line(name, 100)!r} is no name of a dataset on the Hub: give OWNER/NAME")
@@ -45,10 +45,10 @@ def check_hub_name(name: str) -> str:
 
 
 def parse_hub_address(text: str) -> HubAddress:
-    """Reads `hf://datasets/OWNER/NAME`, with `@REVISION` where another than `main` is meant.
+    """Parse `hf://datasets/OWNER/NAME`, with `@REVISION` for another than `main`.
 
     Raises:
-        InputError: if it is nothing of that form.
+        InputError: if it has another form.
     """
     rest = text.removeprefix("hf://datasets/").rstrip("/")
     name, at, revision = rest.partition("@")
@@ -60,7 +60,7 @@ def parse_hub_address(text: str) -> HubAddress:
 
 
 def make_hub_api() -> "HfApi":
-    """The Hub at `HF_ENDPOINT`, asked with the token of `HF_TOKEN` or of `hf auth login`, if there is one.
+    """Make a client of the Hub at `HF_ENDPOINT`, with the token of `HF_TOKEN` or of `hf auth login`, if any.
 
     Raises:
         InputError: if huggingface_hub is not installed.

@@ -1,4 +1,4 @@
-"""What a committed shard has lost since: files that are gone, and a tar that is not as long as it was written."""
+"""Integrity of committed shards: missing files, and tars of another length than was written."""
 
 import tarfile
 from collections.abc import Collection, Iterable, Mapping
@@ -14,54 +14,53 @@ from tableverse_factory.core.storage.files import StoragePath, list_names, list_
 from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.shards import FOLDERS, advise_repair, shard_path
 
-_AT_ONCE = 8
+_N_THREADS = 8
 
 
 def check_files(out: StoragePath, committed: Iterable[int]) -> None:
-    """Looks whether every file of the committed shards is there, with one look at each folder.
+    """Check that every file of the committed shards exists, with one listing per folder.
 
-    Safe while a build runs: a shard that is written anew leaves `scenes/` first, and its other files are replaced, not
+    Safe while a build runs: a shard that is rewritten leaves `scenes/` first, and its other files are replaced, not
     removed. So list the committed shards before.
 
     Raises:
-        BuildError: naming the first file that is gone, and what to do.
+        BuildError: naming the first missing file, and what to do.
     """
     shards = sorted(committed)
     for folder in (name for name in FOLDERS if name != "scenes"):
-        there = set(list_names(out / folder)) if shards else set()
+        names = set(list_names(out / folder)) if shards else set()
         for path in (shard_path(out, folder, shard) for shard in shards):
-            if path.name not in there:
+            if path.name not in names:
                 raise BuildError(f"{path} is damaged (it is missing): {advise_repair(path)}")
 
 
 def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
-    """Compares the length of every tar with what its scenes say; it is sure where no build writes meanwhile.
+    """Compare the length of every tar with the offsets of its scenes; needs a dataset that no build is writing.
 
-    A table of trajectories must be there where scenes have some. Three columns of every shard are read; in a store
-    several at once, because each means to wait for answers.
+    A table of trajectories must exist if scenes have some. Reads three columns of every shard; in a store several at
+    once, because reads mostly wait for answers.
 
     Raises:
-        FileNotFoundError: if a shard is being written again just now.
-        BuildError: naming the first tar that is shorter or longer than it was written, or the table that is gone, and
-            what to do.
+        FileNotFoundError: if a shard is being rewritten just now.
+        BuildError: naming the first tar of a wrong length or the missing table, and what to do.
     """
     shards = sorted(committed)
-    motions = frozenset(list_names(out / "trajectories") if shards else ())
-    check = partial(_check_tar, out, list_sizes(out / "mjcf") if shards else {}, motions)
+    trajectory_files = frozenset(list_names(out / "trajectories") if shards else ())
+    check = partial(_check_tar, out, list_sizes(out / "mjcf") if shards else {}, trajectory_files)
     if not isinstance(out, UPath):
         for shard in shards:
             check(shard)
         return
-    with ThreadPoolExecutor(_AT_ONCE) as threads:
+    with ThreadPoolExecutor(_N_THREADS) as threads:
         list(threads.map(check, shards))
 
 
 def tar_length(end: int) -> int:
-    """Length of a tar whose last scene ends at `end` [bytes]: two empty blocks, then up to a whole record."""
+    """Compute the length of a tar whose last scene ends at `end`: two empty blocks, then up to a record [bytes]."""
     return -(-(end + 2 * tarfile.BLOCKSIZE) // tarfile.RECORDSIZE) * tarfile.RECORDSIZE
 
 
-def _check_tar(out: StoragePath, sizes: Mapping[str, int], motions: Collection[str], shard: int) -> None:
+def _check_tar(out: StoragePath, sizes: Mapping[str, int], trajectory_files: Collection[str], shard: int) -> None:
     path = shard_path(out, "mjcf", shard)
     table = read_shard(out, "scenes", shard, ["tar_offset", "tar_size", "n_trajectories"])
     end: pa.Scalar = pc.max(pc.add(table["tar_offset"], table["tar_size"]))
@@ -69,5 +68,5 @@ def _check_tar(out: StoragePath, sizes: Mapping[str, int], motions: Collection[s
     if found != written:
         raise BuildError(f"{path} is damaged ({found} bytes, not {written}): {advise_repair(path)}")
     rows = shard_path(out, "trajectories", shard)
-    if pc.sum(table["n_trajectories"]).as_py() and rows.name not in motions:
+    if pc.sum(table["n_trajectories"]).as_py() and rows.name not in trajectory_files:
         raise BuildError(f"{rows} is damaged (it is missing): {advise_repair(rows)}")

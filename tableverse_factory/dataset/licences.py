@@ -1,4 +1,4 @@
-"""What a licence allows to be done with a scene that was made from a picture, by its name alone.
+"""Classification of licences by name: what may be done with a scene that was made from a picture.
 
 A scene is an adaptation of its picture: textures come from the pixels, shapes from what they show. Verdicts sort; they
 are no legal advice. What is not recognised is `unknown`, and nothing that is unknown counts as permitted.
@@ -32,7 +32,7 @@ PROFILES: Mapping[str, frozenset[LicenceVerdict]] = {
     "share-alike": frozenset({LicenceVerdict.PERMISSIVE, LicenceVerdict.SHARE_ALIKE}),
     "non-commercial": frozenset({LicenceVerdict.PERMISSIVE, LicenceVerdict.SHARE_ALIKE, LicenceVerdict.NON_COMMERCIAL}),
 }
-"""Which verdicts a published dataset may hold."""
+"""Verdicts that a published dataset may hold."""
 
 _PERMISSIVE = re.compile(
     r"cc0([- ]1\.0)?|cc[- ]?zero|pdm|pddl(-1\.0)?|public[- ]domain( mark| dedication)?( 1\.0)?|unlicense|0bsd|wtfpl"
@@ -46,14 +46,16 @@ _SHARE_ALIKE = re.compile(
 # Unsplash and Pexels: single pictures are free to use, collections that compete with theirs are not.
 _RESTRICTED = re.compile(r"all rights reserved|proprietary|copyrighted|none|licenseref-proprietary|unsplash|pexels")
 # Where licences up to 3.0 were adapted to national law; 4.0 never was.
-_PORTS = (
+_JURISDICTIONS = (
     "ar at au az be bg br ca ch cl cn co cr cz de dk ec ee eg es fi fr ge gr gt hk hr hu ie igo il in it jp kr lu mk mt"
     " mx my nl no nz pe ph pl pr pt ro rs scotland se sg si th tw ug uk us ve vn za"
 ).replace(" ", "|")
-_CREATIVE_COMMONS = re.compile(rf"cc[- ]?by((?:[- ](?:nc|nd|sa))*)(?:[- ](?:4\.0|[1-3]\.[05](?:[- ](?:{_PORTS}))?))?")
+_CREATIVE_COMMONS = re.compile(
+    rf"cc[- ]?by((?:[- ](?:nc|nd|sa))*)(?:[- ](?:4\.0|[1-3]\.[05](?:[- ](?:{_JURISDICTIONS}))?))?"
+)
 _ADDRESS = re.compile(
     r"https?://(?:www\.)?creativecommons\.org/(?:licenses/(?P<licence>by(?:-(?:nc|nd|sa))*)|publicdomain/(?P<free>zero|mark))"
-    rf"(?:/(?:4\.0|[1-3]\.[0-9](?:/(?:{_PORTS}))?))?(?:/(?:deed|legalcode)(?:\.[a-z]{{2,3}}(?:-[a-z]{{2,4}})?)?)?/?"
+    rf"(?:/(?:4\.0|[1-3]\.[0-9](?:/(?:{_JURISDICTIONS}))?))?(?:/(?:deed|legalcode)(?:\.[a-z]{{2,3}}(?:-[a-z]{{2,4}})?)?)?/?"
 )
 _SUFFIXES = re.compile(r"\s+(international|unported|generic|universal|licen[cs]e)\b")
 _PROSE = re.compile(r"[()\[\],;]")
@@ -61,7 +63,7 @@ _MAX_CHARS = 512
 
 
 def classify_license(licence: str | None) -> LicenceVerdict:
-    """The verdict on a licence as `source.json` names it.
+    """Classify a licence as `source.json` names it.
 
     SPDX identifiers, their usual spellings (`CC BY 4.0`), addresses of Creative Commons, and expressions: of `A OR B`
     the freer counts, of `A AND B` the stricter. One part that is unknown or restricted decides for the whole: it may be
@@ -70,7 +72,7 @@ def classify_license(licence: str | None) -> LicenceVerdict:
     text = " ".join((licence or "")[: _MAX_CHARS + 1].lower().split())
     if not text or len(text) > _MAX_CHARS or _PROSE.search(text):
         return LicenceVerdict.UNKNOWN
-    choices = [[_single(name) for name in choice.split(" and ")] for choice in text.split(" or ")]
+    choices = [[_classify_name(name) for name in choice.split(" and ")] for choice in text.split(" or ")]
     for verdict in (LicenceVerdict.UNKNOWN, LicenceVerdict.RESTRICTED):
         if any(verdict in names for names in choices):
             return verdict
@@ -79,14 +81,14 @@ def classify_license(licence: str | None) -> LicenceVerdict:
 
 
 def scene_license(row: Mapping[str, Any]) -> LicenceVerdict:
-    """The verdict on a scene by its row: the most restricted of its picture's and those of meshes that models made."""
+    """Classify a scene by its row: the most restricted of its picture's licence and those of generated meshes."""
     return max(map(classify_license, (row["licence"], *(row["mesh_licences"] or ()))), key=list(LicenceVerdict).index)
 
 
-def _single(name: str) -> LicenceVerdict:
-    plain = _SUFFIXES.sub("", _spelled_out(name.strip().removeprefix("the ")))
+def _classify_name(name: str) -> LicenceVerdict:
+    plain = _SUFFIXES.sub("", _shorten_name(name.strip().removeprefix("the ")))
     if (commons := _CREATIVE_COMMONS.fullmatch(plain)) is not None:
-        return _of_terms(commons[1])
+        return _classify_terms(commons[1])
     for pattern, verdict in (
         (_PERMISSIVE, LicenceVerdict.PERMISSIVE),
         (_SHARE_ALIKE, LicenceVerdict.SHARE_ALIKE),
@@ -97,8 +99,8 @@ def _single(name: str) -> LicenceVerdict:
     return LicenceVerdict.UNKNOWN
 
 
-def _spelled_out(name: str) -> str:
-    """An address of Creative Commons, or its long name, as the short one."""
+def _shorten_name(name: str) -> str:
+    """Shorten an address of Creative Commons, or its long name."""
     if (address := _ADDRESS.fullmatch(name)) is not None:
         return {"zero": "cc0", "mark": "pdm"}[address["free"]] if address["free"] else f"cc-{address['licence']}"
     for long, short in (
@@ -115,7 +117,7 @@ def _spelled_out(name: str) -> str:
     return name
 
 
-def _of_terms(terms: str) -> LicenceVerdict:
+def _classify_terms(terms: str) -> LicenceVerdict:
     if "nd" in terms:
         return LicenceVerdict.NO_DERIVATIVES
     if "nc" in terms:

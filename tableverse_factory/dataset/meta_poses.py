@@ -1,4 +1,4 @@
-"""Poses as meta.json has them, which may be anybody's."""
+"""Poses in an untrusted meta.json."""
 
 from typing import Any
 
@@ -12,15 +12,15 @@ from tableverse_factory.geometry.math.transforms import normalize_quaternion
 FARTHEST_M = 1e3
 
 
-def read_meta_pose(value: Any, whose: str) -> Pose:
-    """The pose in `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m].
+def read_meta_pose(value: Any, owner: str) -> Pose:
+    """Read `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m].
 
     Args:
         value: As parsed.
-        whose: For errors: an object's id, or `the camera`.
+        owner: For errors: an object's id, or `the camera`.
 
     Raises:
-        InputError: `bad_meta` if it is none.
+        InputError: `bad_meta` if it is no pose.
     """
     try:
         position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
@@ -28,7 +28,7 @@ def read_meta_pose(value: Any, whose: str) -> Pose:
             raise ValueError("numbers that make no pose")
         return Pose(position, normalize_quaternion(quaternion))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        said = sanitize_line(str(error), 120)
+        problem = sanitize_line(str(error), 120)
         raise InputError(
-            f"meta.json: a pose of {sanitize_line(whose, 60)} makes no sense: {said}", "bad_meta"
+            f"meta.json: a pose of {sanitize_line(owner, 60)} makes no sense: {problem}", "bad_meta"
         ) from None

@@ -1,4 +1,4 @@
-"""The photograph of a scene as people are shown it: read within bounds, since it may be anybody's."""
+"""Photograph of a scene for display, read within bounds since it is untrusted."""
 
 from PIL import Image
 
@@ -9,16 +9,16 @@ PHOTOGRAPH = "observation/color.jpg"
 """Its name among the files of a scene."""
 
 TALLEST = 4
-"""Times its width: a strip of four pixels by seven hundred would become a picture of as many megabytes."""
+"""Largest ratio of height to width: a strip of four pixels by seven hundred would be scaled to megabytes."""
 
 
 def read_photograph(data: bytes, name: str, width: int) -> Image.Image:
-    """The photograph in RGB, `width` wide or, where it is smaller, as it is.
+    """Read the photograph in RGB, `width` wide or, if it is smaller, as it is.
 
     Args:
         data: Of the file.
         name: For errors.
-        width: The largest [px]; a JPEG that is larger by far is decoded at half its size, a quarter or an eighth.
+        width: The largest [px]; a much larger JPEG is decoded at a half, a quarter or an eighth of its size.
 
     Raises:
         InputError: `bad_photo` if it does not decode or is more than `TALLEST` times as high as wide,

@@ -1,4 +1,4 @@
-"""The words of a `query --where` expression, and the error that points at one of them."""
+"""Lexer of `query --where` expressions, and the error that points at a token."""
 
 import re
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ _SHOWN_CHARS = 60
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A piece of the text: `kind` is number, text, word, keyword, sign or end."""
+    """Token of the text: `kind` is number, text, word, keyword, sign or end."""
 
     kind: str
     text: str
@@ -34,15 +34,15 @@ class Token:
 
     @property
     def shown(self) -> str:
-        """As messages name it."""
+        """The token as messages name it."""
         return self.text if self.kind == "end" else repr(self.text)
 
 
 def tokenize(text: str) -> list[Token]:
-    """The pieces in order, `end` last.
+    """Split the text into tokens, `end` last.
 
     Raises:
-        QueryError: at a character that begins no piece.
+        QueryError: at a character that begins no token.
     """
     tokens, position, end = [], 0, len(text.rstrip())
     while position < end:
@@ -59,18 +59,18 @@ def tokenize(text: str) -> list[Token]:
 
 
 def unquote(token: Token) -> str:
-    """What a text token says: without its quotes, a doubled quote inside as one."""
+    """Remove the quotes of a text token; a doubled quote inside becomes one."""
     return token.text[1:-1].replace(token.text[0] * 2, token.text[0])
 
 
 def make_query_error(message: str, text: str, token: Token) -> QueryError:
-    """The message, then the expression around the token, then carets below it."""
+    """Make an error of the message, the expression around the token, and carets below it."""
     first = max(0, token.start - _SHOWN_CHARS)
-    line = _visible(text[first : token.start + _SHOWN_CHARS])
+    line = _mask_unprintable(text[first : token.start + _SHOWN_CHARS])
     carets = "^" * max(1, min(token.end, first + len(line)) - token.start)
-    return QueryError(f"{_visible(message)[:500]}\n  {line}\n  {' ' * (token.start - first)}{carets}")
+    return QueryError(f"{_mask_unprintable(message)[:500]}\n  {line}\n  {' ' * (token.start - first)}{carets}")
 
 
-def _visible(text: str) -> str:
-    """Same length, so that the carets stay below what they point at."""
+def _mask_unprintable(text: str) -> str:
+    """Replace unprintable characters, keeping the length so that the carets stay below their token."""
     return "".join(c if c.isprintable() else "·" for c in text)

@@ -1,4 +1,4 @@
-"""One scene of a dataset, in memory: its files, its rows, its model."""
+"""Scene of a dataset in memory: its files, rows and model."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,14 +15,9 @@ if TYPE_CHECKING:
     from tableverse_factory.dataset.randomize import TableTexture
 
 
-def _no_rows(_: str) -> list[dict[str, Any]]:
-    """Of a scene that lies in no dataset."""
-    return []
-
-
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """One exported scene.
+    """Exported scene.
 
     Attributes:
         row: Its row of scenes/.
@@ -31,78 +26,62 @@ class Scene:
     scene_id: str
     row: Mapping[str, Any]
     _files: Mapping[str, bytes]
-    _rows: Callable[[str], list[dict[str, Any]]] = _no_rows
+    _rows: Callable[[str], list[dict[str, Any]]] = lambda _table: []
 
     def files(self) -> dict[str, bytes]:
-        """Every file by its name: `scene.xml`, `assets/…`, `meta.json`, `observation/…`, `trajectories/…`."""
+        """Return every file by name: `scene.xml`, `assets/…`, `meta.json`, `observation/…`, `trajectories/…`."""
         return dict(self._files)
 
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """How each of its tasks was tried, in their order; none where no trajectories were asked for.
+        """Return the trajectory of each task that was tried, in the order of the tasks.
 
         Raises:
-            InputError: if the table of trajectories does not read, or names a file that is not there.
+            InputError: if the table cannot be read, or names a file that is missing.
         """
         return tuple(
-            Trajectory(row, None if row["arrays"] is None else self._file(row["arrays"]))
+            Trajectory(row, None if row["arrays"] is None else self._read_file(row["arrays"]))
             for row in self.trajectory_rows()
         )
 
     def trajectory_rows(self) -> list[dict[str, Any]]:
-        """Its rows of trajectories/, in the order of its tasks.
-
-        Raises:
-            InputError: if the table does not read.
-        """
+        """Read its rows of trajectories/; raises InputError if the table cannot be read."""
         return self._rows("trajectories")
 
     def object_rows(self) -> list[dict[str, Any]]:
-        """Its rows of objects/; none where the scene lies in no dataset.
-
-        Raises:
-            InputError: if the table does not read.
-        """
+        """Read its rows of objects/; raises InputError if the table cannot be read."""
         return self._rows("objects")
 
     def task_rows(self) -> list[dict[str, Any]]:
-        """Its rows of tasks/, also of the refused.
-
-        Raises:
-            InputError: if the table does not read.
-        """
+        """Read its rows of tasks/, including refused ones; raises InputError if the table cannot be read."""
         return self._rows("tasks")
 
     def trajectory(self, task_id: str) -> Trajectory:
-        """How this task was tried.
+        """Return the trajectory of a task.
 
         Raises:
-            InputError: if it was not, with the tasks that were.
+            InputError: if the task was not tried, with those that were.
         """
         found = {str(trajectory.row["task_id"]): trajectory for trajectory in self.trajectories()}
         if task_id not in found:
-            tried = ", ".join(list(found)[:10]) or "none"
-            raise InputError(
-                f"scene {self.scene_id}: no trajectory of {sanitize_line(task_id, 80)!r}; tried were: {tried}"
-            )
+            tried, asked = ", ".join(list(found)[:10]) or "none", sanitize_line(task_id, 80)
+            raise InputError(f"scene {self.scene_id}: no trajectory of {asked!r}; tried were: {tried}")
         return found[task_id]
 
     @property
     def xml(self) -> str:
-        """The MJCF text."""
-        return self._file("scene.xml").decode()
+        """MJCF text."""
+        return self._read_file("scene.xml").decode()
 
     @property
     def meta(self) -> dict[str, Any]:
-        """`meta.json`: certificate, camera, poses and the judge's verdict (docs/formats.md).
+        """Content of `meta.json`: certificate, camera, poses and the judge's verdict (docs/formats.md).
 
         Raises:
             InputError: `bad_meta` if it is no JSON object, or its `objects` are no list of objects with ids.
         """
-        from tableverse_factory.core.storage.untrusted import (
-            parse_json,  # it brings Pillow, which queries need not load
-        )
+        from tableverse_factory.core.storage.untrusted import parse_json  # imports Pillow, which queries need not load
 
-        meta = parse_json(self._file("meta.json"), f"scene {self.scene_id}: meta.json", "bad_meta")
+        meta = parse_json(self._read_file("meta.json"), f"scene {self.scene_id}: meta.json", "bad_meta")
         objects = meta.get("objects", []) if isinstance(meta, dict) else None
         if not isinstance(objects, list) or not all(isinstance(its, dict) and "object_id" in its for its in objects):
             raise InputError(f"scene {self.scene_id}: meta.json is not of a scene", "bad_meta")
@@ -111,10 +90,10 @@ class Scene:
     def model(
         self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None
     ) -> "mujoco.MjModel":
-        """The compiled model, from memory; its looks as `restyled` changes them.
+        """Compile the MuJoCo model from memory, with the appearance that `restyle` gives.
 
         Raises:
-            InputError: if MuJoCo refuses it, or as `restyled`.
+            InputError: if MuJoCo refuses it, or as `restyle`.
         """
         from tableverse_factory.physics.mjcf.load import load_model
 
@@ -126,13 +105,13 @@ class Scene:
     def restyle(
         self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None
     ) -> "Scene":
-        """The same scene in another light: bodies, masses and contacts stay as they are, and so does the dataset.
+        """Change the appearance: bodies, masses and contacts stay, and so does the dataset.
 
         Args:
-            texture: What lies on the table: a seed or a name of `textures.catalogue`, or a picture of shape (h, w, 3)
+            texture: Of the table: a seed or a name of `textures.catalogue`, or a picture of shape (h, w, 3)
                 that covers `catalogue.TILE_M`; None keeps it.
-            lights: Seed for place, strength and warmth of the lamps; None keeps them.
-            camera: Seed for a small step aside of the camera `observation`; None keeps it.
+            lights: Seed for position, strength and color temperature of the lamps; None keeps them.
+            camera: Seed for a small displacement of the camera `observation`; None keeps it.
 
         Raises:
             InputError: if there is no such texture, or the scene has no table to change.
@@ -145,7 +124,7 @@ class Scene:
         return Scene(self.scene_id, self.row, files, self._rows)
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:
-        """Writes every file below the folder `dest` and returns the paths.
+        """Write every file below the folder `dest` and return the paths.
 
         Raises:
             InputError: if `dest` is not an empty or a new folder.
@@ -161,7 +140,7 @@ class Scene:
             paths.append(path)
         return tuple(paths)
 
-    def _file(self, name: str) -> bytes:
+    def _read_file(self, name: str) -> bytes:
         if name not in self._files:
             raise InputError(f"scene {self.scene_id} has no {name}")
         return self._files[name]

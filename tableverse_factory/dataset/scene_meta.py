@@ -1,4 +1,4 @@
-"""`meta.json` as it is read again: by `tableverse verify`, and where a dataset grows. Imports no physics."""
+"""`meta.json` as `tableverse verify` and growing datasets read it, without importing physics."""
 
 import json
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ FORMAT = "tableverse-scene-1"
 
 @dataclass(frozen=True, slots=True)
 class SceneMeta:
-    """What `verify` needs of a `meta.json`."""
+    """Content of a `meta.json` that verification needs."""
 
     certificate: Certificate
     history: PoseHistory
@@ -26,7 +26,7 @@ class SceneMeta:
 
 
 def read_meta(data: bytes) -> SceneMeta:
-    """The certificate as stored, and the poses before.
+    """Read the stored certificate, and the poses before settling.
 
     Raises:
         InputError: `bad_meta` if the file is not a `meta.json` of this format.

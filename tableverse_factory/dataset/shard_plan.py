@@ -1,4 +1,4 @@
-"""The frozen plan: which scene stands in which shard, decided once from the manifest's order before anything runs."""
+"""Frozen plan of a build: the shard of each scene, decided once from the manifest's order before anything runs."""
 
 import hashlib
 import itertools
@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import BuildError, ConfigError, StoreError
-from tableverse_factory.core.storage.files import StoragePath, missing_build_error, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, make_missing_build_error, write_atomic
 from tableverse_factory.core.storage.parquet import encode_parquet, read_table
 
 MAX_SHARDS = 1_000_000
@@ -34,17 +34,17 @@ class Plan:
 
     @property
     def n_shards(self) -> int:
-        """How many shards there are; 0 for an empty manifest."""
+        """Number of shards; 0 for an empty manifest."""
         return self.shards[-1] + 1 if self.shards else 0
 
     def members(self) -> tuple[range, ...]:
-        """Ranks of the scenes of each shard."""
+        """List the ranks of the scenes of each shard."""
         starts = [rank for rank, shard in enumerate(self.shards) if rank == 0 or self.shards[rank - 1] != shard]
         return tuple(itertools.starmap(range, itertools.pairwise([*starts, len(self.shards)])))
 
 
 def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
-    """The plan of a manifest whose scene ids are unique: `shard_size` scenes a shard, in the manifest's order."""
+    """Plan a manifest whose scene ids are unique: `shard_size` scenes a shard, in the manifest's order."""
     return Plan(
         scene_ids=tuple(row.scene_id for row in rows),
         kinds=tuple(row.kind.value for row in rows),
@@ -53,10 +53,10 @@ def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
 
 
 def parse_shards(text: str) -> frozenset[int]:
-    """The shards of a list such as `3-7,9`.
+    """Parse a list of shards such as `3-7,9`.
 
     Raises:
-        ConfigError: if it is no such list.
+        ConfigError: if it is malformed.
     """
     numbers: set[int] = set()
     for part in text.split(","):
@@ -71,10 +71,10 @@ def parse_shards(text: str) -> frozenset[int]:
 
 
 def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int) -> None:
-    """Refuses shards that the plan of so many scenes does not have; None asks for all.
+    """Check that the plan of a number of scenes has these shards; None stands for all.
 
     Raises:
-        ConfigError: naming the first of them, and what the plan has.
+        ConfigError: naming the first that it does not have, and those that it has.
     """
     n_shards = -(-n_scenes // shard_size)
     beyond = [shard for shard in shards or () if shard >= n_shards]
@@ -84,9 +84,9 @@ def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int)
 
 
 def digest_manifest(rows: Sequence[ImageRow]) -> str:
-    """Sha256 over the content of the rows, in order: the same for the same rows in another Parquet file.
+    """Hash the content of the rows, in order: the same for the same rows in another Parquet file.
 
-    `url` came later than finished datasets: a row without one is digested as they were.
+    `url` is newer than some finished datasets: a row without one is hashed as in these.
     """
     digest = hashlib.sha256()
     for row in rows:
@@ -96,13 +96,13 @@ def digest_manifest(rows: Sequence[ImageRow]) -> str:
 
 
 def write_plan(path: StoragePath, plan: Plan) -> None:
-    """Writes plan.parquet, durably and with the same bytes for the same plan."""
+    """Write plan.parquet durably, with the same bytes for the same plan."""
     columns = {"scene_id": plan.scene_ids, "kind": plan.kinds, "shard": plan.shards}
     write_atomic(path, encode_parquet(pa.Table.from_pydict(columns, schema=PLAN)))
 
 
 def read_plan(path: StoragePath) -> Plan:
-    """Reads plan.parquet back.
+    """Read plan.parquet.
 
     Raises:
         BuildError: if there is none, or it is not a plan.
@@ -110,7 +110,7 @@ def read_plan(path: StoragePath) -> Plan:
     try:
         table = read_table(path, PLAN)
     except FileNotFoundError:
-        raise missing_build_error(path) from None
+        raise make_missing_build_error(path) from None
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:

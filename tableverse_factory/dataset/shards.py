@@ -1,9 +1,9 @@
-"""Shards whose bytes depend on their content alone: USTAR, sorted and without a clock; Parquet with fixed settings."""
+"""Shards whose bytes depend on their content alone: sorted USTAR without a clock, Parquet with fixed settings."""
 
 import io
 import re
 import tarfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
@@ -19,14 +19,14 @@ FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "
 """Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
 
 SPARSE = {"trajectories": "parquet"}
-"""Folders in which a shard has a file only where it has rows for it: few datasets have trajectories."""
+"""Folders in which a shard has a file only if it has rows for it."""
 
 _COPY_BYTES = 1024 * 1024
-_SCENES = re.compile(r"shard-(\d{5,9})\.parquet")
+_PARQUET = re.compile(r"shard-(\d{5,9})\.parquet")
 
 
 class TarShard:
-    """A USTAR file written front to back; members carry no owner, no clock and mode 0644.
+    """USTAR file written front to back; members carry no owner, no clock and mode 0644.
 
     Add scenes in the order of `tar_sort_key`, so that all member names in the file are sorted.
     """
@@ -36,14 +36,14 @@ class TarShard:
         self._tar = tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115 closed in close
 
     def add(self, scene: ExportedScene) -> tuple[int, int]:
-        """Appends a scene's members; returns where its first header starts and how long it is, padding included."""
+        """Append a scene's members; return the offset of its first header and its length, padding included [bytes]."""
         start = self._tar.offset
         for name, data in scene.files:
-            self._tar.addfile(_member(scene.scene_id, name, len(data)), io.BytesIO(data))
+            self._tar.addfile(_make_member(scene.scene_id, name, len(data)), io.BytesIO(data))
         return start, self._tar.offset - start
 
     def copy(self, source: BinaryIO, offset: int, size: int) -> tuple[int, int]:
-        """Appends a scene's members as they stand in another shard; returns their offset and size here.
+        """Append a scene's members as they are in another shard; return their offset and size here [bytes].
 
         Raises:
             BuildError: if the other shard is shorter than its offsets say.
@@ -61,17 +61,17 @@ class TarShard:
         return start, size
 
     def close(self) -> None:
-        """Writes the end of the archive; the file stays open."""
+        """Write the end of the archive; the file stays open."""
         self._tar.close()
 
 
 def shard_path(out: StoragePath, folder: str, number: int) -> StoragePath:
-    """Where a shard's file of that folder stands, e.g. `OUT/scenes/shard-00000.parquet`."""
+    """Path of a shard's file in a folder, e.g. `OUT/scenes/shard-00000.parquet`."""
     return out / folder / shard_name(folder, number)
 
 
 def shard_name(folder: str, number: int) -> str:
-    """Name of a shard's file in that folder."""
+    """Name of a shard's file in a folder."""
     return f"{shard_stem(number)}.{(FOLDERS | SPARSE)[folder]}"
 
 
@@ -81,22 +81,27 @@ def shard_stem(number: int) -> str:
 
 
 def is_committed(out: StoragePath, number: int) -> bool:
-    """Whether the shard is whole: its scenes file is written last."""
+    """Return whether the shard is committed: its scenes file is written last."""
     return shard_path(out, "scenes", number).exists()
 
 
 def committed_shards(out: StoragePath) -> frozenset[int]:
-    """Numbers of the shards that are whole, from one look."""
-    return frozenset(int(match[1]) for match in map(_SCENES.fullmatch, list_names(out / "scenes")) if match)
+    """List the committed shards with one request."""
+    return find_shards(list_names(out / "scenes"))
+
+
+def find_shards(names: Iterable[str]) -> frozenset[int]:
+    """Find the numbers of the shards whose Parquet files are among these names."""
+    return frozenset(int(match[1]) for match in map(_PARQUET.fullmatch, names) if match)
 
 
 def tar_sort_key(scene_id: str) -> str:
-    """Key that sorts scenes as their member names sort (`a-b/x` stands before `a/x`)."""
+    """Key that sorts scenes as their member names sort (`a-b/x` before `a/x`)."""
     return scene_id + "/"
 
 
 def check_exported(scene: ExportedScene, scene_id: str) -> None:
-    """Proves that a scene can be committed, so that nothing is left to go wrong when its shard is written.
+    """Check that a scene can be committed, so that writing its shard cannot fail later.
 
     Raises:
         BuildError: naming the member that is no safe, sorted USTAR name, or the row that does not fit its table.
@@ -111,7 +116,7 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
         if path.is_absolute() or ".." in path.parts or str(path) != name or not name.isprintable():
             raise BuildError(f"{name[:200]!r} is no safe name for a file of a scene")
         try:
-            _member(scene_id, name, 0).tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
+            _make_member(scene_id, name, 0).tobuf(tarfile.USTAR_FORMAT, "ascii", "strict")
         except (ValueError, UnicodeError) as error:
             raise BuildError(f"{name[:200]!r} does not fit a USTAR header: {error}") from error
     for what, schema, rows in (
@@ -129,11 +134,11 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
 
 
 def advise_repair(path: StoragePath) -> str:
-    """What to do about a damaged file of a shard, for people."""
+    """Advise what to do about a damaged file of a shard."""
     return f"delete scenes/{path.stem}.parquet, and the same build makes the shard again"
 
 
-def _member(scene_id: str, name: str, size: int) -> tarfile.TarInfo:
+def _make_member(scene_id: str, name: str, size: int) -> tarfile.TarInfo:
     member = tarfile.TarInfo(f"{scene_id}/{name}")
     member.size, member.mtime, member.mode = size, 0, 0o644
     return member

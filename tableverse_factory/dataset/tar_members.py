@@ -1,4 +1,4 @@
-"""The files of one scene out of its bytes of a tar, which may be anybody's."""
+"""Files of one scene from its untrusted bytes of a tar."""
 
 import io
 import tarfile
@@ -10,7 +10,7 @@ from tableverse_factory.core.text import sanitize_line
 
 
 def read_scene_files(scene_id: str, data: bytes) -> dict[str, bytes]:
-    """The plain files of a slice of a tar, names relative to the scene's folder and checked to stay in it.
+    """Read the plain files of a slice of a tar, with names relative to the scene's folder and checked to stay in it.
 
     Raises:
         InputError: if it is no tar, is cut short, or holds anything but files of this scene.
@@ -19,14 +19,14 @@ def read_scene_files(scene_id: str, data: bytes) -> dict[str, bytes]:
     try:
         with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as tar:
             for member in tar:
-                name = _safe_name(scene_id, member)
-                files[name] = _content(tar, member)
+                name = _check_name(scene_id, member)
+                files[name] = _read_content(tar, member)
     except (tarfile.TarError, EOFError, ValueError) as error:
         raise InputError(f"scene {scene_id}: its bytes are no tar: {sanitize_line(str(error), 200)}") from None
     return files
 
 
-def _safe_name(scene_id: str, member: tarfile.TarInfo) -> str:
+def _check_name(scene_id: str, member: tarfile.TarInfo) -> str:
     path = PurePosixPath(member.name)
     inside: Sequence[str] = path.parts[1:]
     safe = path.parts[:1] == (scene_id,) and inside and ".." not in inside and "\\" not in member.name
@@ -35,7 +35,7 @@ def _safe_name(scene_id: str, member: tarfile.TarInfo) -> str:
     return "/".join(inside)
 
 
-def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
+def _read_content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     stream = tar.extractfile(member)
     data = stream.read() if stream is not None else b""
     if len(data) != member.size:

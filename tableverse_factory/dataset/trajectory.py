@@ -1,4 +1,4 @@
-"""A trajectory of a dataset as its consumers see it: its row, and the arrays of its motion."""
+"""Trajectory of a dataset: its row, and the arrays of its motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ class Trajectory:
         return bool(self.row["success"])
 
     def recording(self) -> "Recording":
-        """What the robot was told and what then happened, sample by sample.
+        """Decode the commands to the robot and what then happened, sample by sample.
 
         Raises:
             InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged, or not

@@ -1,4 +1,4 @@
-"""The files of a scene's trajectories: their names, and whether rows and files belong together."""
+"""Files of a scene's trajectories: their names, and whether rows and files belong together."""
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,13 +9,13 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 
 FOLDER = "trajectories/"
-"""Of a scene: what lies below it came after the export, and is not in `meta.json`."""
+"""Folder of a scene for what came after the export, which is not in `meta.json`."""
 
 Row = Mapping[str, Any]
 
 
 def arrays_name(task_id: str) -> str:
-    """The file with the arrays of a task's motion, e.g. `trajectories/task_000.npz`.
+    """Name of the file with the arrays of a task's motion, e.g. `trajectories/task_000.npz`.
 
     Raises:
         ValueError: if the id could not be part of a name.
@@ -24,27 +24,27 @@ def arrays_name(task_id: str) -> str:
 
 
 def strip_motions(files: Sequence[tuple[str, bytes]]) -> tuple[tuple[str, bytes], ...]:
-    """What was exported."""
+    """Remove the files that came after the export."""
     return tuple((name, data) for name, data in files if not name.startswith(FOLDER))
 
 
 def add_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list[dict[str, Any]]:
-    """The rows with the SHA-256 of the file that each of them names."""
+    """Add to each row the SHA-256 of the file that it names."""
     data_of = dict(files)
-    return [{**row, "arrays_sha256": _digest(data_of[row["arrays"]]) if row.get("arrays") else None} for row in rows]
+    return [{**row, "arrays_sha256": _hash(data_of[row["arrays"]]) if row.get("arrays") else None} for row in rows]
 
 
 def check_digest(data: bytes, row: Row) -> bytes:
-    """The file of a row of trajectories/ if it is the one that the row was written with.
+    """Return the file of a row of trajectories/ if it is the one that the row was written with.
 
     Args:
-        data: The file.
+        data: Of the file.
         row: With `arrays` and `arrays_sha256`.
 
     Raises:
-        InputError: `bad_arrays` if it was changed since, or lies in the place of another.
+        InputError: `bad_arrays` if it was changed, or replaced by another.
     """
-    if _digest(data) != row.get("arrays_sha256"):
+    if _hash(data) != row.get("arrays_sha256"):
         name = sanitize_line(str(row["arrays"]), 100)
         raise InputError(
             f"{name} is not the file that was written: its SHA-256 differs from arrays_sha256 in its row; "
@@ -55,7 +55,7 @@ def check_digest(data: bytes, row: Row) -> bytes:
 
 
 def find_misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequence[str]) -> Iterator[str]:
-    """What is wrong with the rows of a scene's trajectories beside its tasks and its files; one line each."""
+    """Find what does not fit between a scene's trajectory rows, its tasks and its files; one line each."""
     seen: set[str] = set()
     for row in rows:
         task_id, named = row.get("task_id"), row.get("arrays")
@@ -67,11 +67,11 @@ def find_misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequ
             yield f"{named!r:.80} is not the file of {task_id!r:.80}, or not among the scene's files"
         if row.get("success") and named is None:
             yield f"{task_id!r:.80} succeeded, and no file holds its motion"
-    yield from _strangers(rows, files)
+    yield from _find_unclaimed(rows, files)
 
 
 def find_changes(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) -> Iterator[str]:
-    """What has changed or is lost since the scene was written; one line each.
+    """Find what has changed or is lost since the scene was written; one line each.
 
     Args:
         rows: Of the scene's trajectories.
@@ -82,15 +82,15 @@ def find_changes(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) ->
         yield f"trajectories/ has {len(rows)} rows of it, and scenes/ says {scene.get('n_trajectories') or 0}"
     for row in rows:
         named = row["arrays"]
-        if named is not None and (named not in files or _digest(files[named]) != row["arrays_sha256"]):
+        if named is not None and (named not in files or _hash(files[named]) != row["arrays_sha256"]):
             yield f"{named!r:.80} is not the file that was written"
-    yield from _strangers(rows, files)
+    yield from _find_unclaimed(rows, files)
 
 
-def _strangers(rows: Sequence[Row], files: Mapping[str, bytes]) -> Iterator[str]:
+def _find_unclaimed(rows: Sequence[Row], files: Mapping[str, bytes]) -> Iterator[str]:
     claimed = {row.get("arrays") for row in rows}
     yield from (f"{name!r:.80} belongs to no row" for name in files if name.startswith(FOLDER) and name not in claimed)
 
 
-def _digest(data: bytes) -> str:
+def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()

@@ -28,7 +28,7 @@ from schemas.objects import (
 from schemas.observation import Observation
 from schemas.outcome import Allowance, Done, Dropped, Failed, ModelCost
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
-from schemas.trajectories import Grasps, Motion, Placement, Verdict
+from schemas.trajectories import Grasps, Motion, NoMotion, Phase, Placement, Verdict
 from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
 
 HARD_TEXT = 'Ünïcode \U0001f600 \x1b[2J\n\0 \'"/><x a=" $array'
@@ -108,6 +108,7 @@ def examples(seed: int) -> dict[str, object]:
         Grasps(floats(4, 3, 3), floats(4, 3), floats(4), floats(4)),
         Motion(0.02, floats(5, 7), floats(5, 7), floats(5), np.array([0, 0, 1, 2, 5], dtype=np.int32)),
         Placement(pose(), 0.004),
+        NoMotion(Phase.GRASP.value, "blocked", f"{rng.random()} {HARD_TEXT}"),
         Verdict(False, "grasp", "slipped", HARD_TEXT, *(float(x) for x in floats(2))),
         ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT),
         observation,

@@ -1,4 +1,4 @@
-"""What the Hub has under a dataset's name, at one commit, and what a commit after it may do there."""
+"""State of a dataset on the Hub at one commit, and what the next commit may do there."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 HEAD_MESSAGE = "Card, plan and record"
-"""Of the commit that writes the card; whose card was written by another has been edited since."""
+"""Message of the commit that writes the card; a card last written by another commit was edited on the Hub."""
 
 _OWN_FOLDERS = (*FOLDERS, *SPARSE, MERGED)
 _EXPECTED = frozenset({".gitattributes", CARD})
@@ -30,31 +30,31 @@ _SHARD = re.compile(r"shard-(\d{5,9})\.[a-z]+")
 
 @dataclass(frozen=True, slots=True)
 class RemoteState:
-    """The state of a repository that may be gone on from.
+    """State of a repository that an upload may continue.
 
     Attributes:
-        commit: The one that was looked at; the next one must follow it and no other.
-        obsolete: What is to be taken away: files, and whole folders with a slash at their end.
-        keeps_card: Whether there is a card that somebody else wrote.
+        commit: The inspected commit, which the next one must follow.
+        obsolete: What is to be deleted: files, and whole folders with a slash at their end.
+        keep_card: Whether there is a card that was not written by an upload.
     """
 
     commit: str
     obsolete: tuple[str, ...]
-    keeps_card: bool
+    keep_card: bool
 
 
 def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, replace: bool) -> RemoteState:
-    """What is there, if `contents` may go there.
+    """Inspect the repository, and check that `contents` may go there.
 
     Args:
         api: The Hub.
-        contents: What is to go.
+        contents: To be uploaded.
         name: Of the dataset on the Hub.
         public: Whether everybody is to read it.
-        replace: Whether another dataset may be taken away.
+        replace: Whether another dataset may be deleted.
 
     Raises:
-        BuildError: if something else is there, or who may read it is not what was asked for.
+        BuildError: if something else is there, or its visibility is not the requested one.
         StoreError: if the Hub refuses or fails.
     """
     found = call_hub(name, lambda: api.repo_info(name, repo_type="dataset"))
@@ -63,24 +63,24 @@ def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, r
         raise BuildError(f"{name} is {what} on the Hub: run again {give}, or change it in the settings of the dataset")
     commit = str(found.sha)
     entries = call_hub(name, lambda: list(api.list_repo_tree(name, revision=commit, repo_type="dataset")))
-    there = {entry.path for entry in entries}
-    if "run.json" not in there:
-        if others := sorted(there - _EXPECTED):
+    names = {entry.path for entry in entries}
+    if "run.json" not in names:
+        if others := sorted(names - _EXPECTED):
             raise BuildError(f"{name} holds something else ({sanitize_line(others[0], 80)}): give a new name")
-        return RemoteState(commit, (), _keeps_card(api, contents, name, commit, there))
+        return RemoteState(commit, (), _is_card_foreign(api, contents, name, commit, names))
     folder = HubFolder(f"{api.endpoint}/datasets/{name}/resolve/{commit}", name, commit)
-    differing = diff_run_records(_run_in(folder), json.loads(json.dumps(contents.run)))
+    differing = diff_run_records(_read_remote_run(folder), json.loads(json.dumps(contents.run)))
     if not differing:
-        strays = _strays(folder, contents, there)
-        return RemoteState(commit, strays, _keeps_card(api, contents, name, commit, there))
+        strays = _find_strays(folder, contents, names)
+        return RemoteState(commit, strays, _is_card_foreign(api, contents, name, commit, names))
     if not replace:
         keys = sanitize_line(", ".join(list(differing)[:5]), 200)
         raise BuildError(f"{name} holds another dataset ({keys} differ): give another name, or --replace to replace it")
-    return RemoteState(commit, tuple(f"{own}/" for own in _OWN_FOLDERS if own in there), keeps_card=False)
+    return RemoteState(commit, tuple(f"{own}/" for own in _OWN_FOLDERS if own in names), keep_card=False)
 
 
-def _run_in(folder: HubFolder) -> Mapping[str, Any]:
-    """The record of the dataset that is there; empty where it is none."""
+def _read_remote_run(folder: HubFolder) -> Mapping[str, Any]:
+    """Read run.json of the remote dataset; empty if it is malformed."""
     try:
         run = json.loads(folder.cat_file(f"{folder.address}/run.json", 0, _MAX_RUN_BYTES))
     except (ValueError, RecursionError):
@@ -88,11 +88,11 @@ def _run_in(folder: HubFolder) -> Mapping[str, Any]:
     return run if isinstance(run, dict) else {}
 
 
-def _strays(folder: HubFolder, contents: UploadSet, there: set[str]) -> tuple[str, ...]:
-    """Files of shards that `contents` has without such a file, or that were never planned: readers would take them."""
+def _find_strays(folder: HubFolder, contents: UploadSet, names: set[str]) -> tuple[str, ...]:
+    """Find files of shards that `contents` has no such file of, or that were never planned: readers would use them."""
     whole, shards = len(contents.shards) == contents.n_shards, frozenset(contents.shards)
     found = []
-    for own in (own for own in _OWN_FOLDERS if own in there):
+    for own in (own for own in _OWN_FOLDERS if own in names):
         for file in folder.sizes(own):
             number = _SHARD.fullmatch(file)
             ours = (
@@ -103,9 +103,9 @@ def _strays(folder: HubFolder, contents: UploadSet, there: set[str]) -> tuple[st
     return tuple(sorted(found))
 
 
-def _keeps_card(api: "HfApi", contents: UploadSet, name: str, commit: str, there: set[str]) -> bool:
-    """Whether another than `publish` wrote the card that is there; one that is the same may be written again."""
-    if CARD not in there:
+def _is_card_foreign(api: "HfApi", contents: UploadSet, name: str, commit: str, names: set[str]) -> bool:
+    """Return whether the card was last written by another commit than an upload's, and differs from ours."""
+    if CARD not in names:
         return False
     cards = call_hub(name, lambda: api.get_paths_info(name, [CARD], expand=True, revision=commit, repo_type="dataset"))
     git = hashlib.sha1(b"blob %d\0" % len(contents.card) + contents.card, usedforsecurity=False).hexdigest()

@@ -1,4 +1,4 @@
-"""What of a dataset would go to the Hub, and what of it must not."""
+"""Files of a dataset that an upload takes, and reasons to refuse it."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -27,20 +27,20 @@ _COLUMNS = ("licence", "mesh_licences", "uri", "detail", "tar_offset")
 
 @dataclass(frozen=True, slots=True)
 class UploadSet:
-    """A dataset as it would be uploaded.
+    """Dataset as it would be uploaded.
 
     Attributes:
-        out: Where it lies.
+        out: Its folder.
         run: Its `run.json`.
-        n_shards: How many shards were planned.
-        shards: Numbers of those that are committed, in order.
-        card: The text of its `README.md`.
-        sizes: Of every file that would go, by its path below `out` [bytes]; the card's own is not among them.
-        scenes: How many scenes have a row.
-        with_files: How many of them have files.
-        licences: Scenes by name of their licence; empty where none is stated.
-        verdicts: Scenes by what their licences allow, those of their meshes too; the freest first.
-        places: Rows and values of the configuration that name files or addresses of whoever built it.
+        n_shards: Number of planned shards.
+        shards: Numbers of the committed ones, in order.
+        card: Its `README.md`.
+        sizes: Of every file, by its path below `out` [bytes], without the card.
+        scenes: Number of scenes with a row.
+        with_files: Number of them with files.
+        licences: Scenes by name of their licence; empty if none is stated.
+        verdicts: Scenes by what their licences and those of their meshes allow; the freest first.
+        private_values: Number of rows and configuration values that name files or addresses of the building machine.
     """
 
     out: Path
@@ -53,29 +53,29 @@ class UploadSet:
     with_files: int
     licences: Mapping[str, int]
     verdicts: Mapping[LicenceVerdict, int]
-    places: int
+    private_values: int
 
     @property
     def n_bytes(self) -> int:
-        """Of everything that would go."""
+        """Size of the whole upload."""
         return sum(self.sizes.values()) + len(self.card)
 
     def files_of(self, shard: int) -> Iterator[str]:
-        """Paths of a shard's files below `out`, the one that commits it last."""
+        """List the paths of a shard's files below `out`, the one that commits it last."""
         names = (f"{folder}/{shard_name(folder, shard)}" for folder in {**SPARSE, **FOLDERS})
         return (name for name in names if name in self.sizes)
 
     def head(self) -> Iterator[str]:
-        """Paths of what is read before any shard, below `out`."""
+        """List the paths of what is read before any shard, below `out`."""
         return (name for name in _HEAD if name in self.sizes)
 
     def tail(self) -> Iterator[str]:
-        """Paths of what repeats the shards, below `out`."""
+        """List the paths of the merged tables, below `out`."""
         return (name for name in self.sizes if name.startswith(f"{MERGED}/"))
 
 
 def collect_upload_set(out: Path) -> UploadSet:
-    """Looks at everything that would go; nothing is written, and nobody is asked.
+    """Collect everything that would be uploaded; nothing is written or sent.
 
     Raises:
         BuildError: if there is no dataset, or a committed shard lacks a file or some of its bytes.
@@ -89,7 +89,7 @@ def collect_upload_set(out: Path) -> UploadSet:
     check_tars(out, shards)
     licences: Counter[str] = Counter()
     verdicts: Counter[LicenceVerdict] = Counter()
-    with_files, places = 0, int(redact_config(run.get("config", {})) != run.get("config", {}))
+    with_files, private_values = 0, int(redact_config(run.get("config", {})) != run.get("config", {}))
     for number in shards:
         table = read_shard(out, "scenes", number, _COLUMNS)
         licences.update(licence or "" for licence in table["licence"].to_pylist())
@@ -97,28 +97,28 @@ def collect_upload_set(out: Path) -> UploadSet:
         with_files += table.num_rows - table["tar_offset"].null_count
         named = [uri != redact_uri(uri) for uri in pc.fill_null(table["uri"], "").to_pylist()]
         told = [detail is not None for detail in table["detail"].to_pylist()]
-        places += sum(a or b for a, b in zip(named, told, strict=True))
+        private_values += sum(a or b for a, b in zip(named, told, strict=True))
     return UploadSet(
         out,
         run,
         plan.n_shards,
         shards,
-        _card(out, run, shards),
-        _sizes(out, shards, whole=len(shards) == plan.n_shards),
+        _read_or_make_card(out, run, shards),
+        _list_sizes(out, shards, whole=len(shards) == plan.n_shards),
         licences.total(),
         with_files,
         dict(licences.most_common()),
         {verdict: verdicts[verdict] for verdict in LicenceVerdict if verdicts[verdict]},
-        places,
+        private_values,
     )
 
 
 def find_refusals(contents: UploadSet, unfinished: bool) -> list[str]:
-    """Why it must not be uploaded, each with what to do; none where it may be.
+    """Find the reasons not to upload it, each with what to do.
 
     Args:
-        contents: What would go.
-        unfinished: Whether the missing shards are meant to be missing.
+        contents: To be uploaded.
+        unfinished: Whether shards may be missing.
     """
     found = []
     missing = contents.n_shards - len(contents.shards)
@@ -127,36 +127,36 @@ def find_refusals(contents: UploadSet, unfinished: bool) -> list[str]:
             f"{missing} of {contents.n_shards} shards are missing: build on first, or give --unfinished to upload what "
             "there is"
         )
-    profile = _profile(contents.verdicts)
+    profile = _choose_profile(contents.verdicts)
     forbidden = {verdict: count for verdict, count in contents.verdicts.items() if verdict not in PROFILES[profile]}
     export = f"tableverse export {contents.out} {contents.out}-public --profile {profile}"
     if forbidden:
         counts = ", ".join(f"{count} {verdict.value}" for verdict, count in forbidden.items())
         total = sum(forbidden.values())
         found.append(f"{total} scenes may not be passed on ({counts}): `{export}` writes a dataset without them")
-    if contents.places:
+    if contents.private_values:
         found.append(
-            f"{contents.places} rows or values name files or addresses of this machine (uri, detail, config): "
+            f"{contents.private_values} rows or values name files or addresses of this machine (uri, detail, config): "
             f"`{export}` writes a dataset without these"
         )
     return found
 
 
-def _profile(verdicts: Collection[LicenceVerdict]) -> str:
-    """The strictest profile that keeps every scene that may be passed on."""
+def _choose_profile(verdicts: Collection[LicenceVerdict]) -> str:
+    """Choose the strictest profile that keeps every scene that may be redistributed."""
     widest = PROFILES["non-commercial"]
     return next(name for name, allowed in PROFILES.items() if allowed.issuperset(widest.intersection(verdicts)))
 
 
-def _card(out: Path, run: Mapping[str, Any], shards: Collection[int]) -> bytes:
-    """The card that lies there, where it has the head that the Hub reads; else one made from the shards."""
+def _read_or_make_card(out: Path, run: Mapping[str, Any], shards: Collection[int]) -> bytes:
+    """Read the card if it has the front matter that the Hub reads; otherwise make it from the shards."""
     path = out / CARD
     text = path.read_bytes() if path.is_file() else b""
     return text if text.startswith(b"---\n") else make_dataset_card(out, run, tuple(shards)).encode()
 
 
-def _sizes(out: Path, shards: Collection[int], whole: bool) -> dict[str, int]:
-    """Everything that belongs to the dataset, and nothing else that lies there."""
+def _list_sizes(out: Path, shards: Collection[int], whole: bool) -> dict[str, int]:
+    """List the sizes of everything that belongs to the dataset, and of nothing else in its folder."""
     names = [*_HEAD]
     names += [f"{folder}/{shard_name(folder, shard)}" for shard in shards for folder in FOLDERS | SPARSE]
     names += [f"{MERGED}/{name}" for name in list_names(out / MERGED) if whole and name.endswith(".parquet")]

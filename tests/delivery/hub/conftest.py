@@ -21,7 +21,7 @@ def hub(monkeypatch, tmp_path) -> Iterator[HubServer]:
             monkeypatch.setattr(huggingface_hub.constants, name, value)
         monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
         monkeypatch.setenv("HF_TOKEN", TOKEN)
-        monkeypatch.setattr(hub_client, "_BACKOFF_S", 0.01)
+        monkeypatch.setattr(hub_client, "RETRY_POLICY", replace(hub_client.RETRY_POLICY, backoff_s=0.01))
         monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
         yield running
 

@@ -41,7 +41,7 @@ def test_a_xet_storage_that_does_not_answer_ends_in_one_line(hub, dataset, tmp_p
         hub.storage_of_xet = f"http://127.0.0.1:{silent.getsockname()[1]}"
         code = (
             "import tableverse_factory.delivery.hub.upload as upload; from tableverse_factory.cli.main import main; "
-            "upload.PATIENCE_S = 1; main()"
+            "upload.TIMEOUT_S = 1; main()"
         )
         settings = {"HF_ENDPOINT": hub.endpoint, "HF_TOKEN": TOKEN, "HF_HOME": str(tmp_path / "h")}
         process = subprocess.run(
@@ -113,7 +113,7 @@ def test_a_dataset_that_takes_our_place_meanwhile_is_not_replaced(hub, dataset, 
 
 def test_a_card_that_is_edited_meanwhile_is_kept_and_the_rest_arrives(hub, dataset, run):
     meanwhile(hub, lambda files: {**files, "README.md": EDITED}, after=1)
-    assert "looking again" in publish(run, dataset)
+    assert "inspecting it again" in publish(run, dataset)
     assert hub.repositories[NAME].files["README.md"] == EDITED
     assert on_the_hub(hub) == tree_of(dataset, left_behind(dataset))
 
@@ -125,9 +125,7 @@ def test_files_that_the_dataset_no_longer_has_are_taken_away(hub, dataset, run):
     others = {"scenes/notes.md": b"not ours", "LICENSE": b"CC"}
     there.commit("before", {**there.files, **dict.fromkeys(strays, b"stray"), **others})
     said = publish(run, dataset)
-    assert (
-        "taken away, because the dataset does not have it: merged/objects.parquet, scenes/shard-00009.parquet" in said
-    )
+    assert "deleted, because the dataset does not have it: merged/objects.parquet, scenes/shard-00009.parquet" in said
     assert on_the_hub(hub) == {**tree_of(dataset, left_behind(dataset)), **others}
 
 
