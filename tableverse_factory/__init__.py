@@ -8,15 +8,12 @@ from tableverse_factory.core.version import __version__
 if TYPE_CHECKING:
     from tableverse_factory.dataset.dataset import Dataset, open_dataset
     from tableverse_factory.dataset.scene import Scene
-    from tableverse_factory.delivery.learning import (
-        SceneDataset,
-        SceneGrid,
-        SceneStream,
-        TableEnv,
-        Variation,
-        VectorSim,
-        build_scene_grid,
-    )
+    from tableverse_factory.delivery.learning.environment import TableEnv
+    from tableverse_factory.delivery.learning.grid import SceneGrid, build_scene_grid
+    from tableverse_factory.delivery.learning.loader import SceneDataset
+    from tableverse_factory.delivery.learning.stream import SceneStream
+    from tableverse_factory.delivery.learning.variation import Variation
+    from tableverse_factory.delivery.learning.vector_sim import VectorSim
 
 __all__ = [
     "Dataset",
@@ -32,12 +29,31 @@ __all__ = [
     "open_dataset",
 ]
 
-_DATASET = {"Dataset", "Scene", "open_dataset"}
+_MODULES = {
+    "Dataset": "dataset.dataset",
+    "Scene": "dataset.scene",
+    "SceneDataset": "delivery.learning.loader",
+    "SceneGrid": "delivery.learning.grid",
+    "SceneStream": "delivery.learning.stream",
+    "TableEnv": "delivery.learning.environment",
+    "Variation": "delivery.learning.variation",
+    "VectorSim": "delivery.learning.vector_sim",
+    "build_scene_grid": "delivery.learning.grid",
+    "open_dataset": "dataset.dataset",
+}
+_INSTALL = {"torch": "pip install torch", "gymnasium": "pip install 'tableverse-factory[gym]'"}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use, so that importing the package stays cheap."""
-    if name not in __all__:
+    """Import a public name on first use: the package stays cheap to import, and extras are needed only where used."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = "dataset.dataset" if name in _DATASET else "delivery.learning"
-    return getattr(import_module(f"{__name__}.{home}"), name)
+    try:
+        module = import_module(f"{__name__}.{_MODULES[name]}")
+    except ModuleNotFoundError as error:
+        if error.name not in _INSTALL:
+            raise
+        from tableverse_factory.core.errors import ConfigError
+
+        raise ConfigError(f"{name} needs {error.name}: {_INSTALL[error.name]}") from None
+    return getattr(module, name)

@@ -20,7 +20,7 @@ from tableverse_factory.dataset.consolidated_tables import write_merged_tables
 from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, scene_license
 from tableverse_factory.dataset.shard_plan import Plan, read_plan, write_plan
 from tableverse_factory.dataset.shards import SPARSE, TarShard, committed_shards, shard_path, tar_sort_key
-from tableverse_factory.models.local.hf_weights import hub_name
+from tableverse_factory.models.local.hf_weights import parse_hub_name
 from tableverse_factory.run_record import diff_run_records, read_run, resume_refused_error, write_run
 
 _TABLES: Mapping[str, pa.Schema] = {
@@ -29,11 +29,10 @@ _TABLES: Mapping[str, pa.Schema] = {
     "timings": TIMINGS,
     "trajectories": TRAJECTORIES,
 }
+# Files of an export that was killed before `run.json`
 _LEFTOVER_FILES = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
-"""Files of an export that was killed before `run.json`."""
-
+# Configuration keys with these suffixes name the builder's own paths and addresses
 _PRIVATE_SUFFIXES = ("_dir", "_url")
-"""Configuration keys with these suffixes name the builder's own paths and addresses."""
 _PLAIN_NAME = re.compile(r"[\w.+-]+")
 _REDACTED = "…"  # replaces each word of a command
 Row = dict[str, Any]
@@ -188,7 +187,7 @@ def _redact_value(key: str, value: Any) -> Any:
     if key.endswith("_command"):
         return [_redact_program(str(word)) if place == 0 else _REDACTED for place, word in enumerate(value)]
     if key.endswith("_weights"):
-        on_hub = key != "detector_weights" and hub_name(str(value)) is not None
+        on_hub = key != "detector_weights" and parse_hub_name(str(value)) is not None
         return value if on_hub else _strip_folders(str(value))
     return redact_uri(str(value)) if key == "robot" else value
 

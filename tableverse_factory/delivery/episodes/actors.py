@@ -20,6 +20,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.physics.mjcf.drawables import load_scenery, make_box_mesh, read_geom_color, read_geom_mesh
 from tableverse_factory.robotics.execution.arrays import Recording
+from tableverse_factory.robotics.execution.poses import pose_from_row
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import PEDESTAL_HEIGHT_M, PEDESTAL_SHARE, PEDESTAL_TOP_M
 
@@ -64,10 +65,14 @@ class ArmMeshes:
         self._column = _make_cylinder(PEDESTAL_SHARE * arm.base_radius_m, PEDESTAL_HEIGHT_M / 2)
         self.meshes = tuple(_merge_body_mesh(self._model, body, shown) for body in self._bodies)
 
-    @property
-    def n_positions(self) -> int:
-        """Number of joints and fingers."""
-        return len(self._addresses)
+    def check_recording(self, recording: Recording) -> None:
+        """Check that a recording is of this arm.
+
+        Raises:
+            InputError: `bad_arrays`.
+        """
+        if (recorded := recording.qpos.shape[1]) != (known := len(self._addresses)):
+            raise InputError(f"{recorded} positions are recorded, and {recording.robot} has {known}", "bad_arrays")
 
     def pedestal(self, base: Pose) -> TriangleMesh:
         """Return the base's pedestal in the table frame; on the table, the slab hides most of it."""
@@ -133,21 +138,12 @@ def iterate_poses(
     Raises:
         InputError: `bad_arrays` if the recording is of another arm.
     """
-    if recording.qpos.shape[1] != figure.n_positions:
-        raise InputError(
-            f"{recording.qpos.shape[1]} positions are recorded, and {recording.robot} has {figure.n_positions}",
-            "bad_arrays",
-        )
+    figure.check_recording(recording)
     others = [recording.poses_of(name) for name in cast.names]
     ways = [recording.object_pose if way is None else way for way in others]  # X is none of the others
     for sample in samples:
         arm = figure.poses(recording.qpos[sample].astype(np.float64), recording.base)
-        yield [_pose(way[sample]) for way in ways] + arm
-
-
-def _pose(numbers: np.ndarray) -> Pose:
-    values = numbers.astype(np.float64)
-    return Pose(values[:3], normalize_quaternion(values[3:]))
+        yield [pose_from_row(way[sample]) for way in ways] + arm
 
 
 def _list_visual_geoms(model: mujoco.MjModel) -> list[int]:

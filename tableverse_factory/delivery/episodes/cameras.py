@@ -15,13 +15,11 @@ from tableverse_factory.robotics.execution.arrays import Recording
 
 FIELD_OF_VIEW = float(np.deg2rad(44.0))  # vertical, of the robot camera
 _EYE_M = (1.2, 0.85, 1.0)
+# In the robot's base frame: across the table and to its left, with table and arm in view
 _TARGET_M = (0.37, 0.02, 0.26)
-"""In the robot's base frame: across the table and to its left, with table and arm in view."""
-
 _ELEVATION = float(np.deg2rad(30.0))
+# Of the film camera about the viewer's side, from which instructions say left and right; never from beyond
 _AZIMUTHS = tuple(np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 78.0, -78.0]))
-"""Of the film camera about the viewer's side, from which instructions say left and right; never from beyond."""
-
 _CLEAR_M = 0.05  # sufficient distance of the arm from the line of sight to the object at the end
 _PATH_MARGIN_M = 0.15  # table shown around the object's path
 _FRAMING_SAMPLES = 40  # arm configurations considered for framing
@@ -65,9 +63,7 @@ def _spread_samples(recording: Recording) -> list[int]:
 
 def _collect_arm_points(recording: Recording, figure: ArmMeshes, sample: int) -> Points:
     """Collect the arm's vertices at a sample of a recording, in the table frame [m]. Shape (n, 3)."""
-    if recording.qpos.shape[1] != figure.n_positions:
-        detail = f"{recording.qpos.shape[1]} positions are recorded, and {recording.robot} has {figure.n_positions}"
-        raise InputError(detail, "bad_arrays")
+    figure.check_recording(recording)
     poses = figure.poses(recording.qpos[sample].astype(np.float64), recording.base)
     parts = zip(poses, figure.meshes, strict=True)
     return np.concatenate([transform_points(pose, mesh.vertices) for pose, mesh in parts])

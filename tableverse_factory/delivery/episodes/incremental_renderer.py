@@ -5,7 +5,7 @@ none. Same input, same bytes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -211,15 +211,7 @@ def _downsample(image: np.ndarray) -> np.ndarray:
 
 
 def _select_hits(hits: Hits, indices: np.ndarray) -> Hits:
-    return Hits(
-        hits.pixels[indices],
-        hits.depth[indices],
-        hits.part[indices],
-        hits.triangles[indices],
-        hits.weights[indices],
-        hits.points[indices],
-        hits.normals[indices],
-    )
+    return Hits(*(getattr(hits, field.name)[indices] for field in fields(Hits)))
 
 
 def _make_empty_hits() -> Hits:

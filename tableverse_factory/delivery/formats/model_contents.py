@@ -10,16 +10,15 @@ import mujoco
 import numpy as np
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_matrix, rotation_matrix
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.mjcf.drawables import Rgb, make_geom_box, read_geom_color, read_geom_mesh
 from tableverse_factory.physics.mjcf.hidden_geoms import find_geoms_without_visual
 from tableverse_factory.physics.simulate.model_solids import body_name, make_geom_mesh
 
+# Lowercase names of supports, which are never taken for objects
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
-"""Lowercase names of supports, which are never taken for objects."""
-
 HIDDEN_GROUP = 3  # geoms of this group and above are hidden in MuJoCo's viewer: usually shapes that only collide
 UNBOUNDED_PLANE_M = 1.0  # half the side drawn for an infinite plane [m]
 
@@ -91,7 +90,7 @@ def is_table(name: str) -> bool:
 
 
 def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> ModelObject:
-    pose = _build_pose(data.xpos[root], data.xmat[root])
+    pose = pose_from_rotation(data.xpos[root], data.xmat[root].reshape(3, 3))
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
     seen = _list_visual_geoms(model, geoms)
@@ -150,7 +149,10 @@ def _compute_hull(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: P
 
 def _to_object_frame(mesh: TriangleMesh, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh:
     """Transform a geom's mesh to the object's frame."""
-    return place_mesh(mesh, compose_poses(invert_pose(pose), _build_pose(data.geom_xpos[geom], data.geom_xmat[geom])))
+    return place_mesh(
+        mesh,
+        compose_poses(invert_pose(pose), pose_from_rotation(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))),
+    )
 
 
 def _compute_mass_properties(
@@ -171,9 +173,3 @@ def _compute_mass_properties(
     turn = rotation_matrix(pose.quaternion_wxyz)
     local: Vector3 = turn.T @ (center - pose.position)
     return mass, local, turn.T @ inertia @ turn
-
-
-def _build_pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
-    homogeneous = np.eye(4)
-    homogeneous[:3, :3], homogeneous[:3, 3] = matrix.reshape(3, 3), position
-    return pose_from_matrix(homogeneous)

@@ -13,11 +13,11 @@ import numpy as np
 from schemas.geometry import Matrix3, Pose
 from schemas.identity import make_file_stem
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject
-from tableverse_factory.delivery.formats.textured_obj import encode_obj_files
+from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.physics.mjcf.obj_assets import encode_obj
+from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
 
 MESHES = "meshes"
 WORLD = "world"
@@ -142,6 +142,28 @@ def compute_roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
 
 def _format_numbers(values: Sequence[float] | np.ndarray) -> str:
     return " ".join(f"{float(value):.12g}" for value in values)
+
+
+def encode_obj_files(look: VisualMesh, stem: str) -> dict[str, bytes]:
+    """Encode `stem.obj`, `stem.mtl` and, for a textured mesh, `stem.png`."""
+    texture = look.mesh.texture
+    material = [f"newmtl {stem}", "Ks 0.05 0.05 0.05", "Ns 20"]
+    head = f"mtllib {stem}.mtl\nusemtl {stem}\n".encode()
+    if texture is None:
+        material.append("Kd " + " ".join(f"{channel / 255:.4f}" for channel in look.color))
+        return {f"{stem}.obj": head + encode_obj(look.mesh), f"{stem}.mtl": _join_lines(material)}
+    picture = encode_png(np.asarray(texture.picture))
+    appearance = Appearance.at_corners(picture, np.asarray(texture.corner_uv))
+    material += ["Kd 1 1 1", f"map_Kd {stem}.png"]
+    return {
+        f"{stem}.obj": head + encode_obj(look.mesh, appearance),
+        f"{stem}.mtl": _join_lines(material),
+        f"{stem}.png": picture,
+    }
+
+
+def _join_lines(lines: list[str]) -> bytes:
+    return ("\n".join(lines) + "\n").encode()
 
 
 def _serialize(root: ET.Element) -> bytes:

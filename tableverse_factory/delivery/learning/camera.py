@@ -10,9 +10,9 @@ from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.episodes.actors import ArmMeshes, build_render_scene
 from tableverse_factory.delivery.episodes.cameras import place_robot_camera
 from tableverse_factory.delivery.episodes.incremental_renderer import IncrementalRenderer, PaintedMeshes
-from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.physics.mjcf.scene_objects import read_slab
 from tableverse_factory.physics.render.render import Lighting
+from tableverse_factory.robotics.execution.poses import pose_from_row
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture
 
@@ -53,7 +53,7 @@ class RobotCamera:
 
     def picture(self, poses: Mapping[str, np.ndarray], positions: np.ndarray) -> Picture:
         """Render the picture at object poses (position [m], quaternion wxyz) and positions of joints and fingers."""
-        objects = [Pose(poses[name][:3].copy(), normalize_quaternion(poses[name][3:])) for name in self._names]
+        objects = [pose_from_row(poses[name]) for name in self._names]
         return self._renderer.render([*objects, *self._figure.poses(positions, self._base)])
 
 

@@ -18,12 +18,13 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
 from tableverse_factory.delivery.learning.variation import Variation, displace_objects
-from tableverse_factory.geometry.math.transforms import normalize_quaternion, quaternion_about_z
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.simulate.at_rest import HOLD_S, SPEED_LIMIT
 from tableverse_factory.robotics.execution.arrays import MAX_STEP_S, MIN_STEP_S
 from tableverse_factory.robotics.execution.goal import load_goal
 from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, StateSample
+from tableverse_factory.robotics.execution.poses import pose_from_row
 from tableverse_factory.robotics.execution.rollout import align_timestep, check_simulation_settings
 from tableverse_factory.robotics.execution.success import FALL_M, MIN_LIFT_M, compute_displacement_limits
 from tableverse_factory.robotics.robots.base import find_bases
@@ -136,7 +137,7 @@ class PickPlaceSim:
         self._failure, self._relation_cache = "", (np.full((2, 7), np.inf), False)
         sample = self._monitor.sample(self._data, 0, 0, self._command)
         self._boxes = [
-            _compute_box(place_mesh(mesh, _pose(row)))
+            _compute_box(place_mesh(mesh, pose_from_row(row)))
             for mesh, row in zip((self.goal.x, self.goal.y), self.poses()[:2], strict=True)
         ]
         self._stood_m = float(sample.center[2])
@@ -187,7 +188,7 @@ class PickPlaceSim:
         now = np.array([sample.pose, sample.others[self._monitor.others.index(self.goal.y_id)]])
         before, held = self._relation_cache
         if not np.abs(now - before).max() < _UNMOVED_M:
-            held = self.goal.holds(*map(_pose, now))
+            held = self.goal.holds(*map(pose_from_row, now))
             self._relation_cache = (now, held)
         return held
 
@@ -207,10 +208,6 @@ class PickPlaceSim:
         if not found:
             raise InputError(f"no place for {self.station.arm.name} reaches both objects: give a base", "no_base")
         return found[0]
-
-
-def _pose(numbers: np.ndarray) -> Pose:
-    return Pose(numbers[:3].copy(), normalize_quaternion(numbers[3:]))
 
 
 def _compute_box(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:

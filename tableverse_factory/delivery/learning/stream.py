@@ -16,17 +16,20 @@ from typing import Any, Self
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from jaxtyping import Int64
 
 from schemas.arrow import SCENES
 from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.query_parser import check_columns, parse_filter
-from tableverse_factory.delivery.learning.epoch_order import Indices, shuffle_epoch, take_part
 from tableverse_factory.delivery.learning.item_parts import PARTS, check_parts
 
 _INDEX_COLUMNS = ("scene_id", "shard", "tar_offset", "tar_size")
 _STATE_KEYS = ("epoch", "given", "part", "order")
+
+Indices = Int64[np.ndarray, " n"]
 
 
 @dataclass(slots=True)
@@ -62,7 +65,7 @@ class SceneStream:
             parts: Names of `learning.item_parts.PARTS`.
             columns: Columns of scenes/ to add to each item.
             condition: On the columns of scenes/, as in `tableverse query --where`; scenes without files are skipped.
-            shuffle: Size of the shuffle buffer (`learning.epoch_order`); 0 keeps the order of the table.
+            shuffle: Size of the shuffle buffer (`shuffle_epoch`); 0 keeps the order of the table.
             seed: Of the shuffle.
 
         Raises:
@@ -182,3 +185,35 @@ class SceneStream:
         for scene_id, shard in zip(*(self._index[name].to_pylist() for name in ("scene_id", "shard")), strict=True):
             digest.update(f"\n{shard} {scene_id}".encode())
         return digest.hexdigest()[:16]
+
+
+def shuffle_epoch(shards: Indices, seed: int, epoch: int, buffer: int) -> Indices:
+    """Shuffle all scenes of an epoch: a permutation of 0 to n - 1.
+
+    Shards are shuffled, and a buffer mixes the scenes of consecutive shards: each next scene is drawn from `buffer`
+    waiting ones. Only indices wait, so a buffer costs no memory; it is bounded so that scenes read in succession lie in
+    few shards. With `buffer` 0 the order is that of the table, in every epoch. `shards` holds each scene's shard
+    number.
+    """
+    if buffer == 0:
+        return np.arange(len(shards), dtype=np.int64)
+    rng = make_rng(seed, "stream", f"epoch {epoch}")
+    rank = np.empty(int(shards.max(initial=-1)) + 1, dtype=np.int64)
+    present = np.unique(shards)
+    rank[present] = rng.permutation(len(present))
+    by_shard = np.argsort(rank[shards], kind="stable")
+    waiting, rest = by_shard[:buffer].copy(), by_shard[buffer:]
+    drawn = np.empty(len(by_shard), dtype=np.int64)
+    for position, (slot, following) in enumerate(zip(rng.integers(buffer, size=len(rest)), rest, strict=True)):
+        drawn[position], waiting[slot] = waiting[slot], following
+    drawn[len(rest) :] = rng.permutation(waiting)
+    return drawn
+
+
+def take_part(ordered: Indices, index: int, of: int, even_for: int = 1) -> Indices:
+    """Take every `of`-th scene from `index` on; the parts are disjoint and complete.
+
+    `even_for` drops the last few scenes of the order, fewer than this, so that as many parts are equally long.
+    """
+    part: Indices = ordered[: len(ordered) - len(ordered) % even_for][index::of]
+    return part

@@ -23,9 +23,8 @@ from tableverse_factory.core.text import sanitize_line
 FORMAT = "tableverse-trajectory-1"
 MAX_BYTES = 64 * 1024 * 1024
 MAX_DURATION_S = 120.0
+# As the configuration bounds `trajectories.step_s`: replaying any file takes bounded time
 MIN_STEP_S, MAX_STEP_S = 0.004, 0.1
-"""As the configuration bounds `trajectories.step_s`: replaying any file takes bounded time."""
-
 MAX_SAMPLES = round(MAX_DURATION_S / MIN_STEP_S) + 1
 MAX_MOVED = 1000
 MAX_JOINTS = 64
@@ -42,48 +41,27 @@ _HEADER = re.compile(
 _QUATERNION_TOLERANCE = 1e-3
 _TIME_TOLERANCE = 1e-3
 _DATE = (1980, 1, 1, 0, 0, 0)
-_TYPES = {
-    "format": "|u1",
-    "robot": "|u1",
-    "base": "<f8",
-    "step_s": "<f8",
-    "max_disturbed_m": "<f8",
-    "command": "<f8",
-    "phase": "<i4",
-    "time_s": "<f4",
-    "qpos": "<f4",
-    "qvel": "<f4",
-    "tcp": "<f4",
-    "object_pose": "<f4",
-    "pads": "|u1",
-    "disturbed_m": "<f4",
-    "moved_ids": "|u1",
-    "moved_poses": "<f4",
+_ARRAYS = {
+    "format": ("|u1", 1),
+    "robot": ("|u1", 1),
+    "base": ("<f8", 1),
+    "step_s": ("<f8", 0),
+    "max_disturbed_m": ("<f8", 0),
+    "command": ("<f8", 2),
+    "phase": ("<i4", 1),
+    "time_s": ("<f4", 1),
+    "qpos": ("<f4", 2),
+    "qvel": ("<f4", 2),
+    "tcp": ("<f4", 2),
+    "object_pose": ("<f4", 2),
+    "pads": ("|u1", 1),
+    "disturbed_m": ("<f4", 1),
+    "moved_ids": ("|u1", 1),
+    "moved_poses": ("<f4", 3),
 }
-"""Every array of the file and its type, in the order of the file."""
+"""Type and number of dimensions of every array, in the order of the file."""
 
-_DIMENSIONS = {
-    "step_s": 0,
-    "max_disturbed_m": 0,
-    "command": 2,
-    "qpos": 2,
-    "qvel": 2,
-    "tcp": 2,
-    "object_pose": 2,
-    "moved_poses": 3,
-}
-_AS_READ = (
-    "command",
-    "phase",
-    "time_s",
-    "qpos",
-    "qvel",
-    "tcp",
-    "object_pose",
-    "pads",
-    "disturbed_m",
-    "moved_poses",
-)
+_DECODED = frozenset({"format", "robot", "base", "step_s", "max_disturbed_m", "moved_ids"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,14 +117,14 @@ class Recording(Frozen):
 
 def encode_recording(recording: Recording) -> bytes:
     """Encode the file; equal recordings give equal bytes."""
-    arrays: dict[str, Any] = {name: getattr(recording, name) for name in _TYPES if hasattr(recording, name)}
+    arrays: dict[str, Any] = {name: getattr(recording, name) for name in _ARRAYS if hasattr(recording, name)}
     arrays["format"] = np.frombuffer(FORMAT.encode(), dtype=np.uint8)
     arrays["robot"] = np.frombuffer(recording.robot.encode(), dtype=np.uint8)
     arrays["moved_ids"] = np.frombuffer("\n".join(recording.moved_ids).encode(), dtype=np.uint8)
     arrays["base"] = np.concatenate([recording.base.position, recording.base.quaternion_wxyz])
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, kind in _TYPES.items():
+        for name, (kind, _) in _ARRAYS.items():
             entry = zipfile.ZipInfo(f"{name}.npy", _DATE)
             entry.create_system, entry.external_attr = 3, 0o644 << 16
             content = io.BytesIO()
@@ -174,7 +152,7 @@ def decode_recording(data: bytes, name: str = "trajectory") -> Recording:
             step_s=float(found["step_s"]),
             max_disturbed_m=float(found["max_disturbed_m"]),
             moved_ids=_read_moved_ids(found),
-            **{key: found[key] for key in _AS_READ},
+            **{key: found[key] for key in _ARRAYS if key not in _DECODED},
         )
     except (ValueError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"{name}: no arrays of {FORMAT}: {sanitize_line(str(error), 300)}", "bad_arrays") from None
@@ -184,14 +162,14 @@ def _read_members(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_BYTES:
         raise ValueError(f"longer than {MAX_BYTES} bytes")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = {entry.filename: entry for entry in archive.infolist()[: len(_TYPES) + 1]}
-        if missing := [name for name in _TYPES if f"{name}.npy" not in entries]:
+        entries = {entry.filename: entry for entry in archive.infolist()[: len(_ARRAYS) + 1]}
+        if missing := [name for name in _ARRAYS if f"{name}.npy" not in entries]:
             raise ValueError(f"there is no {missing[0]}.npy")
-        if len(archive.infolist()) != len(_TYPES):
-            raise ValueError(f"{len(archive.infolist())} members instead of {len(_TYPES)}")
+        if len(archive.infolist()) != len(_ARRAYS):
+            raise ValueError(f"{len(archive.infolist())} members instead of {len(_ARRAYS)}")
         if packed := [entry.filename for entry in entries.values() if entry.compress_type != zipfile.ZIP_STORED]:
             raise ValueError(f"{packed[0]} is compressed; write it without")
-        return {name: _parse_array(name, archive.read(f"{name}.npy")) for name in _TYPES}
+        return {name: _parse_array(name, archive.read(f"{name}.npy")) for name in _ARRAYS}
 
 
 def _parse_array(name: str, content: bytes) -> Any:
@@ -199,10 +177,11 @@ def _parse_array(name: str, content: bytes) -> Any:
     if match is None or len(match[0]) != 10 + int.from_bytes(content[8:10], "little"):
         raise ValueError(f"{name}: its header is not that of a plain array, in .npy of version 1.0")
     kind, order, shape = match[1].decode(), match[2], tuple(int(side) for side in match[3].split(b",") if side.strip())
-    if len(shape) != _DIMENSIONS.get(name, 1):
-        raise ValueError(f"{name}: {len(shape)} dimensions instead of {_DIMENSIONS.get(name, 1)}")
-    if kind != _TYPES[name] or (order == b"True" and len(shape) > 1):
-        raise ValueError(f"{name}: type {kind}, Fortran order {order.decode()}; it has to be {_TYPES[name]}, False")
+    expected, dimensions = _ARRAYS[name]
+    if len(shape) != dimensions:
+        raise ValueError(f"{name}: {len(shape)} dimensions instead of {dimensions}")
+    if kind != expected or (order == b"True" and len(shape) > 1):
+        raise ValueError(f"{name}: type {kind}, Fortran order {order.decode()}; it has to be {expected}, False")
     body = content[len(match[0]) :]
     if math.prod(shape) * np.dtype(kind).itemsize != len(body):
         raise ValueError(f"{name}: its header says shape {shape}, but {len(body)} bytes follow")

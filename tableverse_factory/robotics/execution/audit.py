@@ -15,8 +15,8 @@ from tableverse_factory.robotics.robots.station import Station
 
 OBJECT_TOLERANCE_M = 0.005
 OBJECT_TOLERANCE_RAD = 0.1
+# Tolerances for another machine's arithmetic; on the machine that made the trajectory a replay is equal
 ARM_TOLERANCE_RAD = 0.01
-"""Tolerances for another machine's arithmetic; on the machine that made the trajectory a replay is equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +109,13 @@ def _compare_outcome(row: Row, replay: Replay) -> Iterator[str]:
 def _compare_states(replay: Replay, found: ReplayDifference) -> Iterator[str]:
     if strangers := replay.find_unknown_objects():
         yield f"{strangers[0]} is recorded as moved, and is no other object of the scene"
-    if not found.object_m <= OBJECT_TOLERANCE_M:
-        yield f"replayed an object is {1e3 * found.object_m:.1f} mm from where it was recorded"
-    if not found.object_rad <= OBJECT_TOLERANCE_RAD:
-        yield f"replayed an object is turned by {found.object_rad:.2f} rad from how it was recorded"
-    if not found.arm_rad <= ARM_TOLERANCE_RAD:
-        yield f"replayed a joint is {found.arm_rad:.3f} rad from where it was recorded"
-    if not found.tcp_m <= OBJECT_TOLERANCE_M:
-        yield f"replayed the gripper is {1e3 * found.tcp_m:.1f} mm from where it was recorded"
-    if not found.disturbed_m <= OBJECT_TOLERANCE_M:
-        yield f"replayed displacements differ by {1e3 * found.disturbed_m:.1f} mm from those that were recorded"
+    limits = (
+        (found.object_m, OBJECT_TOLERANCE_M, f"an object is {1e3 * found.object_m:.1f} mm from where it was recorded"),
+        (found.object_rad, OBJECT_TOLERANCE_RAD, f"an object is turned by {found.object_rad:.2f} rad"),
+        (found.arm_rad, ARM_TOLERANCE_RAD, f"a joint is {found.arm_rad:.3f} rad from where it was recorded"),
+        (found.tcp_m, OBJECT_TOLERANCE_M, f"the gripper is {1e3 * found.tcp_m:.1f} mm from where it was recorded"),
+        (found.disturbed_m, OBJECT_TOLERANCE_M, f"displacements differ by {1e3 * found.disturbed_m:.1f} mm"),
+    )
+    yield from (f"replayed {problem}" for value, limit, problem in limits if not value <= limit)
     if len(replay.saved) != len(replay.now):
         yield f"{len(replay.saved)} samples are recorded; replayed it ends after {len(replay.now)}"

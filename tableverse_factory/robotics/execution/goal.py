@@ -12,8 +12,8 @@ from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.relations.relations import compute_body_features, relation_holds
 from tableverse_factory.physics.mjcf.scene_objects import load_mesh
 
+# Relations in which the reference carries the object
 RESTING_RELATIONS = frozenset({Relation.ON, Relation.IN, Relation.INTO, Relation.INSIDE})
-"""Relations in which the reference carries the object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,20 +6,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
-from schemas.geometry import Pose
 from schemas.trajectories import Phase, Verdict
-from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.physics.simulate.at_rest import HOLD_S, SPEED_LIMIT
 from tableverse_factory.robotics.execution.goal import RESTING_RELATIONS, Goal
 from tableverse_factory.robotics.execution.monitor import StateSample
+from tableverse_factory.robotics.execution.poses import pose_from_row
 from tableverse_factory.robotics.execution.rollout import Rollout, ServoCommands
 
 MIN_LIFT_M = 0.03  # minimum rise at the end of the post-grasp phase that counts as lifted
+# Where Y carries X in the end, Y and objects that touch Y may move by this multiple of `max_disturbed_m`: a bowl rocks
+# when something is put into it, and its contents make room
 CARRIER_FACTOR = 2.0
-"""Where Y carries X in the end, Y and objects that touch Y may move by this multiple of `max_disturbed_m`: a bowl rocks
-when something is put into it, and its contents make room.
-"""
-
 FALL_M = 0.01  # an object whose center of mass is this far below the table top has fallen from it
 DROP_S = 0.06  # an object without finger contact for this long is dropped; single steps without contact are not counted
 LAG_RAD = 0.03  # maximum joint error where the fingers close and open, and at the end
@@ -164,7 +161,7 @@ class SuccessChecker:
             return RolloutFailure(Phase.POST_PLACE, "not_released", "a finger still touches it in the end")
         if last.center[2] < -FALL_M:
             return RolloutFailure(Phase.PLACE, "relation_missed", f"{goal.x_id} fell from the table")
-        if not goal.holds(_pose(last.pose), _pose(reference)):
+        if not goal.holds(pose_from_row(last.pose), pose_from_row(reference)):
             x, y, z = 1e3 * last.center
             detail = (
                 f"{goal.x_id} is not {goal.relation.value} {goal.y_id}; its centre is at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
@@ -182,7 +179,3 @@ def _is_release_commanded(commands: ServoCommands, index: int) -> bool:
     last = min(index, len(commands) - 1)
     start = max(commands.last_of(Phase.PRE_PLACE), 0)
     return bool((np.diff(commands.targets[start : last + 1, -1]) > 1e-6).any())
-
-
-def _pose(numbers: np.ndarray) -> Pose:
-    return Pose(numbers[:3].copy(), normalize_quaternion(numbers[3:]))

@@ -25,24 +25,19 @@ from tableverse_factory.robotics.robots.arm import GripperShape
 from tableverse_factory.robotics.robots.gripper_clearance import FINGER_CLEARANCE_M
 
 OPENING_MARGIN_M = 0.002  # A gripped object is at least this much narrower than the opening: 0.078 m for a Panda's hand
+# Rotations of the approach about the closing axis, from the steepest descent that the axis allows [rad]
 ROLLS = np.radians([0.0, -20.0, 20.0, -40.0, 40.0, -60.0, 60.0, -80.0, 80.0])
-"""Rotations of the approach about the closing axis, from the steepest descent that the axis allows [rad]."""
-
+# Travel of the TCP beyond the contacts: grips with the middle of the pads, or with the fingertips
 DEPTHS_M = (0.0, -0.008)
-"""Travel of the TCP beyond the contacts: grips with the middle of the pads, or with the fingertips."""
-
 MAX_LIFTED_M = 0.012  # maximum retreat of the gripper where its fingertips would touch the table
 MAX_PAIRS = 128  # contact pairs that are examined closely, spread over the body
+# Slopes beyond the friction cone, up to this coefficient, may still hold: used when nothing better is found
 LOOSE_FRICTION = 0.75
-"""Slopes beyond the friction cone, up to this coefficient, may still hold: used when nothing better is found."""
-
+# Weights of slope, nearness of the center of mass, and area in the score; and the score's factor on loose slopes
 _WEIGHTS, _LOOSE_FACTOR = (0.25, 0.4, 0.35), 0.3
-"""Weights of slope, nearness of the center of mass, and area in the score; and the score's factor on loose slopes."""
-
 _HALF_SCORE_LEVER_M = 0.04  # at this distance from the center of mass nearness is one half
+# Pairs in one cell count as one; parts of a body have this size; widths of one kind differ by less than this
 _CELL_M, _PART_M, _KIND_M = 0.012, 0.06, 0.02
-"""Pairs in one cell count as one; parts of a body have this size; widths of one kind differ by less than this."""
-
 _CLOSING_START_M = 0.012  # pads begin to close this far outside their contacts
 _MIN_WIDTH_M = 0.001
 _SLACK_M = 0.0005

@@ -19,8 +19,8 @@ OBSTACLE_CLEARANCE_M = 0.0015  # gaps to the body itself and to everything else
 _STRIDES = (16, 4, 1)  # coarse subsets of points first: most obstacles are large
 _CHUNK = 128
 Mask = Bool[np.ndarray, "n"]
+# Centers per grasp and half sizes of boxes along the axes of the gripper frame [m]
 Boxes = tuple[Float64[np.ndarray, "n b 3"], Float64[np.ndarray, "b 3"]]
-"""Centers per grasp and half sizes of boxes along the axes of the gripper frame [m]."""
 
 
 def find_clear_grasps(

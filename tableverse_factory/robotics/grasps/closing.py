@@ -11,12 +11,10 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_ra
 from tableverse_factory.geometry.relations.antipodal import cast_surface_rays
 from tableverse_factory.robotics.robots.arm import GripperShape
 
+# Pads press on everything this far behind the first contact: a body turns slightly as it is gripped
 PAD_COMPLIANCE_M = 0.001
-"""Pads press on everything this far behind the first contact: a body turns slightly as it is gripped."""
-
+# Rays along either side of a pad, and position of the outermost: flat objects are held by the very tips
 _RAYS, _OUTER_SHARE = 4, 0.9
-"""Rays along either side of a pad, and position of the outermost: flat objects are held by the very tips."""
-
 Rotations = Float64[np.ndarray, "n 3 3"]
 
 

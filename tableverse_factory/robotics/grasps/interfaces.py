@@ -28,12 +28,7 @@ class GraspModel(Protocol):
     """Proposes grasps of an isolated object."""
 
     def __call__(
-        self,
-        target: SceneObject,
-        arm: Arm,
-        config: TrajectoriesConfig,
-        rng: np.random.Generator,
-        services: Services,
+        self, target: SceneObject, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
     ) -> Grasps:
         """Propose grasps in the table frame, with widths and scores.
 
@@ -66,10 +61,7 @@ def propose_graspgen(
 ) -> Grasps:
     """Request grasps from a server (`grasps.remote`), closed on the pieces."""
     return close_grasps(
-        request_grasps(target.standing, config, services),
-        _merge_pieces(target),
-        arm.shape,
-        arm.max_opening_m,
+        request_grasps(target.standing, config, services), _merge_pieces(target), arm.shape, arm.max_opening_m
     )
 
 

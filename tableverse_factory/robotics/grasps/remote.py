@@ -34,11 +34,10 @@ POINTS = 2048
 COUNT = 256  # number of grasps requested
 MAX_COUNT = 4096  # maximum number of grasps accepted
 MAX_DISTANCE_M = 2.0  # maximum distance of a gripper's base from the centroid
+# Rotations within this of orthonormal, in every entry of `R'R - 1`, are orthonormalized; others are refused
 ROTATION_TOLERANCE = 1e-2
-"""Rotations within this of orthonormal, in every entry of `R'R - 1`, are orthonormalized; others are refused."""
-
+# Our gripper frame (y closing, z approach) in theirs (x closing, z approach)
 _GRIPPER_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Our gripper frame (y closing, z approach) in theirs (x closing, z approach)."""
 
 
 def request_grasps(mesh: TriangleMesh, config: TrajectoriesConfig, services: Services) -> Grasps:

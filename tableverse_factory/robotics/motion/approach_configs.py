@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from schemas.geometry import Frozen, Pose
-from schemas.trajectories import JointVector, NoMotion, Phase
-from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.robotics.motion.kinematics import Configurations, solve_ik
-from tableverse_factory.robotics.motion.lines import CartesianLine, trace_lines
+from schemas.geometry import Frozen, Pose, Vector3
+from schemas.trajectories import JointPath, JointVector, NoMotion, Phase
+from tableverse_factory.geometry.math.transforms import rotation_matrix, translate_pose
+from tableverse_factory.robotics.motion.kinematics import Configurations, follow_poses, solve_ik
 from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 from tableverse_factory.robotics.robots.gripper_clearance import LIFT_M, STANDOFF_M
 
+SPACING_M = 0.005  # distance between solved poses; between them the TCP strays by hundredths of a millimeter
 MAX_BRANCHES = 6  # IK solutions tried per TCP pose
 MIN_LINE_SHARE = 0.4  # A line that ends early is accepted, and recorded, if at least this share of it is left
 SLANT_RAD = 0.26  # lean of the lines that are tried where an obstacle hangs over the way up
@@ -24,6 +24,44 @@ _UP = np.array([0.0, 0.0, 1.0])
 _SLANTED = [
     np.array([np.sin(SLANT_RAD) * np.cos(side), np.sin(SLANT_RAD) * np.sin(side), np.cos(SLANT_RAD)]) for side in _SIDES
 ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CartesianLine(Frozen):
+    """Configurations along a straight motion of the TCP at constant orientation.
+
+    Attributes:
+        path: From the contact end to the free end. Shape (n, j) [rad].
+        length_m: Length reached; less than requested where the arm or the scene ends it [m].
+        blocked_by: What ended it; empty for full length.
+    """
+
+    path: JointPath
+    length_m: float
+    blocked_by: str
+
+
+def trace_lines(
+    world: CollisionWorld,
+    space: CollisionSpace,
+    touching: Configurations,
+    tcp: Pose,
+    direction: Vector3,
+    length_m: float,
+) -> list[CartesianLine]:
+    """Trace a line along a unit vector of the table frame from each configuration at `tcp`, as far as it is free."""
+    count = int(np.ceil(length_m / SPACING_M - 1e-9))
+    away = [translate_pose(tcp, np.asarray(direction) * (length_m * k / count)) for k in range(1, count + 1)]
+    rows, reached = follow_poses(world.chain, touching, [world.in_base(pose) for pose in away])
+    found = []
+    for branch, steps in enumerate(reached.tolist()):
+        path = np.concatenate([touching[branch][None], rows[:steps, branch]])
+        hit = space.find_first_collision(path)
+        why = "" if steps == count else "the arm's reach"
+        if hit is not None:
+            why, steps = world.describe_collision(space, path[hit]), hit - 1
+        found.append(CartesianLine(path[: steps + 1], length_m * max(steps, 0) / count, why))
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,8 +13,8 @@ from tableverse_factory.robotics.motion.pick_place import LINE_MARGIN_M, PickPla
 from tableverse_factory.robotics.motion.segments import PathSegment, TimedRun, time_segments
 from tableverse_factory.robotics.robots.arm import Arm
 
+# Clearances kept from the scene between the lines; later ones are fallbacks, which are recorded [m]
 MARGINS_M = (0.008, 0.003, LINE_MARGIN_M)
-"""Clearances kept from the scene between the lines; later ones are fallbacks, which are recorded [m]."""
 SQUEEZE_M = 0.03  # holding fingers are commanded this much closer than the object's width, for the full grip force [m]
 SETTLE_S = 0.15  # pause after the fingers should be closed or open [s]
 _PHASES = list(Phase)

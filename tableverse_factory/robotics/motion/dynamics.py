@@ -1,17 +1,26 @@
 """Inverse dynamics of an arm with its payload, by MuJoCo on the arm alone."""
 
+from dataclasses import dataclass
+
 import mujoco
 import numpy as np
 
-from schemas.geometry import Pose
+from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointVector
 from tableverse_factory.geometry.math.transforms import compose_poses
-from tableverse_factory.robotics.motion.carried_object import CarriedObject
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import Station
 
 _PAYLOAD = "load"
 _FREE = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CarriedObject(Frozen):
+    """Object between the fingers that follows the TCP, by its own frame in the gripper frame."""
+
+    object_id: str
+    object_to_tcp: Pose
 
 
 class ArmDynamics:

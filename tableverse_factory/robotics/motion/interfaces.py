@@ -28,5 +28,5 @@ class Planner(Protocol):
         ...
 
 
+# Planners by the name in `trajectories.planner`
 PLANNERS: dict[str, Callable[[], Planner]] = {"rrt": RrtConnect, "curobo": CuroboPlanner}
-"""Planners by the name in `trajectories.planner`."""

@@ -21,8 +21,8 @@ Rotations = Float64[np.ndarray, "b 3 3"]
 Positions = Float64[np.ndarray, "b 3"]
 POSITION_TOLERANCE_M = 1e-6
 ROTATION_TOLERANCE_RAD = 1e-5
+# Distance of solutions from joint limits, so that a servo that overshoots does not run into its stop
 LIMIT_MARGIN_RAD = 0.02
-"""Distance of solutions from joint limits, so that a servo that overshoots does not run into its stop."""
 MAX_ITERATIONS = 40
 LINE_ITERATIONS = 8
 MAX_STEP_RAD = 0.6

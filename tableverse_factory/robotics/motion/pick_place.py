@@ -20,7 +20,7 @@ import numpy as np
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointVector
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, translate_pose
-from tableverse_factory.robotics.motion.carried_object import CarriedObject
+from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.world import CONTACT_TOLERANCE_M, CollisionSpace, CollisionWorld, Pair
 from tableverse_factory.robotics.robots.gripper_clearance import compute_approach_openings
 

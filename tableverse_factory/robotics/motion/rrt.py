@@ -8,8 +8,8 @@ import numpy as np
 from schemas.trajectories import JointPath, JointVector
 from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 
+# Largest motion of any joint between two checks while planning; the finished motion is checked more finely
 EDGE_STEP_RAD = 0.02
-"""Largest motion of any joint between two checks while planning; the finished motion is checked more finely."""
 EXTENSION_RAD = 0.4  # longest branch of a tree, as the largest motion of any joint
 MAX_BRANCHES = 1500
 SHORTCUTS = 40

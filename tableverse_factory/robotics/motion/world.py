@@ -15,16 +15,11 @@ import numpy as np
 
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointPath, JointVector
-from tableverse_factory.geometry.math.transforms import (
-    compose_poses,
-    invert_pose,
-    pose_from_matrix,
-)
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_matrix
 from tableverse_factory.physics.mjcf.spec import TABLE
-from tableverse_factory.robotics.motion.carried_object import CarriedObject
-from tableverse_factory.robotics.motion.dynamics import ArmDynamics
+from tableverse_factory.robotics.motion.dynamics import ArmDynamics, CarriedObject
 from tableverse_factory.robotics.motion.kinematics import build_chain
-from tableverse_factory.robotics.robots.station import Station
+from tableverse_factory.robotics.robots.station import Station, find_subtree
 
 Pair = tuple[int, int]  # two geom ids, ascending
 CONTACT_TOLERANCE_M = 1e-5  # penetration below this is the collision routine's own error [m]
@@ -234,7 +229,7 @@ class _CollisionMasks(Frozen):
         robot = np.isin(body, station.arm_bodies)
         moving = robot & (model.body_weldid[body] != model.body_weldid[station.base_body])
         hand = int(model.site_bodyid[station.tcp_site])
-        return cls(solid, robot & solid, moving & solid, np.isin(body, _below(model, hand)) & solid)
+        return cls(solid, robot & solid, moving & solid, np.isin(body, find_subtree(model, hand)) & solid)
 
     def apply(self, model: mujoco.MjModel, held: int | None, margin_m: float) -> None:
         """Write masks and margins into a model; geoms without contacts in the simulation stay without here."""
@@ -273,11 +268,3 @@ def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
     """Convert consecutive addresses to a slice, which halves the time of writing there."""
     first = int(indices[0])
     return slice(first, first + len(indices)) if (np.diff(indices) == 1).all() else indices
-
-
-def _below(model: mujoco.MjModel, top: int) -> list[int]:
-    found = {top}
-    for body in range(top + 1, model.nbody):
-        if int(model.body_parentid[body]) in found:
-            found.add(body)
-    return sorted(found)

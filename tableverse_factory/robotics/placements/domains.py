@@ -16,9 +16,8 @@ from tableverse_factory.geometry.relations.relations import NEXT_TO_GAP_M, BodyF
 
 Vector2 = Float64[np.ndarray, "2"]
 Points2 = Float64[np.ndarray, "n 2"]
+# Extent of a half-space beyond its margin, within common usage of `to the left of` and an arm's reach
 DOMAIN_DEPTH_M = 0.25
-"""Extent of a half-space beyond its margin, within common usage of `to the left of` and an arm's reach."""
-
 NEXT_TO_MARGIN_M = 0.01  # `next to` placements stay closer than the relation's limit by this
 
 

@@ -19,8 +19,9 @@ from tableverse_factory.robotics.placements.request import (
     CandidatePlacement,
     NoPlacement,
     PlacementRequest,
+    PlacementSamples,
+    concatenate_samples,
 )
-from tableverse_factory.robotics.placements.samples import PlacementSamples, concatenate_samples
 
 EDGE_CLEARANCE_M = 0.01  # minimum distance from the object's box to the table's edge
 _FULL_CLEARANCE_M = 0.06  # clearance beyond which a placement is no better

@@ -1,17 +1,22 @@
 """Placements on or in the reference: lowered from above on height maps until the object touches."""
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
 
+from schemas.geometry import Vector3
+from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, MovingSolid
+from tableverse_factory.geometry.collision.solids import Solids
+from tableverse_factory.geometry.math.transforms import rotation_matrix, transform_points
 from tableverse_factory.geometry.mesh.height_maps import CellMask, Heights
 from tableverse_factory.geometry.relations.relations import BodyFeatures, is_inside, relation_holds
 from tableverse_factory.geometry.relations.stable_placement import CONTACT_M, drop_body, is_stable, make_support_surface
+from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.robotics.placements.clearance import are_outlines_clear, compute_least_gaps
 from tableverse_factory.robotics.placements.domains import Predicate
 from tableverse_factory.robotics.placements.orientations import Orientation
-from tableverse_factory.robotics.placements.pieces import ConvexPieces
 from tableverse_factory.robotics.placements.request import (
     CHECKS_PER_PLACEMENT,
     ENOUGH_CLEAR,
@@ -20,8 +25,9 @@ from tableverse_factory.robotics.placements.request import (
     CandidatePlacement,
     NoPlacement,
     PlacementRequest,
+    PlacementSamples,
+    concatenate_samples,
 )
-from tableverse_factory.robotics.placements.samples import PlacementSamples, concatenate_samples
 
 FINGER_REACH_M = 0.02  # minimum reach of fingers beside a held object, from its top
 HAND_ROOM_M = 0.05  # fingers may enter a vessel that is wider than the object by this on either side
@@ -31,6 +37,30 @@ WALL_GAP_M = 0.006  # gap to the wall that makes an insertion easy
 _CORE_SHARE = 0.6  # share of the object's width that is used to find the ground
 _LEVEL_SCALE_M = 0.03  # height in a vessel that costs as much as lying at its wall
 _MAX_DEPTH_M = 0.05  # distance from the edge beyond which a placement is no better
+
+
+class ConvexPieces:
+    """Pieces of an object and of the objects near its placement."""
+
+    def __init__(self, x: SceneObject, near: Sequence[SceneObject]) -> None:
+        self._standing = _build_solids(x)
+        self._near = [MovingSolid(_build_solids(scene_object), np.zeros(3)) for scene_object in near]
+        self._rotated: dict[bytes, Solids] = {}
+        self._up = LinearSweep(np.array([0.0, 0.0, 1.0]))
+
+    def find_clear_height(self, turn: Orientation, offset: Vector3, clearance_m: float) -> float:
+        """Find exactly how far above `offset` the rotated object first has `clearance_m` to all others [m]."""
+        key = turn.quaternion_wxyz.tobytes()
+        if key not in self._rotated:
+            self._rotated[key] = self._standing.turned(rotation_matrix(turn.quaternion_wxyz), np.zeros(3))
+        return self._up.first_clear([MovingSolid(self._rotated[key], offset)], self._near, clearance_m)
+
+
+def _build_solids(scene_object: SceneObject) -> Solids:
+    return Solids(
+        [transform_points(scene_object.pose, hull.vertices) for hull in scene_object.hulls],
+        [h.faces for h in scene_object.hulls],
+    )
 
 
 def find_places_on_or_in(

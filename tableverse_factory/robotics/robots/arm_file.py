@@ -18,13 +18,12 @@ from tableverse_factory.physics.mjcf.file_check import check_files
 from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import Arm
-from tableverse_factory.robotics.robots.gripper import measure_gripper
+from tableverse_factory.robotics.robots.gripper import measure_gripper, robot_error
 
 TCP_SITE = "tcp"
 HOME_KEY = "home"
+# Gentle defaults for files without a `numeric` of that name [rad/s], [rad/s²], [m/s]
 MAX_VELOCITY, MAX_ACCELERATION, MAX_OPENING_SPEED = 1.5, 5.0, 0.1
-"""Gentle defaults for files without a `numeric` of that name [rad/s], [rad/s²], [m/s]."""
-
 _MIN_BASE_RADIUS_M = 0.08
 _FOOT_HEIGHT_M = 0.15
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
@@ -72,7 +71,7 @@ def _load_spec(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSp
 def _build_arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, TCP_SITE)
     if site < 0:
-        raise _lacking(f"there is no site {TCP_SITE!r}: add one between the fingertips, z out of the hand, y across")
+        raise robot_error(f"there is no site {TCP_SITE!r}: add one between the fingertips, z out of the hand, y across")
     bodies = _find_bodies_to(model, int(model.site_bodyid[site]))
     joints = [j for body in bodies for j in _list_joints(model, body)]
     _check_chain(model, bodies[0], joints)
@@ -82,7 +81,9 @@ def _build_arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     lower, upper = _compute_limits(model, joints, servos)
     addresses = model.jnt_qposadr[joints]
     if ((home[addresses] < lower) | (home[addresses] > upper)).any():
-        raise _lacking(f"the keyframe {HOME_KEY!r} is outside the joints' limits: {home[addresses].round(4).tolist()}")
+        raise robot_error(
+            f"the keyframe {HOME_KEY!r} is outside the joints' limits: {home[addresses].round(4).tolist()}"
+        )
     gripper = measure_gripper(model, site, joints, gripper_actuator, home)
     _prepare_for_attachment(spec, model, joints[0], home)
     return Arm(
@@ -129,7 +130,7 @@ def _prepare_for_attachment(spec: mujoco.MjSpec, model: mujoco.MjModel, first_jo
     mujoco.mj_fwdPosition(alone, data)
     pairs = [[alone.body(int(body)).name for body in alone.geom_bodyid[contact.geom]] for contact in data.contact]
     if pairs:
-        raise _lacking(
+        raise robot_error(
             f"at home {pairs[0][0]!r} touches {pairs[0][1]!r}: exclude the pair, or choose another {HOME_KEY!r}"
         )
 
@@ -141,7 +142,7 @@ def _find_bodies_to(model: mujoco.MjModel, body: int) -> list[int]:
         bodies.insert(0, body)
         body = int(model.body_parentid[body])
     if not bodies:
-        raise _lacking(f"the site {TCP_SITE!r} stands in the world: put it into the hand")
+        raise robot_error(f"the site {TCP_SITE!r} stands in the world: put it into the hand")
     return bodies
 
 
@@ -151,14 +152,14 @@ def _list_joints(model: mujoco.MjModel, body: int) -> list[int]:
 
 def _check_chain(model: mujoco.MjModel, base: int, joints: list[int]) -> None:
     if model.body_jntnum[base]:
-        raise _lacking(f"the base {model.body(base).name!r} has a joint: an arm stands still on its base")
+        raise robot_error(f"the base {model.body(base).name!r} has a joint: an arm stands still on its base")
     if (model.jnt_type == _FREE).any() or len(np.flatnonzero(model.body_parentid[1:] == 0)) != 1:
-        raise _lacking("there is more than one body in the world, or one that is free: give the arm alone")
+        raise robot_error("there is more than one body in the world, or one that is free: give the arm alone")
     if not joints:
-        raise _lacking(f"no joint lies between the base and the site {TCP_SITE!r}")
+        raise robot_error(f"no joint lies between the base and the site {TCP_SITE!r}")
     for joint in joints:
         if model.jnt_type[joint] != _HINGE or not model.jnt_limited[joint]:
-            raise _lacking(f"the joint {model.joint(joint).name!r} must be a hinge with a range")
+            raise robot_error(f"the joint {model.joint(joint).name!r} must be a hinge with a range")
 
 
 def _find_servo(model: mujoco.MjModel, joint: int) -> int:
@@ -167,13 +168,13 @@ def _find_servo(model: mujoco.MjModel, joint: int) -> int:
     found = np.flatnonzero(of_joint)
     called = model.joint(joint).name
     if len(found) != 1:
-        raise _lacking(f"the joint {called!r} has {len(found)} actuators: give it one, of the kind position")
+        raise robot_error(f"the joint {called!r} has {len(found)} actuators: give it one, of the kind position")
     servo = int(found[0])
     stiffness, back = float(model.actuator_gainprm[servo, 0]), float(model.actuator_biasprm[servo, 1])
     affine = model.actuator_biastype[servo] == mujoco.mjtBias.mjBIAS_AFFINE
     direct = model.actuator_dyntype[servo] == mujoco.mjtDyn.mjDYN_NONE and model.actuator_gear[servo, 0] == 1.0
     if not (affine and direct and stiffness > 0.0 and np.isclose(stiffness, -back)):
-        raise _lacking(
+        raise robot_error(
             f"the actuator of the joint {called!r} does not control its position: use the kind position, with gear 1"
         )
     return servo
@@ -182,9 +183,9 @@ def _find_servo(model: mujoco.MjModel, joint: int) -> int:
 def _find_gripper_actuator(model: mujoco.MjModel, servos: list[int]) -> int:
     others = [actuator for actuator in range(model.nu) if actuator not in servos]
     if len(others) != 1:
-        raise _lacking(f"there are {len(others)} actuators besides the joints': give one, which opens the gripper")
+        raise robot_error(f"there are {len(others)} actuators besides the joints': give one, which opens the gripper")
     if not model.actuator_ctrllimited[others[0]]:
-        raise _lacking(f"the gripper's actuator {model.actuator(others[0]).name!r} needs a ctrlrange")
+        raise robot_error(f"the gripper's actuator {model.actuator(others[0]).name!r} needs a ctrlrange")
     return others[0]
 
 
@@ -192,7 +193,7 @@ def _read_home(model: mujoco.MjModel) -> JointVector:
     """Read all positions of the home keyframe."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, HOME_KEY)
     if key < 0:
-        raise _lacking(f"there is no keyframe {HOME_KEY!r}: add one with the arm where it waits")
+        raise robot_error(f"there is no keyframe {HOME_KEY!r}: add one with the arm where it waits")
     return np.array(model.key_qpos[key])
 
 
@@ -209,7 +210,7 @@ def _read_max_torque(model: mujoco.MjModel, joint: int, servo: int) -> float:
         return float(np.abs(model.actuator_forcerange[servo]).min())
     if model.jnt_actfrclimited[joint]:
         return float(np.abs(model.jnt_actfrcrange[joint]).min())
-    raise _lacking(f"the actuator of the joint {model.joint(joint).name!r} needs a forcerange [N m]")
+    raise robot_error(f"the actuator of the joint {model.joint(joint).name!r} needs a forcerange [N m]")
 
 
 def _read_numeric(model: mujoco.MjModel, name: str, count: int, default: float) -> JointVector:
@@ -220,7 +221,7 @@ def _read_numeric(model: mujoco.MjModel, name: str, count: int, default: float) 
     first, size = int(model.numeric_adr[index]), int(model.numeric_size[index])
     values = np.array(model.numeric_data[first : first + size])
     if size not in (1, count) or not (values > 0.0).all():
-        raise _lacking(f"the numeric {name!r} has {values.tolist()}: give {count} positive numbers, or one")
+        raise robot_error(f"the numeric {name!r} has {values.tolist()}: give {count} positive numbers, or one")
     return np.broadcast_to(values, (count,)).copy()
 
 
@@ -241,9 +242,5 @@ def _measure_base_radius(model: mujoco.MjModel, base: int) -> float:
 def _require_name(item: mujoco.MjModel, what: str) -> str:
     name: str = item.name
     if not name:
-        raise _lacking(f"a {what} has no name: give it one")
+        raise robot_error(f"a {what} has no name: give it one")
     return name
-
-
-def _lacking(message: str) -> InputError:
-    return InputError(message, "bad_robot")

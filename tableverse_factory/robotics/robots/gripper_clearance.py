@@ -4,13 +4,11 @@ import numpy as np
 
 from schemas.trajectories import Numbers
 
+# Straight travel of the empty gripper to a grasp and back from a release (GenManip's stand-offs, both)
 STANDOFF_M = 0.08
-"""Straight travel of the empty gripper to a grasp and back from a release (GenManip's stand-offs, both)."""
-
 LIFT_M = 0.16  # straight travel of the object up from its place, and down to its release
+# Gap between each finger and its contact on approach; near the maximum opening the gripper is fully open
 FINGER_CLEARANCE_M = 0.01
-"""Gap between each finger and its contact on approach; near the maximum opening the gripper is fully open."""
-
 _NEARLY_OPEN = 0.95
 
 

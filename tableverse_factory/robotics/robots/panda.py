@@ -28,12 +28,11 @@ from tableverse_factory.robotics.robots.panda_shapes import (
 COLLISION_GROUP, VISUAL_GROUP = 3, 2
 MAX_OPENING_M = 0.08
 GRIP_FORCE_N = 60.0
+# Sliding, torsional [m], rolling [m]; the pads have contact priority, so it applies whatever they touch
 PAD_FRICTION = (0.5, 0.01, 0.0001)
-"""Sliding, torsional [m], rolling [m]; the pads have contact priority, so it applies whatever they touch."""
-
 TCP_BEYOND_FLANGE_M = 0.1034
+# Damping over stiffness of every servo [s]: all joints follow their command equally late, so the path is kept
 LAG_S = 0.03
-"""Damping over stiffness of every servo [s]: all joints follow their command equally late, so the path is kept."""
 
 
 @dataclass(frozen=True, slots=True)

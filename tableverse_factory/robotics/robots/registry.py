@@ -16,8 +16,8 @@ from tableverse_factory.robotics.robots.panda import build_panda
 
 ARMS: Mapping[str, Callable[[], Arm]] = {"panda": build_panda}  # built-in arms
 MENAGERIE_PREFIX = "menagerie:"
+# Body and position of the TCP in its frame, for models without a site `tcp` [m]
 MENAGERIE_TCPS: Mapping[str, tuple[str, Vector3]] = {"franka_emika_panda": ("hand", np.array([0.0, 0.0, 0.1034]))}
-"""Body and position of the TCP in its frame, for models without a site `tcp` [m]."""
 
 
 @lru_cache(maxsize=8)

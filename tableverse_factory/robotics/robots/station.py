@@ -20,9 +20,8 @@ from tableverse_factory.robotics.robots.arm import Arm
 
 PREFIX = "robot/"  # prefix of the arm's names in the scene's model
 PEDESTAL_HEIGHT_M = 0.75
+# Just below the base's foot: for an arm on the table, the pedestal's top is hidden inside the slab
 PEDESTAL_TOP_M = -0.002
-"""Just below the base's foot: for an arm on the table, the pedestal's top is hidden inside the slab."""
-
 PEDESTAL_SHARE = 0.75  # radius of the pedestal over that of the foot's circle
 _SIZE_FIELDS = ("memory", "nstack", "njmax", "nconmax", "nuserdata")
 _PEDESTAL_RGBA = (0.32, 0.34, 0.37, 1.0)
@@ -82,7 +81,7 @@ class Station:
         self.finger_geoms: Ids = np.array([model.geom(PREFIX + name).id for name in arm.finger_geoms])
         self.tcp_site = int(model.site(PREFIX + arm.tcp_site).id)
         self.base_body = int(model.body(f"{PREFIX}pedestal").id)
-        self.arm_bodies: Ids = np.flatnonzero([_stands_on(model, body, self.base_body) for body in range(model.nbody)])
+        self.arm_bodies: Ids = np.array(find_subtree(model, self.base_body))
         free = find_free_bodies(model)
         self.object_ids = tuple(model.body(body).name for body in free)
         self.object_bodies = dict(zip(self.object_ids, free, strict=True))
@@ -224,7 +223,10 @@ def delete_visual_meshes(spec: mujoco.MjSpec) -> None:
             spec.delete(mesh)
 
 
-def _stands_on(model: mujoco.MjModel, body: int, base: int) -> bool:
-    while body > base:
-        body = int(model.body_parentid[body])
-    return body == base
+def find_subtree(model: mujoco.MjModel, root: int) -> list[int]:
+    """List a body and its descendants, ascending."""
+    found = {root}
+    for body in range(root + 1, model.nbody):
+        if int(model.body_parentid[body]) in found:
+            found.add(body)
+    return sorted(found)

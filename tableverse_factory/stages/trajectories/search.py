@@ -30,12 +30,10 @@ from tableverse_factory.robotics.placements.sampling import sample_placements
 from tableverse_factory.stages.trajectories.work_cell import WorkCell
 
 MAX_GRASPS = 16  # grasps tried per stage: the best, and those that differ most from them
+# Grasps nearer than this and turned by less than 20 degrees are alike: they fail together
 ALIKE_M, ALIKE_COS = 0.015, 0.94
-"""Grasps nearer than this and turned by less than 20 degrees are alike: they fail together."""
-
+# Failures in these phases do not depend on the placement
 GRASP_PHASES = (Phase.PRE_GRASP, Phase.GRASP, Phase.POST_GRASP)
-"""Failures in these phases do not depend on the placement."""
-
 MAX_REASONS = 5  # reasons named in the tally of a task's attempts
 _PHASES = tuple(Phase)
 _TARGET_GRASPS = 3

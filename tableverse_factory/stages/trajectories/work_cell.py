@@ -59,12 +59,7 @@ class WorkCell:
         if object_id not in self._grasps:
             others = [scene_object for name, scene_object in self.objects.items() if name != object_id]
             self._grasps[object_id] = propose_grasps(
-                self.objects[object_id],
-                others,
-                self.station.arm,
-                self._config,
-                self._rngs[object_id],
-                self._services,
+                self.objects[object_id], others, self.station.arm, self._config, self._rngs[object_id], self._services
             )
         return self._grasps[object_id]
 

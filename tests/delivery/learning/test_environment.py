@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+import tableverse_factory
 from schemas.curation import Relation
-from tableverse_factory import open_dataset
+from tableverse_factory import TableEnv, Variation, open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.delivery import learning
-from tableverse_factory.delivery.learning import TableEnv, Variation
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
 from tableverse_factory.delivery.learning.variation import displace_objects
 
@@ -317,7 +316,7 @@ def test_without_its_package_it_says_what_to_type(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.delitem(sys.modules, "tableverse_factory.delivery.learning.environment")
     with pytest.raises(ConfigError, match=r"TableEnv needs gymnasium: pip install 'tableverse-factory\[gym\]'"):
-        _ = learning.TableEnv
+        _ = tableverse_factory.TableEnv
 
 
 def test_names_alone_are_enough_for_a_process_that_knows_nothing(out):

@@ -9,9 +9,9 @@ import torch
 from torch.testing._internal.distributed.fake_pg import FakeStore
 from torch.utils.data import DataLoader
 
+import tableverse_factory
+from tableverse_factory import SceneDataset, SceneStream
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.delivery import learning
-from tableverse_factory.delivery.learning import SceneDataset, SceneStream
 
 IDS = [f"s-{k}" for k in range(7)]
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create 3 worker processes")
@@ -158,4 +158,4 @@ def test_without_torch_it_says_what_to_type(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.delitem(sys.modules, "tableverse_factory.delivery.learning.loader")
     with pytest.raises(ConfigError, match=r"SceneDataset needs torch: pip install torch$"):
-        _ = learning.SceneDataset
+        _ = tableverse_factory.SceneDataset

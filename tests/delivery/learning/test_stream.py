@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tableverse_factory import open_dataset
+from tableverse_factory import SceneStream, open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError, QueryError
-from tableverse_factory.delivery.learning import SceneStream
-from tableverse_factory.delivery.learning.epoch_order import shuffle_epoch, take_part
+from tableverse_factory.delivery.learning.stream import shuffle_epoch, take_part
 from tests.helpers.recorded_dataset import write_recorded_dataset
 
 IDS = [f"s-{k}" for k in range(7)]

@@ -7,9 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from tableverse_factory import open_dataset
+from tableverse_factory import VectorSim, build_scene_grid, open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.delivery.learning import VectorSim, build_scene_grid
 
 
 @pytest.fixture(scope="module")

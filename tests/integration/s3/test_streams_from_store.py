@@ -3,8 +3,8 @@
 import pytest
 from torch.utils.data import DataLoader
 
+from tableverse_factory import SceneDataset, SceneStream
 from tableverse_factory.core.storage.files import get_store
-from tableverse_factory.delivery.learning import SceneDataset, SceneStream
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
 

@@ -17,8 +17,8 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     transform_points,
 )
-from tableverse_factory.robotics.motion.carried_object import CarriedObject
 from tableverse_factory.robotics.motion.curobo import _describe_box, _describe_mesh
+from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.interfaces import PLANNERS
 from tableverse_factory.robotics.motion.obstacles import build_obstacle, list_obstacles, merge_object_pieces
 from tableverse_factory.robotics.motion.world import CollisionWorld

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.robotics.motion.blend import blend_path
-from tableverse_factory.robotics.motion.carried_object import CarriedObject
-from tableverse_factory.robotics.motion.dynamics import ArmDynamics
+from tableverse_factory.robotics.motion.dynamics import ArmDynamics, CarriedObject
 from tableverse_factory.robotics.motion.retime import TORQUE_SHARE, retime_curve
+from tableverse_factory.robotics.motion.segments import blend_path
 from tableverse_factory.robotics.robots.panda import build_panda
 from tests.helpers.cells import BLOCK, HOME, alone, down, held_pose, station_of
 from tests.helpers.simple_scenes import Solid, box

@@ -5,7 +5,7 @@ import pytest
 
 from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
-from tableverse_factory.robotics.motion.carried_object import CarriedObject
+from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.pick_place import PickPlace
 from tableverse_factory.robotics.motion.world import CollisionWorld, _order_coarse_to_fine
