@@ -5,7 +5,6 @@ import json
 import math
 import os
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +20,7 @@ from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
 from tableverse_factory.stages.trajectories.preflight import check_trajectory_models
 from workers.driver.budget import SpendingLimits
+from workers.driver.signals import StopSignals
 from workers.executors.ray_address import parse_host_port
 from workers.progress.notebook import open_display
 from workers.progress.tally import Display
@@ -49,6 +49,7 @@ def build(
     max_calls: int | None = None,
     keep: bool = True,
     display: Display | Literal["auto"] | None = "auto",
+    signals: StopSignals | None = None,
 ) -> BuildSummary:
     """Build a dataset, or resume its build.
 
@@ -73,6 +74,7 @@ def build(
         max_calls: Most requests to models, over all runs of `out`.
         keep: Whether the output of every stage is kept in `out`; `from_stage` needs it.
         display: Shows the progress: `auto` draws a table in a notebook or terminal, None shows nothing.
+        signals: Handlers of SIGINT and SIGTERM that end the run; None leaves signals alone.
 
     Returns:
         The counts of this run. `summary.read_state()` reads those of the whole dataset, with the reasons of losses.
@@ -89,71 +91,26 @@ def build(
         >>> state = summary.read_state()
         >>> state.done, state.dropped, state.failed
     """
-    request = make_request(
-        None if manifest is None else os.fspath(manifest),
-        os.fspath(out),
-        config=None if config is None else Path(config),
-        overrides=_format_overrides(overrides),
-        executor=executor,
-        workers=workers,
-        address=address,
-        pools=None if pools is None else Path(pools),
-        stages=stages,
-        from_stage=from_stage,
-        limit=limit,
-        shards=shards,
-        max_usd=max_usd,
-        max_calls=max_calls,
-        keep=keep,
-    )
-    context: AbstractContextManager[Display] = open_display(display)
-    with context as shown:
-        return run_build(request, shown)
-
-
-def make_request(
-    manifest: str | None,
-    out: str,
-    *,
-    config: Path | None = None,
-    overrides: Sequence[str] = (),
-    executor: Literal["local", "ray"] = "local",
-    workers: int | None = None,
-    address: str | None = None,
-    pools: Path | None = None,
-    stages: str | None = None,
-    from_stage: str | None = None,
-    limit: int | None = None,
-    shards: str | Collection[int] | None = None,
-    max_usd: float | None = None,
-    max_calls: int | None = None,
-    keep: bool = True,
-) -> BuildRequest:
-    """Check the arguments of `build` and load the files that they name.
-
-    Raises:
-        TableverseError: naming the option, its value and what would be right.
-    """
+    place = parse_path(os.fspath(out))
     pipeline = WITH_TRAJECTORIES if manifest is None else _choose_pipeline(stages, from_stage)
     if executor == "ray" and address not in (None, "auto"):
         parse_host_port(str(address))
-    place = parse_path(out)
     _check_parents(place)
     if manifest is None:
-        settings = config_from_run(read_run(place / "run.json"), TRAJECTORIES, overrides)
+        settings = config_from_run(read_run(place / "run.json"), TRAJECTORIES, _format_overrides(overrides))
     else:
-        settings = load_config(config, overrides)
+        settings = load_config(None if config is None else Path(config), _format_overrides(overrides))
     if pipeline == WITH_TRAJECTORIES:
         check_trajectory_models(settings.trajectories, here=executor == "local" or address is None)
-    return BuildRequest(
-        manifest=None if manifest is None else parse_path(manifest),
+    request = BuildRequest(
+        manifest=None if manifest is None else parse_path(os.fspath(manifest)),
         out=place,
         config=settings,
         cache_dir=get_cache_dir(),
         executor=executor,
         workers=workers,
         address=address,
-        pools=load_pools(pools, settings),
+        pools=load_pools(None if pools is None else Path(pools), settings),
         from_stage=from_stage,
         limit=limit,
         shards=parse_shards(shards) if isinstance(shards, str) else shards,
@@ -161,6 +118,8 @@ def make_request(
         keep=keep,
         pipeline=pipeline,
     )
+    with open_display(display) as shown:
+        return run_build(request, shown, signals)
 
 
 def _format_overrides(overrides: Mapping[str, object] | Sequence[str]) -> list[str]:

@@ -1,6 +1,5 @@
 """`tableverse build`: from the image manifest to the dataset; the same command again resumes."""
 
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,7 +23,8 @@ from tableverse_factory.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from workers.run import BuildRequest, BuildSummary
+    from workers import BuildSummary
+    from workers.progress.tally import DisplayGroup
 
 SOME_FAILED = 3
 OVER_BUDGET = 4
@@ -80,9 +80,10 @@ def build(
 
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
-    from workers.api import make_request
+    from workers import build as run
+    from workers.driver.signals import StopSignals
 
-    request = make_request(
+    summary = run(
         manifest,
         out,
         config=config,
@@ -98,38 +99,30 @@ def build(
         max_usd=max_usd,
         max_calls=max_calls,
         keep=keep,
+        display=make_display(out, metrics),
+        signals=StopSignals(),
     )
-    run_with_progress(request, out, metrics)
+    report_summary(summary, out)
 
 
-def run_with_progress(request: "BuildRequest", out: str, metrics: Path | None) -> None:
-    """Run the build with its progress on the terminal, and print how it ended.
+def make_display(out: str, metrics: Path | None) -> "DisplayGroup":
+    """Make the display of a build: its progress on the terminal, and a file for Prometheus if one is wanted."""
+    from rich.console import Console
 
-    Args:
-        request: What to build.
-        out: The dataset, as the user named it.
-        metrics: File for Prometheus, if one is wanted.
+    from workers.progress.console import ProgressDisplay
+    from workers.progress.prometheus import MetricsFile, dataset_name
+    from workers.progress.tally import DisplayGroup
+
+    progress = ProgressDisplay(Console(stderr=True))
+    return DisplayGroup(progress, *(() if metrics is None else (MetricsFile(metrics, dataset_name(out)),)))
+
+
+def report_summary(summary: "BuildSummary", out: str) -> None:
+    """Print how a build ended.
 
     Raises:
         typer.Exit: with the exit code, unless it is 0.
     """
-    from rich.console import Console
-
-    from workers.driver.signals import StopSignals
-    from workers.progress.console import ProgressDisplay
-    from workers.progress.prometheus import MetricsFile, dataset_name
-    from workers.progress.tally import Display, DisplayGroup
-    from workers.run import run_build
-
-    with ExitStack() as stack:
-        displays: list[Display] = [stack.enter_context(ProgressDisplay(Console(stderr=True)))]
-        if metrics is not None:
-            displays.append(stack.enter_context(MetricsFile(metrics, dataset_name(out))))
-        summary = run_build(request, DisplayGroup(*displays), StopSignals())
-    _report_summary(summary, out)
-
-
-def _report_summary(summary: "BuildSummary", out: str) -> None:
     from tableverse_factory.core.text import pluralize
     from tableverse_factory.dataset.model_costs import format_cost
     from workers.driver.signals import STOPPED_MESSAGE

@@ -59,11 +59,7 @@ def estimate(
 
 
 def _read_config(place: "StoragePath") -> "Config":
-    """Read the configuration of the build in OUT.
-
-    Raises:
-        ConfigError: if another version wrote it.
-    """
+    """Read the configuration of the build in OUT."""
     from pydantic import ValidationError
 
     from schemas.config import Config
@@ -79,11 +75,7 @@ def _read_config(place: "StoragePath") -> "Config":
 
 
 def _parse_cluster(text: str | None) -> "ClusterSize | None":
-    """Parse `--cluster`.
-
-    Raises:
-        ConfigError: saying what is allowed.
-    """
+    """Parse `--cluster`."""
     from tableverse_factory.core.errors import ConfigError
     from tableverse_factory.dataset.cost_estimate import ClusterSize, parse_amounts
 

@@ -72,11 +72,7 @@ def _find_help(why: str) -> str:
 
 
 def _check_filters(lost: list["SceneStatus"], ran: list[str], stage: str | None, reason: str | None) -> None:
-    """Refuse a stage that does not exist, or a reason for which no scene was lost.
-
-    Raises:
-        InputError: naming the existing ones.
-    """
+    """Refuse a stage that does not exist, or a reason for which no scene was lost."""
     from schemas.config import Config
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.core.text import sanitize_line

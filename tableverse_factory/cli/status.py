@@ -84,11 +84,7 @@ def _follow(out: "StoragePath", every_s: float) -> None:
 
 
 def _dump_json(figures: dict[str, Any]) -> str:
-    """Encode the figures as strict JSON, which has no infinity.
-
-    Raises:
-        InputError: if a table of the dataset holds one.
-    """
+    """Encode the figures as strict JSON, which has no infinity."""
     import json
 
     from tableverse_factory.core.errors import InputError

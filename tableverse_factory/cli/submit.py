@@ -99,11 +99,7 @@ def parse_build(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def _check_files(parsed: Mapping[str, Any], folder: Path) -> None:
-    """Read `--config`, `--set` and `--pools` as the job will, if their files are here.
-
-    Raises:
-        ConfigError: if a key or a value is wrong.
-    """
+    """Read `--config`, `--set` and `--pools` as the job will, if their files are here."""
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.pools_file import load_pools
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli.build import run_with_progress
+from tableverse_factory.cli.build import make_display, report_summary
 from tableverse_factory.cli.completions import complete_config_keys
 from tableverse_factory.cli.options import (
     Address,
@@ -49,9 +49,10 @@ def trajectories(
 
     Example: `tableverse trajectories out --workers 2 --set trajectories.max_tasks=5`
     """
-    from workers.api import TRAJECTORIES, make_request
+    from workers import build
+    from workers.driver.signals import StopSignals
 
-    request = make_request(
+    summary = build(
         None,
         out,
         overrides=overrides or [],
@@ -59,8 +60,10 @@ def trajectories(
         workers=workers,
         address=address,
         pools=pools,
-        from_stage=TRAJECTORIES if again else None,
+        from_stage="trajectories" if again else None,
         limit=limit,
         shards=shards,
+        display=make_display(out, metrics),
+        signals=StopSignals(),
     )
-    run_with_progress(request, out, metrics)
+    report_summary(summary, out)

@@ -228,11 +228,7 @@ def _collect_report(reference: Any, node: Node) -> NodeReport | None:
 
 
 def _is_visible(uri: str) -> bool:
-    """Whether a file or folder exists; web addresses are not requested.
-
-    Raises:
-        StoreError: if an object store does not answer.
-    """
+    """Whether a file or folder exists; web addresses are not requested."""
     if uri.startswith(("http://", "https://")):
         return True
     try:

@@ -168,11 +168,7 @@ class RayExecutor:
         ray.shutdown()
 
     def _on_actor_started(self, reference: Any) -> Event:
-        """Handle an actor that started, or died before.
-
-        Raises:
-            BuildError: if it is on a node that would give other bytes.
-        """
+        """Handle an actor that started, or died before."""
         worker = self._starting.pop(reference)
         try:
             problem = ray.get(reference)

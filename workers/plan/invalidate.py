@@ -5,7 +5,7 @@ from collections.abc import Collection
 
 from upath import UPath
 
-from tableverse_factory.core.storage.files import StoragePath, sync_folder, make_write_error
+from tableverse_factory.core.storage.files import StoragePath, make_write_error, sync_folder
 from tableverse_factory.dataset.shard_plan import Plan, read_plan
 from workers.state.commit import publish_ready
 from workers.state.journal import open_journal

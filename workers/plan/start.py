@@ -131,11 +131,7 @@ def _make_run_record(
 
 
 def _find_added_stage(out: StoragePath, before: Mapping[str, Any], record: Mapping[str, Any]) -> str:
-    """Find the first stage that was added since the start of the build; empty if there is none.
-
-    Raises:
-        BuildError: if a stage was removed.
-    """
+    """Find the first stage that was added since the start of the build; empty if there is none."""
     if before.get("manifest") != record["manifest"]:
         return ""  # another build altogether
     had, has = before.get("stages", {}), record["stages"]

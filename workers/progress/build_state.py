@@ -225,11 +225,7 @@ def _read_with_retries(out: StoragePath, listing: _Listing, shard: int) -> _Shar
 
 
 def _read_shard(out: StoragePath, shard: int, listing: _Listing) -> _Shard:
-    """Read one shard: results in its journal take precedence over committed rows.
-
-    Raises:
-        FileNotFoundError: if a listed file is gone.
-    """
+    """Read one shard: results in its journal take precedence over committed rows."""
     path = journal_path(out, shard)
     journal = read_journal(path) if shard in listing.journals else EMPTY_JOURNAL
     whole = shard in listing.published

@@ -69,7 +69,7 @@ def open_display(display: Display | Literal["auto"] | None) -> AbstractContextMa
     if display is None:
         return nullcontext(DisplayGroup())
     if display != "auto":
-        return nullcontext(display)
+        return display if isinstance(display, AbstractContextManager) else nullcontext(display)
     return NotebookDisplay() if _is_notebook() else ProgressDisplay(Console(stderr=True))
 
 

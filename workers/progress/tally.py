@@ -2,7 +2,9 @@
 
 from bisect import bisect_left
 from collections import Counter, defaultdict
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
+from types import TracebackType
 from typing import NamedTuple, Protocol
 
 from schemas.work import Status
@@ -138,10 +140,24 @@ class Display(Protocol):
 
 
 class DisplayGroup:
-    """Several displays as one."""
+    """Several displays as one, which enters and leaves them together."""
 
     def __init__(self, *displays: Display) -> None:
         self._displays = displays
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "DisplayGroup":
+        with ExitStack() as stack:
+            for display in self._displays:
+                if isinstance(display, AbstractContextManager):
+                    stack.enter_context(display)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
 
     def show(self, tally: Tally) -> None:
         """Show the tally on all displays."""

@@ -16,7 +16,7 @@ from typer import Exit
 
 from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig, RemoteModelSection, RunConfig
 from schemas.outcome import NO_COST
-from tableverse_factory.cli.build import OVER_BUDGET, _report_summary
+from tableverse_factory.cli.build import OVER_BUDGET, report_summary
 from tableverse_factory.dataset.model_costs import read_model_costs
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, finish, kill, scenes, wait_until, write_manifest
@@ -156,7 +156,7 @@ def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(s
     assert len(server.asked) == 4, "the last question was begun while money was left"
     assert summary.over_budget.usd == pytest.approx(two_scenes)
     with pytest.raises(Exit) as ended:
-        _report_summary(summary, str(stopped.out))
+        report_summary(summary, str(stopped.out))
     assert ended.value.exit_code == OVER_BUDGET
     spent = "4 calls, 3200 tokens read, 164 written, 0.484 USD"
     assert capsys.readouterr().out.startswith(
