@@ -43,10 +43,12 @@ class FrameSpan:
 
     @property
     def offset(self) -> int:
+        """Position of the payload."""
         return self.start + _HEADER_BYTES + len(self.label)
 
     @property
     def end(self) -> int:
+        """Position behind the frame."""
         return self.offset + self.size
 
 
