@@ -87,8 +87,7 @@ def sense_depth(
     readable &= ~_find_shadows(per_metre / depth)
     readable &= ~_find_holes(rng, sensor, depth, facing, shiny)
     units = np.rint(per_metre / disparity / sensor.depth_scale)
-    image: UInt16[np.ndarray, "h w"] = np.where(readable & (units <= 65535), units, 0).astype(np.uint16)
-    return image
+    return np.where(readable & (units <= 65535), units, 0).astype(np.uint16)
 
 
 def sense_color(rng: np.random.Generator, picture: Picture) -> Picture:

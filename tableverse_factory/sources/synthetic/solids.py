@@ -195,8 +195,7 @@ def _make_rounded_rectangle(size_x: float, size_y: float, corner: float) -> Floa
     core = CrossSection.square((size_x - 2 * corner, size_y - 2 * corner), True)
     if corner > 0.0:
         core = core.offset(corner, JoinType.Round, 2.0, 24)
-    ring: Float64[np.ndarray, "m 2"] = np.asarray(core.to_polygons()[0], dtype=np.float64)
-    return ring
+    return np.asarray(core.to_polygons()[0], dtype=np.float64)
 
 
 def _make_axis_rotation(axis: int, angle: float) -> Float64[np.ndarray, "3 3"]:

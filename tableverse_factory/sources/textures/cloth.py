@@ -198,8 +198,7 @@ def _add_weave(draw: TextureSampler, raster: Raster) -> Raster:
 
 def _draw_folds(draw: TextureSampler) -> Field:
     """Draw soft folds."""
-    soft: Field = draw.between(0.0, 0.035) * draw.noise((2, 2), 2)
-    return soft
+    return draw.between(0.0, 0.035) * draw.noise((2, 2), 2)
 
 
 def _make_line(turns: Field, width: float) -> Field:
@@ -208,5 +207,4 @@ def _make_line(turns: Field, width: float) -> Field:
 
 def _measure_from_middle(x: Field, y: Field) -> Field:
     a, b = take_fraction(x) - np.float32(0.5), take_fraction(y) - np.float32(0.5)
-    distance: Field = np.sqrt(a * a + b * b)
-    return distance
+    return np.sqrt(a * a + b * b)

@@ -69,8 +69,7 @@ class TextureSampler:
 
     def each(self, count: int, far: float) -> np.ndarray:
         """Draw a number from -far to far for each cell or board. Shape (count,)."""
-        values: np.ndarray = (self.rng.random(count, dtype=np.float32) * 2 - 1) * np.float32(far)
-        return values
+        return (self.rng.random(count, dtype=np.float32) * 2 - 1) * np.float32(far)
 
     def noise(self, cells: tuple[int, int], octaves: int = 4, gain: float = 0.5) -> Field:
         """Draw noise (`make_noise`)."""

@@ -54,8 +54,7 @@ class Cells(Frozen):
 
 def pixel_centers(size: int) -> Float32[np.ndarray, " n"]:
     """Compute the centres of the pixels of a row, over its length."""
-    places: Float32[np.ndarray, " n"] = ((np.arange(size) + 0.5) / size).astype(np.float32)
-    return places
+    return ((np.arange(size) + 0.5) / size).astype(np.float32)
 
 
 def pixel_grid(size: int) -> tuple[Field, Field]:
@@ -161,8 +160,7 @@ def bell(values: Field, width: float) -> Field:
     """Peak of height 1 at 0; a half at 0.64 of `width`."""
     t = values / np.float32(width)
     p = 1 / (1 + t * t)
-    peak: Field = p * p
-    return peak
+    return p * p
 
 
 def shade_relief(height: Field, strength: float) -> Field:
