@@ -1,4 +1,4 @@
-"""Addresses of models: https everywhere but on this machine, and nothing secret in them."""
+"""URLs of model servers: https except on this machine, and no secrets."""
 
 import ipaddress
 from typing import Annotated
@@ -10,7 +10,7 @@ MAX_URL_CHARS = 2000
 
 
 def is_loopback(url: str) -> bool:
-    """Whether an address is on this machine."""
+    """Return whether a URL is on this machine."""
     host = urlsplit(url).hostname or ""
     try:
         return ipaddress.ip_address(host).is_loopback
@@ -18,8 +18,8 @@ def is_loopback(url: str) -> bool:
         return host == "localhost"
 
 
-def _checked(url: str) -> str:
-    """The address, if keys and pictures may travel to it; an empty one is left alone."""
+def _check_url(url: str) -> str:
+    """Check that keys and pictures may be sent to a URL; an empty one is allowed."""
     if not url:
         return url
     try:
@@ -38,5 +38,5 @@ def _checked(url: str) -> str:
     return url
 
 
-ModelUrl = Annotated[str, Field(max_length=MAX_URL_CHARS), AfterValidator(_checked)]
-"""Base URL of a model's server, or empty."""
+ModelUrl = Annotated[str, Field(max_length=MAX_URL_CHARS), AfterValidator(_check_url)]
+"""Base URL of a model server, or empty."""

@@ -1,4 +1,4 @@
-"""Arrow schemas of the tables at rest (docs/formats.md names every column)."""
+"""Arrow schemas of the stored tables (docs/formats.md describes every column)."""
 
 import pyarrow as pa
 

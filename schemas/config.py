@@ -1,4 +1,4 @@
-"""The whole configuration, a section per stage. Every key has a default and a meaning; unknown keys are errors."""
+"""Configuration, a section per stage. Every key has a default and a docstring; unknown keys are errors."""
 
 import os
 import re
@@ -13,19 +13,19 @@ Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
-def _variable_name(name: str) -> str:
-    """The name of an environment variable; the message does not show it, for it may be a key that went astray."""
+def _check_variable_name(name: str) -> str:
+    """Check the name of an environment variable; the error does not show it, since it may be a misplaced key."""
     if name and not re.fullmatch(r"[A-Z_][A-Z0-9_]{0,63}", name):
         raise ValueError("must be the NAME of an environment variable, in capitals; never the key itself")
     return name
 
 
 MODEL_LOAD_S = 1200.0
-"""Wall time in which a model fetches and loads its weights, and its process starts [s]."""
+"""Wall time in which a model downloads and loads its weights, and its process starts [s]."""
 MAX_SLOW_MESHES = 30
-"""Objects of a scene that may each take as long as `place.mesh_timeout_s`; as a rule one takes a fraction of it."""
+"""Objects of a scene that may each take the whole `place.mesh_timeout_s`; most take a fraction of it."""
 
-KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_variable_name)]
+KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_check_variable_name)]
 Weights = Annotated[str, Field(max_length=4096), AfterValidator(os.path.expanduser)]
 ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
 
@@ -37,41 +37,41 @@ class Section(BaseModel):
 
 
 class StageSection(Section):
-    """Base of the sections that belong to a stage."""
+    """Base of the sections of stages."""
 
     deadline_s: Positive | None = None
     """Wall time of this stage on one scene; null for `run.deadline_s` [s]."""
 
     def resolve_deadline(self, run_deadline_s: float) -> float:
-        """The wall time of the stage, where that of the run is this [s]."""
+        """Resolve the wall time of the stage, given that of the run [s]."""
         return run_deadline_s if self.deadline_s is None else self.deadline_s
 
 
 class RemoteModelSection(StageSection):
-    """Base of the sections whose stage may ask a model behind an address."""
+    """Base of the sections of stages that may send requests to a model server."""
 
     base_url: ModelUrl = ""
     """Of `openai`, e.g. `http://localhost:8000/v1`; `gemini` has its public one. https but on localhost."""
     model: ModelName = ""
-    """What the server calls the model."""
+    """Name of the model on the server."""
     key_env: KeyVariable = ""
-    """Name of the environment variable that holds the key; empty for a server that wants none."""
+    """Name of the environment variable that holds the API key; empty for a server without keys."""
     enforce_schema: bool = True
     """Whether the answer's schema is sent for the server to enforce; false for servers that refuse it."""
     timeout_s: Positive = 240.0
-    """For one answer of a model with all retries; less than the stage's deadline [s]."""
+    """Time limit of one answer with all retries; less than the stage's deadline [s]."""
     usd_per_million_input: Annotated[float, Field(ge=0.0, le=1e6, allow_inf_nan=False)] = 0.0
-    """Price of a million tokens of the question [USD]."""
+    """Price of a million input tokens [USD]."""
     usd_per_million_output: Annotated[float, Field(ge=0.0, le=1e6, allow_inf_nan=False)] = 0.0
-    """Price of a million tokens of the answer [USD]."""
+    """Price of a million output tokens [USD]."""
 
     @property
     @abstractmethod
     def protocol(self) -> str:
-        """Which protocol is spoken with the model, `openai` or `gemini`; empty where none is asked."""
+        """Protocol of the model server, `openai` or `gemini`; empty if no model is asked."""
 
     def find_missing_keys(self) -> list[str]:
-        """Keys without which the model cannot be asked."""
+        """Find the keys without which the model cannot be asked."""
         missing = {
             "model": bool(self.protocol) and not self.model,
             "base_url": self.protocol == "openai" and not self.base_url,
@@ -81,83 +81,86 @@ class RemoteModelSection(StageSection):
 
 
 class AskingConfig(Section):
-    """How models behind an address are asked, on each machine. Nothing here changes what they answer."""
+    """Limits on requests to model servers, on each machine. They change no answer."""
 
     max_parallel: Annotated[int, Field(ge=1, le=1024)] = 8
-    """Questions under way at a time."""
+    """Concurrent requests."""
     per_minute: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """Questions begun within a minute; 0 for no limit."""
+    """Requests begun within a minute; 0 for no limit."""
 
 
 class ModelsConfig(Section):
-    """Where models with weights of their own run."""
+    """Device and precision of models with local weights."""
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """`auto` is the GPU where there is one that torch can use. The same scene differs in a few pixels between them."""
+    """`auto` is the GPU if torch can use one. Results differ in a few pixels between devices."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     """`auto` is bfloat16 on a GPU and float32 on a CPU."""
 
 
 class ObserveConfig(StageSection):
-    """Bounds on what is decoded, and the depth used beyond which nothing is believed."""
+    """Limits on decoded inputs, and the source of depth."""
 
     max_pixels: Annotated[int, Field(ge=1, le=200_000_000)] = 40_000_000
-    """Of one picture, by its header; a larger one is refused before it is decoded."""
+    """Largest picture, by its header; a larger one is refused before it is decoded."""
     max_file_bytes: Annotated[int, Field(ge=1)] = 256 * 1024 * 1024
-    """Of one file of the input [bytes]."""
+    """Largest input file [bytes]."""
     max_depth_m: Positive = 5.0
-    """Depth beyond this is not believed [m]."""
+    """Largest depth that is used [m]."""
     depth: Literal[
         "sensor", "recorded", "depth_anything_3", "depth_anything_3_nested", "moge_2", "depth_anything_2"
     ] = "sensor"
-    """Where the depth of a bare picture comes from; `sensor` has none for it, `recorded` reads `NAME.depth.npy` and
-    `NAME.camera.json` beside it. A capture always has its own."""
+    """Source of the depth of a bare picture; `sensor` has none for it, `recorded` reads `NAME.depth.npy` and
+    `NAME.camera.json` beside it. A capture always has its own.
+    """
     depth_weights: Weights = ""
-    """Folder, or `owner/name` or `owner/name@revision` on the hub, of the depth model; empty for the published ones."""
+    """Folder, or `owner/name` or `owner/name@revision` on the Hub, of the depth model; empty for the published ones."""
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
-    """Focal length of bare pictures, for models that do not tell it, where their EXIF does not either [px]."""
+    """Focal length of bare pictures, if neither the model nor their EXIF gives it [px]."""
 
     def resolve_deadline(self, run_deadline_s: float) -> float:
-        """A depth model may load its weights besides."""
+        """Add the time to load the weights of a depth model."""
         if self.deadline_s is not None or self.depth in ("sensor", "recorded"):
             return super().resolve_deadline(run_deadline_s)
         return run_deadline_s + MODEL_LOAD_S
 
 
 class PerceiveConfig(RemoteModelSection):
-    """Which backend finds the objects, and how the table is found."""
+    """Detector, segmenter and limits on objects."""
 
     detector: Literal["auto", "geometric", "learned", "replay", "openai", "gemini"] = "auto"
-    """`auto` replays `detections.json` where the capture has one, with `masks.png` if it is there; else `geometric`.
+    """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else `geometric`.
     `learned` is a net of `tableverse train segmenter`, `openai` any server of OpenAI's chat completions, `gemini`
-    Google's own protocol."""
+    Google's own protocol.
+    """
     detector_weights: Weights = ""
     """The `.onnx` file of `learned`."""
     box_order: Literal["auto", "xyxy", "yxyx"] = "auto"
-    """In which order the model gives boxes; `auto` is yxyx for `gemini`, else xyxy."""
+    """Coordinate order of the model's boxes; `auto` is yxyx for `gemini`, else xyxy."""
     segmenter: Literal["geometric", "sam2", "sam3"] = "geometric"
-    """What turns boxes into masks: our own from depth, or a model with weights, for detectors that give boxes: `replay`
-    without `masks.png`, `openai`, `gemini`."""
+    """Converts boxes to masks: our own from depth, or a model with weights, for detectors that give boxes: `replay`
+    without `masks.png`, `openai`, `gemini`.
+    """
     segmenter_weights: Weights = ""
     """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; empty for the published ones."""
     segmenter_batch: Annotated[int, Field(ge=1, le=256)] = 8
-    """Pictures that go through the segmenter at a time on a GPU."""
+    """Pictures per batch of the segmenter on a GPU."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60
     """Most objects that are kept of one picture."""
 
     @property
     def protocol(self) -> str:
-        """Which protocol is spoken with the detector; empty where none is asked."""
+        """Protocol of the detector's server; empty if no model is asked."""
         return self.detector if self.detector in ("openai", "gemini") else ""
 
     def resolve_deadline(self, run_deadline_s: float) -> float:
-        """A segmenter may load its weights besides."""
+        """Add the time to load the weights of a segmenter."""
         if self.deadline_s is not None or self.segmenter == "geometric":
             return super().resolve_deadline(run_deadline_s)
         return run_deadline_s + MODEL_LOAD_S
 
     @model_validator(mode="after")
-    def _complete(self) -> "PerceiveConfig":
+    def _check_required_keys(self) -> "PerceiveConfig":
         names = [f"perceive.{name}" for name in self.find_missing_keys()]
         if self.detector == "learned" and not self.detector_weights:
             names.append("perceive.detector_weights")
@@ -174,7 +177,7 @@ class PerceiveConfig(RemoteModelSection):
 
 
 class PlaceConfig(StageSection):
-    """How meshes are completed and registered."""
+    """Completion and registration of meshes."""
 
     mesh_model: Literal["carved", "replay", "sam3d", "triposr"] = "carved"
     """`carved` completes what the picture shows; `replay` registers the meshes recorded in `meshes/` of the capture;
@@ -182,51 +185,51 @@ class PlaceConfig(StageSection):
     mesh_command: Annotated[tuple[Annotated[str, Field(max_length=4096)], ...], Field(max_length=64)] = ()
     """Program and arguments that start the process of the mesh model."""
     mesh_timeout_s: Positive = 120.0
-    """For one object's mesh: the longest silence of that process [s]."""
+    """Longest silence of that process during one object's mesh [s]."""
 
     def resolve_deadline(self, run_deadline_s: float) -> float:
-        """A mesh model may load its weights, and then take its own time for each object."""
+        """Add the times of a mesh model to load its weights and to make each object's mesh."""
         if self.deadline_s is not None or not self.in_process:
             return super().resolve_deadline(run_deadline_s)
         return run_deadline_s + MODEL_LOAD_S + MAX_SLOW_MESHES * self.mesh_timeout_s
 
     @property
     def in_process(self) -> bool:
-        """Whether meshes come from a model in a process of its own."""
+        """Whether meshes come from a model in its own process."""
         return self.mesh_model in ("sam3d", "triposr")
 
     @model_validator(mode="after")
-    def _complete(self) -> "PlaceConfig":
+    def _check_required_keys(self) -> "PlaceConfig":
         if self.in_process and not self.mesh_command:
             raise ValueError(f"the mesh model {self.mesh_model!r} needs place.mesh_command (docs/mesh-process.md)")
         return self
 
 
 class RectifyConfig(StageSection):
-    """Convex pieces and the ways to move objects apart."""
+    """Convex pieces, and the method of moving objects apart."""
 
     method: Literal["joint", "lccr"] = "joint"
     """`joint` moves the whole layout least and keeps who carries whom (docs/concepts.md); `lccr` is the paper's."""
     clearance_m: Metres = 0.0005
-    """Gap that is left between objects, on top of what their meshes stick out of their pieces [m]."""
+    """Gap between objects, in addition to what their meshes stick out of their pieces [m]."""
     contact_m: Metres = 0.01
-    """Objects with a gap of at most this between them count as touching: about the noise of registration [m]."""
+    """Objects with at most this gap count as touching; about the noise of registration [m]."""
     overlap_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """`lccr`: touching objects whose boxes, seen from above, share this much of the smaller's area are one group."""
     decomposition: Literal["cut", "coacd"] = "cut"
-    """How meshes become convex pieces: our own cuts and merges, or CoACD as in the paper (docs/benchmarks.md)."""
+    """Convex decomposition of meshes: our own cuts and merges, or CoACD as in the paper (docs/benchmarks.md)."""
     volume_error: Annotated[float, Field(gt=0.0, le=10.0)] = 0.1
     """Pieces may add up to this share of a mesh's volume, if `max_pieces` allows."""
     max_pieces: Annotated[int, Field(ge=1, le=256)] = 48
     """Convex pieces per object."""
     max_contents: Annotated[int, Field(ge=0, le=200)] = 60
-    """Things in the containers of one scene, counted copies included; what is beyond is left out."""
+    """Most objects in the containers of one scene, counted copies included; the rest is left out."""
     fall_time_s: Annotated[float, Field(ge=1.0, le=20.0)] = 3.0
-    """Simulated time within which a thing dropped into a container must come to rest [s]."""
+    """Simulated time within which an object dropped into a container must come to rest [s]."""
 
 
 class SettleConfig(StageSection):
-    """The forward simulation to rest."""
+    """Forward simulation to rest."""
 
     timestep_s: Annotated[float, Field(ge=0.0002, le=0.005)] = 0.002
     """Step of the simulation, also written into the exported XML [s]."""
@@ -235,7 +238,7 @@ class SettleConfig(StageSection):
 
 
 class CurateConfig(RemoteModelSection):
-    """The judge."""
+    """Judge."""
 
     judge: Literal["rules", "openai", "gemini", "replay"] = "rules"
     """`rules` needs no model; `openai` is any server of OpenAI's chat completions, `gemini` Google's own protocol."""
@@ -246,15 +249,15 @@ class CurateConfig(RemoteModelSection):
     gripper_width_m: Positive = 0.078
     """Widest opening of the gripper that tasks are meant for [m]."""
     max_grasp_mass_kg: Positive = 2.0
-    """What that gripper lifts [kg]."""
+    """Largest mass that this gripper lifts [kg]."""
 
     @property
     def protocol(self) -> str:
-        """Which protocol is spoken with the judge; empty where none is asked."""
+        """Protocol of the judge's server; empty if no model is asked."""
         return self.judge if self.judge in ("openai", "gemini") else ""
 
     @model_validator(mode="after")
-    def _complete(self) -> "CurateConfig":
+    def _check_required_keys(self) -> "CurateConfig":
         names = [f"curate.{name}" for name in self.find_missing_keys()]
         if self.judge == "replay" and not self.replay_dir:
             names.append("curate.replay_dir")
@@ -269,11 +272,11 @@ class ExportConfig(StageSection):
     epsilon_m: Metres = 0.001
     """Pairs deeper than this collide, and the scene is dropped [m]."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
-    """Of `observation/color.jpg`, which the textures are made from too."""
+    """JPEG quality of `observation/color.jpg`, from which the textures are made too."""
 
 
 class TrajectoriesConfig(StageSection):
-    """Grasps, placements and motions for the accepted tasks of a scene, each proven in simulation."""
+    """Grasps, placements and motions for the accepted tasks of a scene, each verified in simulation."""
 
     deadline_s: Positive | None = None
     """Wall time of all tasks of one scene; null for `run.deadline_s` and `task_deadline_s` for each of `max_tasks`."""
@@ -282,13 +285,13 @@ class TrajectoriesConfig(StageSection):
     grasp_model: Literal["antipodal", "graspgen"] = "antipodal"
     """`antipodal` samples pairs of contacts; `graspgen` asks a server at `grasp_url`."""
     grasp_url: ModelUrl = ""
-    """Of the grasp server, up to and without `/grasps`. https but on localhost."""
+    """Base URL of the grasp server, without `/grasps`. https but on localhost."""
     grasp_gripper: ModelName = "franka_panda"
-    """What the grasp server calls the gripper."""
+    """Name of the gripper on the grasp server."""
     grasp_depth_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1034
     """From the origin of the grasp server's gripper frame along its approach to between the fingertips [m]."""
     grasp_timeout_s: Positive = 30.0
-    """For one answer of the grasp server with all retries; less than `task_deadline_s` [s]."""
+    """Time limit of one answer of the grasp server with all retries; less than `task_deadline_s` [s]."""
     planner: Literal["rrt", "curobo"] = "rrt"
     """`rrt` runs anywhere; `curobo` needs a GPU and its package, and is experimental: it has never been run on one."""
     candidates: Annotated[int, Field(ge=16, le=100_000)] = 2000
@@ -302,7 +305,7 @@ class TrajectoriesConfig(StageSection):
     placements: Annotated[int, Field(ge=1, le=1000)] = 24
     """Placements that are kept per task, from at most a hundred times as many samples."""
     tries: Annotated[int, Field(ge=1, le=1000)] = 12
-    """Pairs of grasp and placement that are planned before a task is given up."""
+    """Pairs of grasp and placement that are planned before a task fails."""
     step_s: Annotated[float, Field(ge=0.004, le=0.1)] = 0.02
     """Time between the samples of a motion, which are also the commands [s]."""
     speed: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
@@ -310,16 +313,16 @@ class TrajectoriesConfig(StageSection):
     max_disturbed_m: Positive = 0.02
     """A trajectory fails where any other object was displaced by more [m]."""
     task_deadline_s: Positive = 60.0
-    """Wall time of one task, planning and proof; what hangs or crashes costs that task alone [s]."""
+    """Wall time of one task, planning and verification; a hang or crash loses that task alone [s]."""
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 100
     """Accepted tasks of a scene that are tried, in their order."""
 
     def resolve_deadline(self, run_deadline_s: float) -> float:
-        """Every task may take its own time, so the stage's is only for what no task is to blame for [s]."""
+        """Add the time of every task to the time for the rest of the stage [s]."""
         return run_deadline_s + self.max_tasks * self.task_deadline_s if self.deadline_s is None else self.deadline_s
 
     @model_validator(mode="after")
-    def _asks_in_time(self) -> "TrajectoriesConfig":
+    def _check_grasp_server(self) -> "TrajectoriesConfig":
         if self.grasp_model != "graspgen":
             return self
         if not self.grasp_url or not self.grasp_gripper:
@@ -333,18 +336,18 @@ class TrajectoriesConfig(StageSection):
 
 
 class RunConfig(Section):
-    """The run as a whole."""
+    """Seed, shards, retries and limits of the run."""
 
     seed: Annotated[int, Field(ge=0)] = 0
-    """Of everything that is drawn at random; the same seed gives the same bytes."""
+    """Seed of everything random; the same seed gives the same bytes."""
     shard_size: Annotated[int, Field(ge=1, le=10_000)] = 64
-    """Scenes in one shard: what is written, and done again, as one."""
+    """Scenes per shard, which is written and recomputed as a whole."""
     attempts: Annotated[int, Field(ge=1, le=10)] = 2
-    """How often a stage may crash, hang or run out of memory on a scene before it is failed; errors are final."""
+    """Attempts of a stage that crashes, hangs or runs out of memory on a scene; errors are final."""
     deadline_s: Positive = 300.0
-    """Wall time of one stage on one scene, where its own section names none [s]."""
+    """Wall time of one stage on one scene, unless its own section sets it [s]."""
     memory_mb: Annotated[int, Field(ge=256)] = 6144
-    """Resident memory of the process that runs a stage [MB]; beyond it the scene is out of memory."""
+    """Limit on the resident memory of the process that runs a stage [MB]."""
 
 
 class Config(Section):
@@ -363,18 +366,18 @@ class Config(Section):
     asking: AskingConfig = AskingConfig()
 
     def get_deadline(self, section: str) -> float:
-        """Wall time of the stage that this section belongs to [s]."""
-        its: StageSection = getattr(self, section)
-        return its.resolve_deadline(self.run.deadline_s)
+        """Get the wall time of the stage of a section [s]."""
+        own: StageSection = getattr(self, section)
+        return own.resolve_deadline(self.run.deadline_s)
 
     @model_validator(mode="after")
-    def _in_time(self) -> "Config":
+    def _check_timeouts(self) -> "Config":
         for section in ("perceive", "curate"):
-            its: RemoteModelSection = getattr(self, section)
+            own: RemoteModelSection = getattr(self, section)
             deadline_s = self.get_deadline(section)
-            if its.protocol and its.timeout_s >= deadline_s:
+            if own.protocol and own.timeout_s >= deadline_s:
                 raise ValueError(
-                    f"{section}.timeout_s ({its.timeout_s:g}) must be less than the stage's deadline "
+                    f"{section}.timeout_s ({own.timeout_s:g}) must be less than the stage's deadline "
                     f"({deadline_s:g}, of {section}.deadline_s or run.deadline_s): it would be killed while its model "
                     "is asked"
                 )

@@ -1,4 +1,4 @@
-"""The judge's seven outputs (paper section 3.3, appendix B): the answer as text, and the verdict after our checks."""
+"""The judge's seven outputs (paper section 3.3, appendix B): the raw answer, and the verdict after our checks."""
 
 from enum import StrEnum
 from typing import Annotated, Literal
@@ -30,11 +30,13 @@ class Relation(StrEnum):
 HINGE_CATEGORIES = ("Bottle", "Box", "Bucket", "Laptop", "Pliers", "Scissors", "TrashCan")
 
 
-class _Answer(BaseModel):
+class Answer(BaseModel):
+    """Base of answers of models and of what is made of them: unknown keys are ignored."""
+
     model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True)
 
 
-class Usability(_Answer):
+class Usability(Answer):
     """Part A."""
 
     usable: bool
@@ -42,7 +44,7 @@ class Usability(_Answer):
     evidence_ids: dict[str, tuple[int, ...]] = Field(default_factory=dict)
 
 
-class SevereLabelError(_Answer):
+class SevereLabelError(Answer):
     """Part B."""
 
     has_severe_label_error: bool = False
@@ -50,7 +52,7 @@ class SevereLabelError(_Answer):
     correct_labels: dict[str, Label] = Field(default_factory=dict)
 
 
-class PhysicalProperties(_Answer):
+class PhysicalProperties(Answer):
     """Part D."""
 
     mass_kg: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -58,7 +60,7 @@ class PhysicalProperties(_Answer):
     hinge_category: str | None = None
 
 
-class CriterionScore(_Answer):
+class CriterionScore(Answer):
     """One of the four criteria of part E, with the ids it names."""
 
     score: Score
@@ -67,7 +69,7 @@ class CriterionScore(_Answer):
     ungraspable_ids: tuple[int, ...] = ()
 
 
-class PerCriterion(_Answer):
+class PerCriterion(Answer):
     """Part E: weights 45, 15, 15 and 25 in a hundred."""
 
     category_diversity: CriterionScore
@@ -76,14 +78,14 @@ class PerCriterion(_Answer):
     layout_clarity: CriterionScore
 
 
-class Relabelling(_Answer):
+class Relabelling(Answer):
     """Part F."""
 
     relabel_name: Label
     distinguishing_phrases: Annotated[tuple[Label, ...], Field(max_length=20)] = ()
 
 
-class GeneratedTask(_Answer):
+class GeneratedTask(Answer):
     """Part G."""
 
     instruction: Annotated[str, Field(max_length=1000)]
@@ -95,7 +97,7 @@ class GeneratedTask(_Answer):
     initial_relation_satisfied: bool = False
 
 
-class JudgeAnswer(_Answer):
+class JudgeAnswer(Answer):
     """The paper's output schema. Integer ids count the scene's objects from 0; dict keys are those ids as text."""
 
     usability: Usability
@@ -108,8 +110,8 @@ class JudgeAnswer(_Answer):
     generated_tasks: Annotated[tuple[GeneratedTask, ...], Field(max_length=500)] = ()
 
 
-class ObjectAssessment(_Answer):
-    """What the dataset says of one object after the checks; object ids are strings (`obj_000`)."""
+class ObjectAssessment(Answer):
+    """Assessment of one object after the checks; object ids are strings (`obj_000`)."""
 
     object_id: str
     relabel_name: Label
@@ -119,7 +121,7 @@ class ObjectAssessment(_Answer):
     corrected_label: str = ""
     mass_kg: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
     answered_mass_kg: float | None = None
-    """What the judge said, before it was clipped to what the volume allows [kg]; None where the rules filled it in."""
+    """The judge's mass, before it was clipped to what the volume allows [kg]; None if the rules filled it in."""
     mass_clipped: bool = False
     has_hinge: bool = False
     hinge_category: str | None = None
@@ -127,11 +129,11 @@ class ObjectAssessment(_Answer):
     bad_geometry: bool = False
     non_tabletop: bool = False
     from_rules: tuple[str, ...] = ()
-    """Parts of the answer that lacked this object and were filled by the rules."""
+    """Parts of the answer that lacked this object and were filled in by the rules."""
 
 
-class TaskAssessment(_Answer):
-    """A task and its verdict; a refused task stays in the manifest with its reason."""
+class TaskAssessment(Answer):
+    """Task and its verdict; a refused task stays in the manifest with its reason."""
 
     task_id: str
     instruction: str
@@ -143,16 +145,16 @@ class TaskAssessment(_Answer):
     refusal: str = ""
 
 
-class JudgeRemark(_Answer):
-    """One thing of an answer that was not taken as it stood; tasks have their own `refusal`."""
+class JudgeRemark(Answer):
+    """Part of an answer that was corrected; tasks have their own `refusal`."""
 
     code: str
     object_id: str = ""
     detail: str = ""
 
 
-class AnswerOrigin(_Answer):
-    """Where an answer comes from; empty where no model was asked."""
+class AnswerOrigin(Answer):
+    """Origin of an answer; empty if no model was asked."""
 
     model: str = ""
     prompt_sha256: str = ""
@@ -160,13 +162,13 @@ class AnswerOrigin(_Answer):
     """1, or 2 where the first answer had to be repaired."""
 
 
-class Agreement(_Answer):
-    """How far a judge and the rules agree on a scene."""
+class Agreement(Answer):
+    """Agreement of a judge and the rules on a scene."""
 
     rules_usable: bool
     rules_score: int
     names_share: Unit
-    """Of the objects: those that both call by the same noun."""
+    """Share of the objects that both call by the same noun."""
     mass_ratio: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
     """The judge's masses, as clipped, over the rules', median over the objects."""
     rules_tasks: int
@@ -174,8 +176,8 @@ class Agreement(_Answer):
     """Accepted tasks with the same two objects and relation on both sides."""
 
 
-class Assessment(_Answer):
-    """The verdict on one scene; `answer_json` keeps the judge's own words, whole."""
+class Assessment(Answer):
+    """Verdict on one scene; `answer_json` keeps the judge's complete answer."""
 
     usable: bool
     reason_codes: tuple[str, ...] = ()
@@ -189,5 +191,5 @@ class Assessment(_Answer):
     remarks: tuple[JudgeRemark, ...] = ()
     origin: AnswerOrigin = AnswerOrigin()
     agreement: Agreement | None = None
-    """None where the rules judged."""
+    """None if the rules judged."""
     answer_json: str = ""

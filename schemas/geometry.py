@@ -1,4 +1,4 @@
-"""Shapes and poses that flow between stages: frozen, slotted, their arrays read-only.
+"""Shapes and poses that flow between stages: frozen, slotted, with read-only arrays.
 
 Lengths in metres, angles in radians, quaternions wxyz. Camera frames have OpenCV axes (x right, y down, z forward);
 the table frame has z up, its origin on the table plane, x to the camera's right and y away from the camera.
@@ -24,7 +24,7 @@ Mask = Bool[np.ndarray, "h w"]
 
 
 class Frozen:
-    """Mixin of the frozen dataclasses that hold arrays: `frozen=True` alone does not freeze what an array holds."""
+    """Mixin that makes the arrays of frozen dataclasses read-only, which `frozen=True` alone does not."""
 
     __slots__ = ()
 
@@ -39,7 +39,7 @@ class Frozen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose(Frozen):
-    """A rigid motion from a local frame to its parent: `parent = R(q) @ local + position`.
+    """Rigid motion from a local frame to its parent: `parent = R(q) @ local + position`.
 
     Attributes:
         position: Origin of the local frame in the parent frame [m].
@@ -52,7 +52,7 @@ class Pose(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A pinhole camera without distortion; pixel centres at whole numbers [px]."""
+    """Pinhole camera without distortion; pixel centres at whole numbers [px]."""
 
     fx: float
     fy: float
@@ -95,18 +95,16 @@ class TriangleMesh(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConvexPieces(Frozen):
-    """A mesh as convex pieces, in the mesh's own frame and at scale 1.
+    """Convex decomposition of a mesh, in the mesh's own frame and at scale 1.
 
     Attributes:
         hulls: Convex hulls as closed triangle meshes of at most 64 vertices each.
         volume_ratio: Volume of the union of the pieces over the volume of the mesh.
-        hausdorff_m: Largest distance from the mesh's surface to the pieces, and from their surface back to it, by
-            samples, at scale 1 [m].
-        method: How they were made: `convex` (nearly convex, one hull), `cut` (across principal axes, then merged) or
-            `coacd`.
-        repaired: What was done to the mesh before: empty, `merged`, `oriented`, `filled` or `remeshed`.
-        uncovered_m: How far the mesh sticks out of its pieces where that was looked at (up to 30,000 of its vertices,
-            10,000 points of its surface), at scale 1 [m]: a thorn between them may stick out further.
+        hausdorff_m: Two-sided Hausdorff distance between the surfaces of mesh and pieces, by samples [m].
+        method: `convex` (nearly convex, one hull), `cut` (across principal axes, then merged) or `coacd`.
+        repaired: Repair of the mesh before: empty, `merged`, `oriented`, `filled` or `remeshed`.
+        uncovered_m: How far the mesh sticks out of its pieces, by up to 30,000 of its vertices and 10,000 points of its
+            surface [m]; a thorn between them may stick out further.
         cavity_kept: Share of the space between the mesh and its convex hull that the pieces leave open, 0 to 1.
     """
 

@@ -1,4 +1,4 @@
-"""Names of scenes and objects: short, safe as a file name, and derived from content where we choose them."""
+"""Ids of scenes and objects: short, safe as a file name, and derived from content if we choose them."""
 
 import hashlib
 import re
@@ -10,13 +10,13 @@ from pydantic import AfterValidator
 MAX_LABEL_CHARS = 120
 MAX_STEM_CHARS = 80
 RESERVED_IDS = ("scene", "sky", "table", "world")
-"""Names of a scene's own parts, in small letters: no object can have them."""
+"""Names of a scene's own parts, in lower case, which no object can have."""
 
 _SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
 
 
 def check_id(value: str) -> str:
-    """Returns `value` unchanged if it is safe as an id, a file name and an XML name.
+    """Return `value` if it is safe as an id, a file name and an XML name.
 
     Raises:
         ValueError: if it is empty, too long, starts with a dot, or holds anything but letters, digits,
@@ -34,18 +34,18 @@ SafeId = Annotated[str, AfterValidator(check_id)]
 
 
 def make_object_id(index: int) -> str:
-    """The id of the object at `index` of its scene: `obj_000`, `obj_001` and so on."""
+    """Make the id of the object at `index` of its scene: `obj_000`, `obj_001` and so on."""
     return f"obj_{index:03d}"
 
 
 def clean_label(text: str) -> str:
-    """One line of at most 120 printable characters; `object` where nothing is left. Labels are untrusted text."""
+    """Clean an untrusted label to one line of at most 120 printable characters; `object` if nothing is left."""
     printable = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(printable.split())[:MAX_LABEL_CHARS].strip() or "object"
 
 
 def content_hash(*parts: bytes) -> str:
-    """Sha256 over length-prefixed parts, so that moving a byte from one part to the next changes it."""
+    """Hash length-prefixed parts with SHA-256, so that moving a byte between parts changes the hash."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
@@ -54,14 +54,14 @@ def content_hash(*parts: bytes) -> str:
 
 
 def make_file_stem(object_id: str) -> str:
-    """Name of an object's files: its id, shortened and made unique by a hash where a tar could not hold it."""
+    """Make the stem of an object's files: its id, shortened and made unique by a hash if a tar could not hold it."""
     if len(object_id) <= MAX_STEM_CHARS:
         return object_id
     return f"{object_id[: MAX_STEM_CHARS - 17]}-{content_hash(object_id.encode())[:16]}"
 
 
 def find_name_clashes(object_ids: Sequence[str]) -> list[str]:
-    """Object ids that cannot stand in one scene: reserved ones, and those whose files would overwrite another's."""
+    """Find object ids that cannot be in one scene: reserved ones, and those whose files would clash."""
     seen: dict[str, str] = {}
     bad = [i for i in object_ids if i.lower() in RESERVED_IDS]
     for object_id in object_ids:

@@ -1,4 +1,4 @@
-"""A layout file: meshes and poses, somebody else's reconstruction or ours (docs/formats.md)."""
+"""Layout file: meshes and poses of a scene, from another reconstruction or ours (docs/formats.md)."""
 
 import difflib
 import re
@@ -10,7 +10,7 @@ from schemas.identity import RESERVED_IDS, SafeId, clean_label, find_name_clashe
 
 MAX_OBJECTS = 200
 FRAME = "table: z up, table plane z=0, metres"
-"""What a layout says of its frame; `table` alone means the same, and so does any part of it, with further notes."""
+"""Frame of a layout; `table` alone means the same, and so does any part of it, with further notes."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e3, le=1e3)]
 
@@ -31,26 +31,26 @@ _OTHER_FRAME = re.compile(
 
 
 def _check_frame(text: str) -> str:
-    """The text unchanged, if it is empty, or begins with `table` and nothing in it contradicts the table frame.
+    """Return the text if it is empty, or begins with `table` and nothing in it contradicts the table frame.
 
-    What stands in parentheses is a note, unless it is nothing but a contradiction: `(y up)`.
+    Parentheses hold notes, unless they hold nothing but a contradiction: `(y up)`.
     """
-    said = text.strip().lower()
-    notes, rest = re.findall(r"\(([^()]*)\)", said), re.sub(r"\([^()]*\)", ",", said)
+    lowered = text.strip().lower()
+    notes, rest = re.findall(r"\(([^()]*)\)", lowered), re.sub(r"\([^()]*\)", ",", lowered)
     other = _OTHER_FRAME.search(rest) or any(_OTHER_FRAME.fullmatch(note.strip()) for note in notes)
-    if said and (other or not re.match(r"table(?![a-z0-9])", said)):
+    if lowered and (other or not re.match(r"table(?![a-z0-9])", lowered)):
         raise ValueError(f'poses are read in the table frame only: write "{FRAME}"')
     return text
 
 
-class _KnownKeys(BaseModel):
-    """A key that nobody knows is refused: a typing error would otherwise leave a default in its place."""
+class _StrictModel(BaseModel):
+    """Base that refuses unknown keys: a typing error would otherwise leave a default in place."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @model_validator(mode="before")
     @classmethod
-    def _keys_are_known(cls, value: Any) -> Any:
+    def _check_keys(cls, value: Any) -> Any:
         for key in value if isinstance(value, dict) else ():
             if key not in cls.model_fields:
                 close = difflib.get_close_matches(str(key).lower(), cls.model_fields, n=1)
@@ -59,21 +59,21 @@ class _KnownKeys(BaseModel):
         return value
 
 
-class LayoutPose(_KnownKeys):
+class LayoutPose(_StrictModel):
     """`vertex_table = R(quaternion_wxyz) @ (scale * vertex) + position` [m]."""
 
     position: tuple[Finite, Finite, Finite]
     quaternion_wxyz: tuple[Finite, Finite, Finite, Finite]
 
     @model_validator(mode="after")
-    def _has_a_direction(self) -> "LayoutPose":
+    def _check_quaternion(self) -> "LayoutPose":
         if sum(q * q for q in self.quaternion_wxyz) < 1e-12:
             raise ValueError("quaternion_wxyz is zero: give a unit quaternion, real part first")
         return self
 
 
-class LayoutObject(_KnownKeys):
-    """One mesh in the layout; `mesh` is relative to the layout file and stays within the layout's parent folder."""
+class LayoutObject(_StrictModel):
+    """Mesh in the layout; `mesh` is relative to the layout file and stays within the layout's parent folder."""
 
     id: SafeId
     label: Annotated[str, Field(max_length=4000), AfterValidator(clean_label)] = "object"
@@ -82,11 +82,11 @@ class LayoutObject(_KnownKeys):
     pose: LayoutPose
     contained_in: SafeId | None = None
     count: Annotated[int, Field(ge=1, le=100)] = 1
-    """How many of it the container holds; the others repeat its mesh."""
+    """Number of such objects in the container; the others repeat its mesh."""
 
 
-class Layout(_KnownKeys):
-    """The whole file. The frame is the table frame: z up, the table plane at z = 0, metres; `origin` is never read."""
+class Layout(_StrictModel):
+    """Layout file. The frame is the table frame: z up, table plane at z = 0, metres; `origin` is never read."""
 
     scene_id: Annotated[str, Field(max_length=512)] = ""
     frame: Annotated[str, Field(max_length=512), AfterValidator(_check_frame)] = ""
@@ -94,7 +94,7 @@ class Layout(_KnownKeys):
     objects: Annotated[tuple[LayoutObject, ...], Field(min_length=1, max_length=MAX_OBJECTS)]
 
     @model_validator(mode="after")
-    def _ids_can_stand_in_one_scene(self) -> "Layout":
+    def _check_ids(self) -> "Layout":
         ids = [o.id for o in self.objects]
         if len(set(ids)) != len(ids):
             raise ValueError(f"object ids repeat: {sorted({i for i in ids if ids.count(i) > 1})}")
@@ -106,7 +106,7 @@ class Layout(_KnownKeys):
         return self
 
     @model_validator(mode="after")
-    def _containers_stand_on_the_table(self) -> "Layout":
+    def _check_containment(self) -> "Layout":
         holder = {o.id: o.contained_in for o in self.objects}
         for item in self.objects:
             if item.contained_in is not None and item.contained_in not in holder:

@@ -1,4 +1,4 @@
-"""A row of the image manifest: what lies where, and whether it can enter the line."""
+"""Row of the image manifest: the location of an input, and whether it can enter the pipeline."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -9,7 +9,7 @@ from schemas.identity import SafeId
 
 
 class SceneKind(StrEnum):
-    """What a manifest row points at (see docs/formats.md)."""
+    """Kind of input that a manifest row points at (see docs/formats.md)."""
 
     IMAGE = "image"
     CAPTURE = "capture"
@@ -17,17 +17,17 @@ class SceneKind(StrEnum):
 
 
 class ImageRow(BaseModel):
-    """One entry of the manifest.
+    """Entry of the manifest.
 
     Attributes:
         scene_id: Derived from the content; safe as a file name.
         kind: Which files to expect at `uri`.
         uri: Folder of a capture, file of a picture or layout; a local path or an fsspec URI.
         name: The entry's own name, for people; untrusted text.
-        content_sha256: Hash of the bytes that the row was made from; empty where they could not be read.
-        url: Address that the picture was fetched from, without user, query and fragment; empty for what lay there.
-        source: Where the picture comes from, where known.
-        licence: Its licence, where known.
+        content_sha256: Hash of the bytes that the row was made from; empty if they could not be read.
+        url: Address that the picture was fetched from, without user, query and fragment; empty for a local file.
+        source: Origin of the picture, if known.
+        licence: Its licence, if known.
         rejected: Empty, or the code of the reason why the entry cannot enter (`unreadable_color`, …).
         rejected_detail: One line for people.
     """

@@ -1,4 +1,4 @@
-"""Objects as perceived in the picture, then as placed on the table."""
+"""Objects as perceived in the picture, and as placed on the table."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from schemas.observation import Observation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table(Frozen):
-    """The supporting plane and the visible part of the table-top.
+    """Supporting plane and visible part of the table-top.
 
     Attributes:
         center_xy: Centre of the rectangle in the table frame [m].
@@ -31,7 +31,7 @@ class Table(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerceivedObject(Frozen):
-    """One thing in the picture.
+    """Object in the picture.
 
     Attributes:
         instance_id: The value of its pixels in `PerceivedObjects.instance_ids`, > 0.
@@ -40,7 +40,7 @@ class PerceivedObject(Frozen):
         points_camera: Denoised surface points, camera frame [m]. Shape (n, 3).
         colors: sRGB of the points.
         contained_in: Id of the container that holds it, or None.
-        count: How many of it there are (contents of a composite; one representative is segmented).
+        count: Number of such objects (contents of a composite; one representative is segmented).
     """
 
     object_id: str
@@ -55,14 +55,14 @@ class PerceivedObject(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerceivedObjects(Frozen):
-    """Everything found in one observation.
+    """Objects found in one observation.
 
     Attributes:
         camera_to_table: Pose of the camera in the table frame.
         instance_ids: Shape (h, w): 0 background, -1 table, else `PerceivedObject.instance_id`.
         perception: Name of the backend that found them, e.g. `geometric`, `replay`.
-        left_out: Ids of things that were found but cannot be used, with the reason.
-        detection: How the answer of a model that found them came about; None where none was asked.
+        left_out: Ids of objects that were found but cannot be used, with the reason.
+        detection: Origin of the answer of a model that found them; None if none was asked.
     """
 
     scene_id: str
@@ -78,7 +78,7 @@ class PerceivedObjects(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class FitUncertainty:
-    """How sure the pose of a mesh in a picture is.
+    """Uncertainty of the pose of a mesh in a picture.
 
     Attributes:
         position_std_m: Standard deviation of the middle of its box: of the length of the error, all axes together [m].
@@ -96,17 +96,17 @@ class FitUncertainty:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedObject(Frozen):
-    """A mesh standing in the table frame: `vertex_table = R(q) @ (scale * vertex) + position`.
+    """Mesh in the table frame: `vertex_table = R(q) @ (scale * vertex) + position`.
 
     Attributes:
         mesh: In its own frame, before `scale`.
         pose: Its own frame in the table frame.
         fit_residual_m: Median distance from the observed points to the placed mesh [m]; 0 for a layout.
         completion: Which MeshModel made the mesh: `carved`, `replay`, `layout`, …
-        count: How many of it there are; 1 once the composite is assembled, for then each is an object of its own.
+        count: Number of such objects; 1 once the composite is assembled, when each is an object of its own.
         copy_of: The object whose mesh, label and pose this one repeats, where it was counted but not seen by itself.
         uncertainty: Of the pose as the picture gave it; None for a layout.
-        mesh_licence: What the model that made the mesh puts it under; None where none did.
+        mesh_licence: Licence of the model that made the mesh; None if none did.
     """
 
     object_id: str
@@ -126,7 +126,7 @@ class PlacedObject(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence(Frozen):
-    """What the dataset keeps of the picture.
+    """Parts of the picture that the dataset keeps.
 
     Attributes:
         color_jpg: The picture as a JPEG file.
@@ -145,13 +145,13 @@ class Evidence(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedObjects(Frozen):
-    """The layout before rectification: from a picture, or read from a layout file.
+    """Layout before rectification: from a picture, or read from a layout file.
 
     Attributes:
         evidence: The picture it came from; None for a layout file.
         perception: Name of the backend that found the objects; `layout` for a layout file.
-        left_out: Ids of things that were found but could not be used or placed, with the reason.
-        detection: How the answer of a model that found the objects came about; None where none was asked.
+        left_out: Ids of objects that were found but could not be used or placed, with the reason.
+        detection: Origin of the answer of a model that found the objects; None if none was asked.
     """
 
     scene_id: str

@@ -1,4 +1,4 @@
-"""What was seen: a picture, its depth and its camera."""
+"""Observation of a scene: a picture, its depth and its camera."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Picture, Trian
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation(Frozen):
-    """One picture with metric depth, colour and depth pixel-aligned.
+    """Picture with metric depth, color and depth pixel-aligned.
 
     Attributes:
         color: Shape (h, w, 3) sRGB.
-        depth: Shape (h, w) float32, distance along the optical axis [m]; 0 where there is no reading.
+        depth: Shape (h, w) float32, distance along the optical axis [m]; 0 without a reading.
         camera: Intrinsics of both images.
         recorded_detections: The capture's own `detections.json`, if it has one.
         recorded_ids: Shape (h, w), the capture's own `masks.png`: 0 background, else instance ids; or None.
-        recorded_meshes: Instance id and mesh, of the capture's own `meshes/`; read where `place.mesh_model` is replay.
+        recorded_meshes: Instance id and mesh, of the capture's own `meshes/`; read if `place.mesh_model` is replay.
         bend: Share of the distance by which the depth may be bent smoothly over the picture, as a model's is; 0 of a
             sensor, whose noise is known.
     """

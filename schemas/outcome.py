@@ -1,4 +1,4 @@
-"""What a stage may answer: the next record, a reason to drop the scene, or an error; and what it spent on models."""
+"""Outcome of a stage: the next record, a reason to drop the scene, or an error; and the cost of its model requests."""
 
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -10,14 +10,14 @@ MAX_DETAIL_CHARS = 2000
 
 @dataclass(frozen=True, slots=True)
 class Done(Generic[T]):
-    """The stage's result, handed to the next stage."""
+    """Result of the stage, passed to the next one."""
 
     value: T
 
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """The scene is sound input but not fit for the dataset: a true reason, never an accident.
+    """Scene that is valid input but unfit for the dataset: a true reason, never an accident.
 
     Attributes:
         reason: Stable snake_case code to count by, e.g. `no_table_plane`.
@@ -33,11 +33,11 @@ class Dropped:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """Something broke: an exception, a crash, a hang.
+    """Failure: an exception, a crash, a hang.
 
     Attributes:
-        error_kind: `exception`, `crash`, `timeout`, `out_of_memory`, `lost` (its process or machine was taken away
-            again and again), or the class of a `TableverseError`.
+        error_kind: `exception`, `crash`, `timeout`, `out_of_memory`, `lost` (its process or machine was killed
+            repeatedly), or the class of a `TableverseError`.
         message: One bounded line.
     """
 
@@ -53,12 +53,12 @@ Outcome = Done[T] | Dropped | Failed
 
 @dataclass(frozen=True, slots=True)
 class ModelCost:
-    """What questions to models behind an address cost.
+    """Cost of requests to model servers.
 
     Attributes:
-        calls: Requests that were sent, those that were sent again included.
-        input_tokens: Read by models, as servers counted them; 0 where they did not.
-        output_tokens: Written by models.
+        calls: Requests, including retries.
+        input_tokens: As servers counted them; 0 if they did not.
+        output_tokens: Likewise.
         usd: By the prices of the configuration [USD].
     """
 
@@ -84,12 +84,12 @@ NO_COST = ModelCost()
 
 @dataclass(frozen=True, slots=True)
 class Allowance:
-    """What a chain of stages may still spend on questions; None for no limit.
+    """Budget that a chain of stages may still spend on model requests; None for no limit.
 
     Attributes:
         calls: Requests.
         usd: A request may begin as long as less than this is spent [USD].
-        name: Under which what is spent of it is written down; empty where nothing is asked.
+        name: Under which costs are logged; empty if no model is asked.
     """
 
     calls: int | None = None
@@ -98,7 +98,7 @@ class Allowance:
 
     @property
     def is_limited(self) -> bool:
-        """Whether it has an end."""
+        """Whether it has a limit."""
         return self.calls is not None or self.usd is not None
 
 

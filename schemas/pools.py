@@ -1,4 +1,4 @@
-"""What the actors of each pool hold on a cluster. It decides how fast a dataset is built, never its bytes."""
+"""Resources of the actors of each pool on a cluster. They decide the speed of a build, never its bytes."""
 
 from typing import Annotated
 
@@ -11,25 +11,25 @@ ResourceName = Annotated[str, Field(max_length=100, pattern=r"^[A-Za-z0-9_.:/-]+
 
 
 class PoolSpec(Section):
-    """One pool of actors. Pools that ask for the same share their actors."""
+    """Pool of actors. Pools with the same resources share their actors."""
 
     cpus: Amount = 1.0
-    """CPUs that an actor holds; a fraction where it mostly waits for a model elsewhere."""
+    """CPUs that an actor holds; a fraction if it mostly waits for a model server."""
     gpus: Amount = 0.0
-    """GPUs that an actor holds: a fraction where several share one, else a whole number."""
+    """GPUs that an actor holds: a fraction if several share one, else a whole number."""
     memory_mb: Annotated[int, Field(ge=0)] = 0
-    """Memory that an actor holds in Ray's books, which keeps nodes from being overfilled; 0 for none [MB]."""
+    """Memory that an actor reserves in Ray, so that nodes are not overfilled; 0 for none [MB]."""
     resources: dict[ResourceName, Amount] = Field(default_factory=dict)
     """Custom resources of the cluster, by name."""
     min: Annotated[int, Field(ge=0, le=100_000)] = 0
-    """Actors that are started at once and kept, even without work: models take long to load."""
+    """Actors that are started at once and kept, since models take long to load."""
     max: Annotated[int | None, Field(ge=1, le=100_000)] = None
     """Actors at most; null for as many as the cluster holds."""
     recycle_after: Annotated[int, Field(ge=0)] = 0
-    """Scenes after which an actor makes way for a new one, against leaks of native code; 0 for never."""
+    """Scenes after which an actor is replaced, against leaks of native code; 0 for never."""
 
     @model_validator(mode="after")
-    def _possible(self) -> "PoolSpec":
+    def _check_bounds(self) -> "PoolSpec":
         if self.gpus > 1 and self.gpus != int(self.gpus):
             raise ValueError(f"gpus {self.gpus:g}: give a fraction of one GPU, or a whole number of them")
         if self.max is not None and self.min > self.max:
@@ -39,13 +39,13 @@ class PoolSpec(Section):
         return self
 
     def needs(self) -> dict[str, float]:
-        """What one actor holds, by Ray's names of resources; memory in bytes."""
+        """Return the resources of one actor by Ray's names; memory in bytes."""
         asked = {"CPU": self.cpus, "GPU": self.gpus, "memory": self.memory_mb * 1e6, **self.resources}
         return {name: amount for name, amount in asked.items() if amount}
 
 
 class Pools(Section):
-    """The pools of the line, one per kind of work."""
+    """Pools of the pipeline, one per kind of work."""
 
     perception: PoolSpec = PoolSpec()
     """observe, read_layout, perceive"""

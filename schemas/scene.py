@@ -1,4 +1,4 @@
-"""From a rectified layout to the scene that leaves the factory."""
+"""Records from the rectified layout to the exported scene."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +20,7 @@ class RectifiedLayout(Frozen):
         poses: Rectified pose of each object in the table frame.
         groups: Group index of each object after phase 1; the root is group 0.
         penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
-        method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
+        method: `lccr`, `joint`, or `partly radial` and `radial` if no joint least motion was found.
     """
 
     scene_id: str
@@ -34,7 +34,7 @@ class RectifiedLayout(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SettledScene(Frozen):
-    """The layout at rest after a forward simulation.
+    """Layout at rest after a forward simulation.
 
     Attributes:
         poses: Settled pose of each object in the table frame.
@@ -49,7 +49,7 @@ class SettledScene(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CuratedScene(Frozen):
-    """A settled scene with the judge's seven outputs, checked against the geometry.
+    """Settled scene with the judge's seven outputs, checked against the geometry.
 
     Attributes:
         judge: Name of the backend that answered.
@@ -64,7 +64,7 @@ class CuratedScene(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Measured on the exported XML itself (design: what nobody else gives).
+    """Measurements on the exported XML itself.
 
     Attributes:
         epsilon_m: Depth below which a touch is not counted as a collision [m].
@@ -97,15 +97,15 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedScene(Frozen):
-    """What the factory writes for one scene; its rows are in one form (`normalize_row`), whoever made them.
+    """Files and rows of one scene, the rows in normal form (`normalize_row`).
 
     Attributes:
         files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
             `observation/…`, `trajectories/…`.
-        scene_row: Columns of scenes/ that the scene itself knows (`schemas.arrow.SCENES`).
+        scene_row: Columns of scenes/ that the scene itself determines (`schemas.arrow.SCENES`).
         object_rows: Rows of objects/.
         task_rows: Rows of tasks/.
-        trajectory_rows: Rows of trajectories/; none where no trajectories were asked for.
+        trajectory_rows: Rows of trajectories/; none in builds without trajectories.
     """
 
     scene_id: str

@@ -1,4 +1,4 @@
-"""From a task to a motion that was proven: grasps, placements, timed joint paths, and how each task ended.
+"""Grasps, placements, timed joint motions and verdicts of tasks.
 
 Frames: everything stands in the table frame unless a name says otherwise. The gripper's own frame has its origin
 between the fingertips (TCP), z along the approach, y along the closing axis.
@@ -48,19 +48,19 @@ class Grasps(Frozen):
     def __len__(self) -> int:
         return len(self.scores)
 
-    def chosen(self, indices: Indices) -> "Grasps":
-        """Some of them, in this order."""
+    def select(self, indices: Indices) -> "Grasps":
+        """Select grasps, in this order."""
         return Grasps(self.rotations[indices], self.positions[indices], self.widths[indices], self.scores[indices])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement(Frozen):
-    """Where an object is to be let go.
+    """Pose at which an object is released.
 
     Attributes:
-        pose: The object's own frame in the table frame, as it will stand before it is let go.
+        pose: The object's own frame in the table frame, before it is released.
         drop_m: How far it then falls until it touches [m].
-        clear_by: How it keeps clear of what stands around: `boxes`, or `outlines` seen from above where boxes leave
+        clear_by: How it keeps clear of other objects: `boxes`, or `outlines` seen from above if boxes leave
             no room.
     """
 
@@ -71,7 +71,7 @@ class Placement(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion(Frozen):
-    """A timed joint motion through the six phases, sampled at a constant step.
+    """Timed joint motion through the six phases, sampled at a constant step.
 
     Attributes:
         step_s: Time between samples [s].
@@ -79,7 +79,7 @@ class Motion(Frozen):
         velocities: Shape (t, j) [rad/s].
         openings: Commanded distance between the fingers. Shape (t,) [m].
         phases: Index into `Phase` of each sample, ascending. Shape (t,).
-        fallbacks: What was settled for where the usual could not be had, in words; empty as a rule.
+        fallbacks: Deviations from the usual plan, in words; usually empty.
     """
 
     step_s: float
@@ -97,7 +97,7 @@ class Motion(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class NoMotion:
-    """Why there is no motion for a grasp and a placement.
+    """Reason why there is no motion for a grasp and a placement.
 
     Attributes:
         phase: The first that cannot be planned.
@@ -112,12 +112,12 @@ class NoMotion:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a rollout in physics says of a motion.
+    """Result of a motion's rollout in physics.
 
     Attributes:
         success: Grasped, lifted, nothing else moved, the relation holds, the object at rest.
-        failed_phase: The phase in which it went wrong; empty where it succeeded.
-        reason: Code; empty where it succeeded.
+        failed_phase: The phase in which it failed; empty if it succeeded.
+        reason: Code; empty if it succeeded.
         detail: One line for people, with the values that decided.
         lifted_m: How far the object rose above where it stood [m].
         disturbed_m: Largest displacement of any other object [m].

@@ -1,4 +1,4 @@
-"""What the executors pass around: a call of one stage, its report, and the finished result of a scene."""
+"""Messages between executors: a call of a stage, its report, and the finished result of a scene."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,15 +10,15 @@ Status = Literal["done", "dropped", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class SandboxSetup:
-    """What a sandbox needs before its first call.
+    """Configuration of a sandbox, sent before its first call.
 
     Attributes:
-        pipeline: Where the lines are, as `module:attribute`.
+        pipeline: Location of the pipelines, as `module:attribute`.
         config_json: The whole configuration.
         cache_dir: Content-addressed cache on the machine that runs the sandbox.
-        attempts: How often a stage may crash, hang or run out of memory on a scene before it is failed.
+        attempts: Attempts of a stage that crashes, hangs or runs out of memory on a scene.
         memory_mb: Resident memory of the child [MB].
-        records_dir: Where the output of every stage is kept.
+        records_dir: Folder of the checkpoints.
     """
 
     pipeline: str
@@ -31,13 +31,13 @@ class SandboxSetup:
 
 @dataclass(frozen=True, slots=True)
 class StageCall:
-    """One stage on one scene; the input travels beside it as encoded bytes.
+    """Call of one stage on one scene; the input travels beside it as encoded bytes.
 
     Attributes:
-        kind: Kind of the manifest row, which names the line.
-        position: Index of the stage in that line.
+        kind: Kind of the manifest row, which names the pipeline.
+        position: Index of the stage in that pipeline.
         deadline_s: Wall time of one attempt [s].
-        tried: Attempts that came to nothing before, in chains that the budget broke off.
+        tried: Failed attempts before, in chains that the budget interrupted.
     """
 
     scene_id: str
@@ -49,14 +49,14 @@ class StageCall:
 
 @dataclass(frozen=True, slots=True)
 class StageChain:
-    """Consecutive stages on one scene, all of one pool; the input travels beside it, or lies among the records.
+    """Consecutive stages of one pool on one scene; the input travels beside it, or is a checkpoint.
 
     Attributes:
         calls: The stages, in order.
-        input_record: Name or place of the record that is the input; empty where the input travels beside.
-        output_records: Name under which the output of each stage is kept; empty where it is not.
-        allowance: What all of them together may spend on questions to models.
-        losses: How often a child was killed from outside before, in chains that the budget broke off.
+        input_record: Name or location of the checkpoint that is the input; empty if the input travels beside.
+        output_records: Name of the checkpoint of each stage's output; empty if it has none.
+        allowance: Budget of all of them together for model requests.
+        losses: How often a child was killed from outside before, in chains that the budget interrupted.
     """
 
     calls: tuple[StageCall, ...]
@@ -68,16 +68,16 @@ class StageChain:
 
 @dataclass(frozen=True, slots=True)
 class StageReport:
-    """How a call ended; the next record travels beside it as encoded bytes.
+    """Report of a call; the next record travels beside it as encoded bytes.
 
     Attributes:
-        outcome: None where the stage is done.
+        outcome: None if the stage is done.
         attempts: The item's own attempts, 1 or more; losses of the infrastructure do not count.
         cpu_s: CPU time of the last attempt [s].
         wall_s: Wall time of the last attempt [s].
-        trace: Where an error was raised, for the log only: never part of the dataset.
-        cost: What the models' answers cost when they were first given, whoever asked for them: a figure of the scene.
-        paid: What was spent just now: less, where answers were in the cache.
+        trace: Traceback of an error, for the log only: never part of the dataset.
+        cost: Cost of the models' answers when they were first given, by any build: a figure of the scene.
+        paid: Cost of this call: less, if answers were in the cache.
     """
 
     outcome: Dropped | Failed | None
@@ -91,13 +91,12 @@ class StageReport:
 
 @dataclass(frozen=True, slots=True)
 class StageChainReport:
-    """How a chain ended: a report of each stage that ran; only the last may be other than done.
+    """Report of a chain: a report of each stage that ran; only the last may be other than done.
 
     Attributes:
-        input_lost: Whether nothing ran, because the record that is the input is gone or damaged.
+        input_lost: Whether nothing ran, because the checkpoint of the input is gone or damaged.
         losses: How often a child was killed from outside, those of the chain before included.
-        counted: Whether the reports say all that was spent: what a process spent that died stands nowhere but where it
-            wrote it down.
+        counted: Whether the reports hold all costs: those of a process that died are only in its cost log.
     """
 
     stages: tuple[StageReport, ...]
@@ -108,7 +107,7 @@ class StageChainReport:
 
 @dataclass(frozen=True, slots=True)
 class StageTiming:
-    """What one stage cost on one scene [s]."""
+    """Time of one stage on one scene [s]."""
 
     stage: str
     cpu_s: float
@@ -117,16 +116,16 @@ class StageTiming:
 
 @dataclass(frozen=True, slots=True)
 class SceneResult:
-    """A scene that is accounted for, as the journal keeps it until its shard is committed.
+    """Result of a scene, as the journal keeps it until its shard is committed.
 
     Attributes:
-        stage: The last stage that ran; `manifest` where the row could not enter.
+        stage: The last stage that ran; `manifest` if the row was rejected.
         reason: Code of a drop, else empty.
         error_kind: Kind of a failure, else empty.
         detail: One line for people, of a drop or a failure.
-        attempts: The most attempts that any stage needed; 0 where none ran.
+        attempts: The most attempts of any stage; 0 if none ran.
         exported: An encoded `ExportedScene`; None unless done.
-        costs: What the answers of models cost, by stage; only of those that asked one.
+        costs: Costs of the models' answers, by stage that asked one.
     """
 
     scene_id: str

@@ -53,7 +53,7 @@ def test_the_rows_are_those_of_the_shards_in_their_order(out):
         opened = open_dataset(out).table(name)
         assert [Path(path).parts[-2] for path in opened.files] == ["merged"]
         assert opened.to_table().equals(rows)
-    assert open_dataset(out)._shard_of["scene-005"] == 2
+    assert open_dataset(out).scene_row("scene-005")["shard"] == 2
 
 
 def test_row_groups_have_one_size_whatever_the_shards_have(tmp_path):

@@ -44,7 +44,7 @@ def test_a_damaged_one_is_not_taken_for_none(dataset, damaged, run):
         open_dataset(dataset).record()
     assert caught.value.reason == "bad_run"
     code, _, errors = run("report", dataset, "--dest", dataset.parent / "site")
-    assert (code, errors.count("\n")) == (1, 1)
+    assert (code, errors.count("\n")) == (1, 2)
     assert "run.json" in errors
     assert not (dataset.parent / "site").exists()
 

@@ -35,7 +35,7 @@ def test_a_scene_that_is_opened_asks_for_its_own_shard(dataset):
     with range_server(dataset) as server:
         shelf = SceneCache(open_dataset(server.address))
         server.forget()
-        assert shelf.lost("s-1-0") is None
+        assert shelf.find_dropped_row("s-1-0") is None
         scene = shelf.open("s-1-0")
         assert [row["label"] for row in scene.object_rows] == ["mug"]
         assert scene.task_rows == tuple(open_dataset(dataset).scene("s-1-0").task_rows())

@@ -63,7 +63,7 @@ class _ContactPairs(Frozen):
         middle: Points = self.first + 0.5 * self.width[:, None] * self.axis
         return middle
 
-    def chosen(self, kept: np.ndarray) -> "_ContactPairs":
+    def select(self, kept: np.ndarray) -> "_ContactPairs":
         return _ContactPairs(self.first[kept], self.axis[kept], self.width[kept], self.alignment[kept])
 
 
@@ -164,7 +164,7 @@ def _keep_above_table(pairs: _ContactPairs, gripper: GripperShape) -> _ContactPa
     """Drop pairs of which a finger would be in the table whatever the approach."""
     thickness = float((gripper.finger_centers + gripper.finger_half_sizes)[:, 1].max())
     lowest = pairs.middle()[:, 2] - np.abs(pairs.axis[:, 2]) * (0.5 * pairs.width + thickness)
-    return pairs.chosen(lowest >= TABLE_CLEARANCE_M - MAX_LIFTED_M * (1.0 - np.abs(pairs.axis[:, 2])))
+    return pairs.select(lowest >= TABLE_CLEARANCE_M - MAX_LIFTED_M * (1.0 - np.abs(pairs.axis[:, 2])))
 
 
 def _spread_pairs(pairs: _ContactPairs, nearness: Numbers) -> _ContactPairs:
@@ -184,7 +184,7 @@ def _spread_pairs(pairs: _ContactPairs, nearness: Numbers) -> _ContactPairs:
     begins = np.searchsorted(part[together], part[together])
     rank = np.empty(len(order), dtype=np.int64)
     rank[together] = np.arange(len(order)) - begins
-    return pairs.chosen(order[np.argsort(rank, kind="stable")][:MAX_PAIRS])
+    return pairs.select(order[np.argsort(rank, kind="stable")][:MAX_PAIRS])
 
 
 def _generate_approaches(

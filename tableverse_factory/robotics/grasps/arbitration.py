@@ -18,5 +18,5 @@ def arbitrate(grasps: Grasps, gamma_strict: float) -> tuple[Grasps, int]:
     down = grasps.rotations[best_first, 2, 2]
     for stage, kept in ((STRICT, down <= gamma_strict), (HEMISPHERE, down < 0.0)):
         if kept.any():
-            return grasps.chosen(best_first[kept]), stage
-    return grasps.chosen(best_first[:1]), CONFIDENCE if len(grasps) else 0
+            return grasps.select(best_first[kept]), stage
+    return grasps.select(best_first[:1]), CONFIDENCE if len(grasps) else 0

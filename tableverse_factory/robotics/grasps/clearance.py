@@ -35,11 +35,11 @@ def find_clear_grasps(
     centers, half = _sweep_boxes(gripper, opening)
     kept = np.flatnonzero(_is_above_table(grasps, (centers, half)))
     for step in _STRIDES if len(own) else ():
-        kept = kept[~_contains_points(grasps.chosen(kept), (centers[kept], half), own[::step])]
+        kept = kept[~_contains_points(grasps.select(kept), (centers[kept], half), own[::step])]
     grip_centers, grip_half = _build_grip_box(gripper, opening)
     centers, half = np.concatenate([centers, grip_centers], axis=1), np.concatenate([half, grip_half])
     for piece in others:
-        kept = kept[~_collides_with_piece(grasps.chosen(kept), (centers[kept], half + OBSTACLE_CLEARANCE_M), piece)]
+        kept = kept[~_collides_with_piece(grasps.select(kept), (centers[kept], half + OBSTACLE_CLEARANCE_M), piece)]
     free = np.zeros(len(grasps), dtype=bool)
     free[kept] = True
     return free
@@ -101,7 +101,7 @@ def _collides_with_piece(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> M
     near = (np.einsum("nbk,nbk->nb", outside, outside) <= radius**2).any(axis=1)
     touching = np.zeros(len(grasps), dtype=bool)
     index = np.flatnonzero(near)
-    touching[index] = _overlaps_boxes(grasps.chosen(index.astype(np.int32)), (centers[index], half), piece)
+    touching[index] = _overlaps_boxes(grasps.select(index.astype(np.int32)), (centers[index], half), piece)
     return touching
 
 

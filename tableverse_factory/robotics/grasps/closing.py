@@ -81,6 +81,6 @@ def close_grasps(grasps: Grasps, felt: TriangleMesh, gripper: GripperShape, max_
     wide = np.full(len(grasps), max_opening_m)
     found = close_pads(grasps.rotations, grasps.positions, wide, make_raycasting_scene(felt), gripper)
     kept = np.flatnonzero(found.width > 0.0).astype(np.int32)
-    some = grasps.chosen(kept)
+    some = grasps.select(kept)
     moved = some.positions + found.sideways[kept, None] * some.rotations[:, :, 1]
     return Grasps(some.rotations, moved, found.width[kept], some.scores)

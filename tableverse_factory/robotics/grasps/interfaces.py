@@ -84,7 +84,7 @@ def propose_grasps(
     found = GRASP_MODELS[config.grasp_model](target, arm, config, rng, services)
     pieces = [place_mesh(hull, other.pose) for other in others for hull in other.hulls]
     room = find_clear_grasps(found, arm.shape, arm.max_opening_m, _sample_surface(target), pieces)
-    return found.chosen(np.flatnonzero(room).astype(np.int32))
+    return found.select(np.flatnonzero(room).astype(np.int32))
 
 
 def _merge_pieces(target: SceneObject) -> TriangleMesh:

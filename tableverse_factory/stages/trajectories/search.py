@@ -235,7 +235,7 @@ def _select_with_clearance(
     if any(room.at(place).any() for place in range(len(places))):
         return room
     roomy = np.flatnonzero(_PlaceClearance(cell, object_id, stage, places).anywhere()).astype(np.int32)
-    return _PlaceClearance(cell, object_id, select_diverse(stage.chosen(roomy)), places)
+    return _PlaceClearance(cell, object_id, select_diverse(stage.select(roomy)), places)
 
 
 def move_grasps(grasps: Grasps, motion: Pose) -> Grasps:
@@ -254,7 +254,7 @@ def split_by_stage(grasps: Grasps, gamma_strict: float) -> Iterator[tuple[int, G
         rest = {STRICT: down > gamma_strict, HEMISPHERE: down >= 0.0}.get(stage)
         if rest is None:
             return
-        left = left.chosen(np.flatnonzero(rest).astype(np.int32))
+        left = left.select(np.flatnonzero(rest).astype(np.int32))
 
 
 def select_diverse(grasps: Grasps) -> Grasps:
@@ -269,7 +269,7 @@ def select_diverse(grasps: Grasps) -> Grasps:
             kept.append(index)
         if len(kept) == MAX_GRASPS:
             break
-    return grasps.chosen(np.array(kept, dtype=np.int32))
+    return grasps.select(np.array(kept, dtype=np.int32))
 
 
 def _iterate_pairs(grasps: int, places: int) -> Iterator[tuple[int, int]]:

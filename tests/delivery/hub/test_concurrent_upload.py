@@ -53,7 +53,7 @@ def test_a_xet_storage_that_does_not_answer_ends_in_one_line(hub, dataset, tmp_p
             check=False,
         )
     assert hub.asked[TOKEN_OF_XET] == 2, "ours, and the one of hf_xet"
-    assert (process.returncode, process.stderr.count("\n")) == (1, 1)
+    assert (process.returncode, process.stderr.count("\n")) == (1, 2)
     assert "gives no answer within 1 s" in process.stderr
     assert "HF_HUB_DISABLE_XET=1" in process.stderr
     assert "0 %  Card, plan and record" in process.stdout, "what is done is said before it"

@@ -53,7 +53,7 @@ def test_a_box_is_held_by_opposite_faces(arm):
     along = np.abs(axis).argmax(axis=1)
     assert (np.abs(axis).max(axis=1) >= 1.0 / np.sqrt(1.0 + FRICTION**2) - 1e-9).all()
     assert (found.widths >= size[along] - 1e-6).all()
-    best = found.chosen(np.arange(20, dtype=np.int32))
+    best = found.select(np.arange(20, dtype=np.int32))
     assert np.abs(best.rotations[:, :, 1]).max(axis=1).min() > 0.99
     assert np.abs(best.widths - size[along[:20]]).max() < 1e-3
     assert np.abs(best.positions - middle(mesh))[:, :2].max() < 0.03
@@ -67,7 +67,7 @@ def test_what_is_wider_than_the_opening_is_not_held_across(arm):
 
 def test_a_sphere_is_held_through_its_centre(arm):
     found = grasps_on(standing(trimesh.creation.icosphere(subdivisions=4, radius=0.03)), arm)
-    best = found.chosen(np.arange(10, dtype=np.int32))
+    best = found.select(np.arange(10, dtype=np.int32))
     assert np.abs(best.widths - 0.06).max() < 0.003
     assert np.linalg.norm(best.positions - [0.0, 0.0, 0.03], axis=1).max() < 0.012
 
@@ -87,7 +87,7 @@ def test_a_body_inside_out_is_held_like_the_body(arm):
 def test_the_middle_is_better_than_the_end(arm):
     rod = box(0.3, 0.02, 0.03)
     found = grasps_on(rod, arm)
-    best = found.chosen(np.arange(10, dtype=np.int32))
+    best = found.select(np.arange(10, dtype=np.int32))
     assert np.abs(best.positions[:, 0]).max() < 0.03
     assert np.abs(found.positions[:, 0]).max() > 0.1, "but the ends are kept, for when the middle is taken"
 

@@ -108,7 +108,7 @@ def test_fingers_do_not_come_down_on_the_body(arm, mesh):
         mesh, mesh, arm.shape, arm.max_opening_m, middle(mesh), TrajectoriesConfig(), np.random.default_rng(0)
     )
     own, _ = sample_inward_normals(mesh, 1500)
-    free = found.chosen(
+    free = found.select(
         np.flatnonzero(find_clear_grasps(found, arm.shape, arm.max_opening_m, own, [])).astype(np.int32)
     )
     assert 20 < len(free) < len(found)

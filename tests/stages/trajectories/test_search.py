@@ -101,7 +101,7 @@ def test_where_none_of_the_first_grasps_has_room_those_that_have_are_tried():
     beside = Pose(np.array([-0.042, -0.15, standing.position[2]]), standing.quaternion_wxyz)  # 2 mm from the other can
     room = ours.has_room("obj_000", move_grasps(grasps, compose_poses(beside, invert_pose(standing))))
     order = np.concatenate([np.flatnonzero(~room), np.flatnonzero(room)]).astype(np.int32)
-    stage, places = grasps.chosen(order), (Placement(beside, 0.0),)
+    stage, places = grasps.select(order), (Placement(beside, 0.0),)
     assert 0 < room.sum() < len(room)
     assert not ours.has_room(
         "obj_000", move_grasps(select_diverse(stage), compose_poses(beside, invert_pose(standing)))
@@ -109,7 +109,7 @@ def test_where_none_of_the_first_grasps_has_room_those_that_have_are_tried():
     tried = _select_with_clearance(ours, "obj_000", stage, places)
     assert tried.at(0).any()
     assert 0 < len(tried.grasps) <= MAX_GRASPS
-    blocked = grasps.chosen(np.flatnonzero(~room).astype(np.int32))
+    blocked = grasps.select(np.flatnonzero(~room).astype(np.int32))
     assert len(_select_with_clearance(ours, "obj_000", blocked, places).grasps) == 0
 
 
