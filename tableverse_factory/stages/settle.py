@@ -1,20 +1,20 @@
-"""SETTLE: a short forward simulation lets the rectified layout find its rest (paper section 3.2, last step)."""
+"""SETTLE stage: a short forward simulation brings the rectified layout to rest (paper section 3.2, last step)."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from schemas.config import Config
-from schemas.identity import colliding_names
+from schemas.identity import find_name_clashes
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.bodies.prior_mass import prior_body
-from tableverse_factory.physics.mjcf.slab import Slab, slab_under
+from tableverse_factory.physics.bodies.prior_mass import make_prior_body
+from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
 from tableverse_factory.physics.mjcf.spec import SceneBody
 from tableverse_factory.physics.simulate.at_rest import Rest
-from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, fallen
+from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, find_fallen
 
 
 def settle(
@@ -23,40 +23,42 @@ def settle(
     rng: np.random.Generator,  # noqa: ARG001
     services: Services,  # noqa: ARG001
 ) -> Outcome[SettledScene]:
-    """Simulates until every object is measured to be at rest.
+    """Simulate until every object is at rest.
 
-    Masses are priors from labels and volumes: the judge, who comes next, predicts better ones, and export settles
-    again on those. Dropped: `reserved_object_id`, `unusable_mesh`, `simulation_unstable`, `object_fell`, `not_at_rest`.
+    Masses are priors from labels and volumes: the judge predicts better ones next, and export settles again
+    with those. Dropped: `reserved_object_id`, `unusable_mesh`, `simulation_unstable`, `object_fell`, `not_at_rest`.
     """
     objects = layout.placed.objects
-    if bad := colliding_names([item.object_id for item in objects]):
+    if bad := find_name_clashes([item.object_id for item in objects]):
         return Dropped("reserved_object_id", f"these ids cannot be bodies of one scene: {', '.join(bad[:5])}")
     try:
-        bodies, slab = bodies_on_table(layout)
+        bodies, slab = make_bodies(layout)
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
     ended, rest = bring_to_rest(
         bodies, slab, timestep_s=config.settle.timestep_s, max_time_s=config.settle.max_time_s, gentle=True
     )
-    return _verdict(layout, ended, slab, rest)
+    return _decide_outcome(layout, ended, slab, rest)
 
 
-def bodies_on_table(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Slab]:
-    """The objects of a layout as bodies of guessed mass and friction, and the table under them.
+def make_bodies(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Slab]:
+    """Make the bodies of a layout, with guessed mass and friction, and the table under them.
 
     Raises:
         GeometryError: if an object has no piece that is thick enough to simulate.
     """
     objects = layout.placed.objects
-    bodies = tuple(map(prior_body, objects, layout.pieces, layout.poses))
+    bodies = tuple(map(make_prior_body, objects, layout.pieces, layout.poses))
     meshes, scales = [item.mesh for item in objects], [item.scale for item in objects]
-    return bodies, slab_under(layout.placed.table, meshes, layout.poses, scales)
+    return bodies, fit_slab(layout.placed.table, meshes, layout.poses, scales)
 
 
-def _verdict(layout: RectifiedLayout, bodies: Sequence[SceneBody], slab: Slab, rest: Rest) -> Outcome[SettledScene]:
+def _decide_outcome(
+    layout: RectifiedLayout, bodies: Sequence[SceneBody], slab: Slab, rest: Rest
+) -> Outcome[SettledScene]:
     if rest.warnings:
         return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(rest.warnings)} at {rest.time_s:.2f} s")
-    if fell := fallen(bodies, slab):
+    if fell := find_fallen(bodies, slab):
         return Dropped("object_fell", f"{', '.join(fell[:10])} of {len(bodies)} objects left the table")
     if not rest.at_rest:
         named = zip(bodies, rest.speeds, rest.moving, strict=True)

@@ -1,4 +1,4 @@
-"""The paper's ablation (table 2) of our own datasets: the same meshes as placed, as rectified, and as exported."""
+"""The paper's ablation (table 2) of our datasets: the same meshes at placed, rectified and exported poses."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,15 +12,15 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
-from tableverse_factory.evaluation.methods.sources import read_pose, scene_of_model
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, SceneSource
+from tableverse_factory.evaluation.methods.sources import read_model_scene, read_pose
 
 CONFIGURATIONS = {"Direct": "placed", "Direct + LCCR": "rectified", "Direct + LCCR + Simulation": "settled"}
-"""Rows of the paper's table, and what the poses after that much work are called in `meta.json`."""
+"""Rows of the paper's table, and the names of their poses in `meta.json`."""
 
 
-def configurations(folder: Path) -> dict[str, str]:
-    """`CONFIGURATIONS`, with the name of what rectified this dataset where that is not LCCR.
+def list_configurations(folder: Path) -> dict[str, str]:
+    """Return `CONFIGURATIONS` with the rectification method of this dataset instead of LCCR.
 
     Raises:
         InputError: if its run.json cannot be read.
@@ -33,30 +33,32 @@ def configurations(folder: Path) -> dict[str, str]:
     return {row.replace("LCCR", name): poses for row, poses in CONFIGURATIONS.items()}
 
 
-def ablation_sources(folder: Path, poses: str) -> list[Source]:
-    """The exported scenes of a dataset with the poses of one configuration.
+def find_ablation_scenes(folder: Path, poses: str) -> list[SceneSource]:
+    """Find the exported scenes of a dataset with the poses of one configuration.
 
-    Scenes that the factory dropped are not among them, so that the figures before settling are those of the survivors;
-    `tableverse bench lccr` measures all of a folder of layouts.
+    Dropped scenes are missing, so the figures before settling are those of the survivors; `tableverse bench lccr`
+    measures all layouts of a folder.
 
     Raises:
         InputError: if there is no dataset.
     """
     dataset = open_dataset(folder)
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"]).column(0).to_pylist()
-    return [Source(scene_id, "dataset", partial(_read, dataset, scene_id, poses)) for scene_id in sorted(done)]
+    return [
+        SceneSource(scene_id, "dataset", partial(_read_scene, dataset, scene_id, poses)) for scene_id in sorted(done)
+    ]
 
 
-def _read(dataset: Dataset, scene_id: str, poses: str) -> MethodScene:
+def _read_scene(dataset: Dataset, scene_id: str, poses: str) -> MethodScene:
     exported = dataset.scene(scene_id)
-    scene, entries = scene_of_model(exported.model()), exported.meta.get("objects", [])
+    scene, entries = read_model_scene(exported.model()), exported.meta.get("objects", [])
     known = {str(entry["object_id"]): entry.get("poses") for entry in entries}
-    moved = (_moved(scene_id, item, known, poses) for item in scene.objects)
+    moved = (_move_object(scene_id, item, known, poses) for item in scene.objects)
     return replace(scene, objects=tuple(item for item in moved if item is not None))
 
 
-def _moved(scene_id: str, item: MethodObject, known: Mapping[str, Any], poses: str) -> MethodObject | None:
-    """The object at that pose; None if it had none yet: copies of a counted thing are made after placing."""
+def _move_object(scene_id: str, item: MethodObject, known: Mapping[str, Any], poses: str) -> MethodObject | None:
+    """Return the object at a pose; None if it had none yet: copies are made after placing."""
     try:
         pose = known[item.name][poses]
     except (KeyError, TypeError):

@@ -1,7 +1,7 @@
-"""The scene collision rate (paper, table 1) of any method, measured with one ruler for all.
+"""Scene collision rate (paper, table 1) of any method, measured alike for all.
 
-A scene collides if any two of its objects lie deeper inside one another than epsilon. The depth is measured on the
-meshes, as the paper counts, and on the convex pieces, as a simulator feels them (`geometry.penetration`).
+A scene collides if two of its objects overlap by more than epsilon. The depth is measured on the meshes, as in the
+paper, and on the convex pieces, which a simulator uses (`geometry.collision.penetration`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,26 +13,31 @@ import numpy as np
 
 from schemas.config import RectifyConfig
 from tableverse_factory.core.errors import TableverseError
-from tableverse_factory.evaluation.methods.scenes import MethodScene, Source
-from tableverse_factory.geometry.collision.penetration import PairDepth, mesh_penetrations, piece_penetrations
+from tableverse_factory.evaluation.methods.scenes import MethodScene, SceneSource
+from tableverse_factory.geometry.collision.penetration import (
+    PairDepth,
+    measure_mesh_penetrations,
+    measure_piece_penetrations,
+)
 from tableverse_factory.geometry.convex.decompose import decompose
 
 Pair = tuple[str, str, float]
-"""Names of two objects and how deep they overlap [m]."""
+"""Names of two objects and the depth of their overlap [m]."""
 
 _Z95 = 1.959964
 
 
 @dataclass(frozen=True, slots=True)
 class SceneCollisions:
-    """One scene.
+    """Collisions of one scene.
 
     Attributes:
-        objects: How many were compared, the table not counted.
-        meshes: Pairs whose meshes share volume, deepest first.
-        pieces: Pairs whose convex pieces overlap, deepest first; None where they were not measured.
-        left_out: What was taken for the table, or stands still.
-        error: Why the scene could not be measured; empty as a rule.
+        name: Name of the scene.
+        objects: Number of objects compared, without the table.
+        meshes: Pairs with overlapping meshes, deepest first.
+        pieces: Pairs with overlapping convex pieces, deepest first; None if they were not measured.
+        left_out: Names of static bodies and of the table.
+        error: Reason why the scene could not be measured, or empty.
     """
 
     name: str
@@ -44,18 +49,18 @@ class SceneCollisions:
 
     @property
     def depth_m(self) -> float:
-        """The deepest pair of meshes [m]."""
+        """Deepest overlap of meshes [m]."""
         return self.meshes[0][2] if self.meshes else 0.0
 
     @property
     def piece_depth_m(self) -> float | None:
-        """The deepest pair on the pieces [m]."""
+        """Deepest overlap of pieces [m]."""
         if self.pieces is None:
             return None
         return self.pieces[0][2] if self.pieces else 0.0
 
     def as_json(self, epsilon_m: float) -> dict[str, Any]:
-        """What a script reads: every pair, in metres."""
+        """Return plain values for JSON: every pair, in metres."""
         if self.error:
             return {"scene": self.name, "error": self.error}
         return {
@@ -72,11 +77,13 @@ class SceneCollisions:
 
 @dataclass(frozen=True, slots=True)
 class MethodCollisions:
-    """One method over all its scenes.
+    """Collisions of one method over all its scenes.
 
     Attributes:
-        epsilon_m: Overlaps up to this depth are no collision [m].
-        dropped: Scenes that the factory gave up, which are not among them; None where nobody knows.
+        method: Name of the method.
+        epsilon_m: Depth beyond which objects collide [m].
+        scenes: Measured scenes, and those that could not be measured.
+        dropped: Number of scenes that the factory dropped, which are not among them; None if unknown.
     """
 
     method: str
@@ -86,25 +93,25 @@ class MethodCollisions:
 
     @property
     def measured(self) -> tuple[SceneCollisions, ...]:
-        """The scenes that could be measured."""
+        """Scenes that could be measured."""
         return tuple(scene for scene in self.scenes if not scene.error)
 
     def rate(self) -> float | None:
-        """Share of the measured scenes that collide on the meshes; None without any."""
-        return _share([scene.depth_m > self.epsilon_m for scene in self.measured])
+        """Compute the share of measured scenes that collide on the meshes; None without any."""
+        return _compute_share([scene.depth_m > self.epsilon_m for scene in self.measured])
 
     def piece_rate(self) -> float | None:
-        """The same on the convex pieces, of those scenes whose pieces were measured."""
+        """Compute the same on the convex pieces, over the scenes whose pieces were measured."""
         depths = [scene.piece_depth_m for scene in self.measured]
-        return _share([depth > self.epsilon_m for depth in depths if depth is not None])
+        return _compute_share([depth > self.epsilon_m for depth in depths if depth is not None])
 
     def interval(self) -> tuple[float, float] | None:
-        """Wilson's 95 % interval of `rate`."""
+        """Compute Wilson's 95 % interval of `rate`."""
         rate = self.rate()
-        return None if rate is None else wilson(rate, len(self.measured))
+        return None if rate is None else compute_wilson_interval(rate, len(self.measured))
 
     def as_json(self) -> dict[str, Any]:
-        """What a script reads."""
+        """Return plain values for JSON."""
         return {
             "method": self.method,
             "scenes": len(self.scenes),
@@ -118,14 +125,14 @@ class MethodCollisions:
 
 
 def measure_method(
-    method: str, sources: Iterable[Source], epsilon_m: float, cache_dir: Path | None, dropped: int | None = None
+    method: str, sources: Iterable[SceneSource], epsilon_m: float, cache_dir: Path | None, dropped: int | None = None
 ) -> MethodCollisions:
-    """Every scene of a method; with a `cache_dir` for convex pieces also on those, else on the meshes alone."""
+    """Measure every scene of a method; with a `cache_dir` for convex pieces also on those."""
     return MethodCollisions(method, epsilon_m, tuple(measure_scenes(sources, cache_dir)), dropped)
 
 
-def measure_scenes(sources: Iterable[Source], cache_dir: Path | None) -> Iterator[SceneCollisions]:
-    """Scene by scene; what cannot be read is a result with its reason, never left out silently."""
+def measure_scenes(sources: Iterable[SceneSource], cache_dir: Path | None) -> Iterator[SceneCollisions]:
+    """Measure scene by scene; a scene that cannot be read becomes a result with its error."""
     for source in sources:
         try:
             yield measure_scene(source.name, source.read(), cache_dir)
@@ -134,24 +141,24 @@ def measure_scenes(sources: Iterable[Source], cache_dir: Path | None) -> Iterato
 
 
 def measure_scene(name: str, scene: MethodScene, cache_dir: Path | None) -> SceneCollisions:
-    """Depths of all pairs of one scene.
+    """Measure the depths of all pairs of one scene.
 
     Raises:
         GeometryError: if a mesh cannot be closed.
     """
     poses = [item.pose for item in scene.objects]
     scales = [item.scale for item in scene.objects]
-    meshes = mesh_penetrations([item.mesh for item in scene.objects], poses, scales)
+    meshes = measure_mesh_penetrations([item.mesh for item in scene.objects], poses, scales)
     pieces = None
     if cache_dir is not None:
         config = RectifyConfig()
         given = [item.pieces or decompose(item.mesh, config, cache_dir) for item in scene.objects]
-        pieces = _named(scene, piece_penetrations(given, poses, scales))
-    return SceneCollisions(name, len(scene.objects), _named(scene, meshes), pieces, scene.left_out)
+        pieces = _name_pairs(scene, measure_piece_penetrations(given, poses, scales))
+    return SceneCollisions(name, len(scene.objects), _name_pairs(scene, meshes), pieces, scene.left_out)
 
 
-def wilson(share: float, count: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a share of `count` trials."""
+def compute_wilson_interval(share: float, count: int) -> tuple[float, float]:
+    """Compute Wilson's 95 % score interval of a share of `count` trials."""
     square = _Z95**2
     middle = share + square / (2 * count)
     reach = _Z95 * float(np.sqrt(share * (1 - share) / count + square / (4 * count**2)))
@@ -159,7 +166,7 @@ def wilson(share: float, count: int) -> tuple[float, float]:
     return max(0.0, (middle - reach) / scale), min(1.0, (middle + reach) / scale)
 
 
-def _named(scene: MethodScene, depths: Sequence[PairDepth]) -> tuple[Pair, ...]:
+def _name_pairs(scene: MethodScene, depths: Sequence[PairDepth]) -> tuple[Pair, ...]:
     names = [item.name for item in scene.objects]
     return tuple((names[i], names[j], depth) for i, j, depth in sorted(depths, key=lambda pair: -pair[2]))
 
@@ -168,5 +175,5 @@ def _pairs_as_json(pairs: Sequence[Pair]) -> list[dict[str, Any]]:
     return [{"a": a, "b": b, "depth_m": depth} for a, b, depth in pairs]
 
 
-def _share(colliding: Sequence[bool]) -> float | None:
+def _compute_share(colliding: Sequence[bool]) -> float | None:
     return sum(colliding) / len(colliding) if colliding else None

@@ -1,4 +1,4 @@
-"""Several methods over the same scenes, with the pictures that these were made from."""
+"""Methods on the same scenes, with the pictures of the real scenes."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,8 +7,8 @@ from pathlib import Path
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.evaluation.methods.grid import CELL, method_views, read_reference, stitched
-from tableverse_factory.evaluation.methods.scenes import Source
+from tableverse_factory.evaluation.methods.grid import CELL, read_reference, render_method, stitch_grid
+from tableverse_factory.evaluation.methods.scenes import SceneSource
 from tableverse_factory.evaluation.methods.sources import find_scenes
 from tableverse_factory.evaluation.methods.vlm_vote import Question
 
@@ -17,16 +17,16 @@ _CONTENT_HASH = re.compile(r"-[0-9a-f]{12}\Z")
 
 
 class Comparison:
-    """What is compared.
+    """Methods with their scenes matched by name.
 
     Attributes:
-        sources: Scenes of each method, by the name that they share.
-        scenes: Names that every method has.
+        sources: Scenes of each method by shared name.
+        scenes: Names of the scenes that every method has.
     """
 
     def __init__(
         self,
-        sources: Mapping[str, Mapping[str, Source]],
+        sources: Mapping[str, Mapping[str, SceneSource]],
         paths: Mapping[str, Path],
         references: Path | None = None,
         side: int = CELL,
@@ -40,18 +40,18 @@ class Comparison:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """In the order given."""
+        """Names of the methods in the given order."""
         return tuple(self.sources)
 
     @property
     def missing(self) -> dict[str, tuple[str, ...]]:
-        """What some method has and this one lacks, for each method that lacks some."""
+        """Scenes that another method has and this one lacks, by method."""
         everything = set().union(*self.sources.values())
         lacking = {method: tuple(sorted(everything - set(its))) for method, its in self.sources.items()}
         return {method: names for method, names in lacking.items() if names}
 
     def grid(self, question: Question) -> bytes:
-        """The picture of one question, a PNG file; a scene is drawn once for all its rounds.
+        """Draw the grid of one question as a PNG file; a scene is drawn once for all its rounds.
 
         Raises:
             InputError: if a scene or its picture cannot be read.
@@ -61,23 +61,23 @@ class Comparison:
         if self._drawn[0] != scene:
             self._drawn = (
                 scene,
-                {method: method_views(its[scene].read(), self._side) for method, its in self.sources.items()},
+                {method: render_method(its[scene].read(), self._side) for method, its in self.sources.items()},
             )
-        return stitched(reference, [self._drawn[1][method] for method in question.columns], self._side)
+        return stitch_grid(reference, [self._drawn[1][method] for method in question.columns], self._side)
 
     def reference(self, scene: str) -> bytes:
-        """The file of the real picture.
+        """Read the picture of the real scene.
 
         Raises:
             InputError: `no_reference` if there is none.
         """
-        found = self._kept(scene) if self._references is None else _beside(self._references, scene)
+        found = self._find_in_datasets(scene) if self._references is None else _find_reference(self._references, scene)
         if found is None:
             where = self._references or "the datasets that are compared; give --reference"
             raise InputError(f"{scene}: no picture of the real scene in {where}", "no_reference")
         return found
 
-    def _kept(self, scene: str) -> bytes | None:
+    def _find_in_datasets(self, scene: str) -> bytes | None:
         for method, its in self.sources.items():
             if its[scene].format == "dataset":
                 files = open_dataset(self._paths[method]).scene(its[scene].name).files()
@@ -86,24 +86,24 @@ class Comparison:
         return None
 
 
-def compare(methods: Mapping[str, Path], references: Path | None = None, side: int = CELL) -> Comparison:
-    """The methods with their scenes matched by name.
+def match_methods(methods: Mapping[str, Path], references: Path | None = None, side: int = CELL) -> Comparison:
+    """Match the scenes of methods by name.
 
     Args:
-        methods: Where each lies.
-        references: Where pictures of the real scenes lie, `<scene>.png` or `<scene>/color.png`; None: those that a
-            dataset among the methods keeps.
-        side: Of a cell of the grid [px].
+        methods: Path of each method.
+        references: Folder of pictures of the real scenes, `<scene>.png` or `<scene>/color.png`; None for those in a
+            dataset among the methods.
+        side: Side of a cell of the grid [px].
 
     Raises:
         InputError: if a method has no scenes.
     """
-    sources = {method: shared_names(find_scenes(path)) for method, path in methods.items()}
+    sources = {method: index_by_shared_name(find_scenes(path)) for method, path in methods.items()}
     return Comparison(sources, dict(methods), references, side)
 
 
-def check_shared(comparison: Comparison) -> None:
-    """Nothing, where there is a scene that every method has.
+def check_shared_scenes(comparison: Comparison) -> None:
+    """Check that every method has at least one scene in common.
 
     Raises:
         InputError: `no_shared_scenes`.
@@ -115,15 +115,15 @@ def check_shared(comparison: Comparison) -> None:
         )
 
 
-def shared_names(sources: Sequence[Source]) -> dict[str, Source]:
-    """Scenes by the name that other methods know them by: of a dataset's ids the part before the content's hash."""
+def index_by_shared_name(sources: Sequence[SceneSource]) -> dict[str, SceneSource]:
+    """Index scenes by the name shared with other methods: for ids of a dataset the part before the content hash."""
     short = [_CONTENT_HASH.sub("", source.name) if source.format == "dataset" else source.name for source in sources]
     return {
         name if short.count(name) == 1 else source.name: source for name, source in zip(short, sources, strict=True)
     }
 
 
-def _beside(folder: Path, scene: str) -> bytes | None:
+def _find_reference(folder: Path, scene: str) -> bytes | None:
     names = [folder / f"{scene}{suffix}" for suffix in PICTURES]
     names += [folder / scene / f"color{suffix}" for suffix in PICTURES]
     return next((path.read_bytes() for path in names if path.is_file()), None)

@@ -1,7 +1,7 @@
-"""The picture that a judge compares methods on (paper, appendix C.3).
+"""Grid picture on which a judge compares methods (paper, appendix C.3).
 
-Two rows: the real picture, then each method from the front and slightly above; a blank, then each method from straight
-ahead, where things that float or sink show. Only objects are drawn, no table. Methods are letters to the judge.
+Upper row: the real picture, then each method from the front and slightly above. Lower row: a blank, then each method
+from straight ahead, which shows floating and sunken objects. Only objects are drawn, no table. Columns have letters.
 """
 
 import io
@@ -14,16 +14,16 @@ from schemas.geometry import Picture, TriangleMesh
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.evaluation.methods.scenes import MethodScene
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery
-from tableverse_factory.physics.render.views import FINE, front_eye, pictures
+from tableverse_factory.physics.render.views import FINE, make_front_camera, render_pictures
 
 OBLIQUE = float(np.deg2rad(25.0))
 CELL = 448
 """Side of a cell [px]."""
 
 HEADER = 28
-"""Height of the line of letters [px]."""
+"""Height of the header with the letters [px]."""
 
 MAX_REFERENCE_PIXELS = 40_000_000
 
@@ -31,39 +31,39 @@ _PAPER = "white"
 _INK = "#24292f"
 
 
-def letters(count: int) -> tuple[str, ...]:
-    """What the methods are called in the grid, from the left."""
+def make_letters(count: int) -> tuple[str, ...]:
+    """Make the letters of the columns from the left."""
     return tuple(chr(ord("A") + index) for index in range(count))
 
 
-def method_views(scene: MethodScene, side: int = CELL) -> tuple[Picture, Picture]:
-    """A scene from the front and slightly above, and from straight ahead; each `side` square."""
-    scenery = scenery_of_scene(scene)
-    eyes = [front_eye(scenery, side, side, elevation=elevation) for elevation in (OBLIQUE, 0.0)]
-    oblique, front = pictures(scenery, eyes, FINE)
+def render_method(scene: MethodScene, side: int = CELL) -> tuple[Picture, Picture]:
+    """Render a scene from the front and slightly above, and from straight ahead; each `side` square [px]."""
+    scenery = build_scenery(scene)
+    cameras = [make_front_camera(scenery, side, side, elevation=elevation) for elevation in (OBLIQUE, 0.0)]
+    oblique, front = render_pictures(scenery, cameras, FINE)
     return oblique.color, front.color
 
 
-def scenery_of_scene(scene: MethodScene) -> Scenery:
-    """The objects of a scene as they stand, nothing else."""
+def build_scenery(scene: MethodScene) -> Scenery:
+    """Build the drawable objects of a scene."""
     names: list[str] = []
     parts: list[TriangleMesh] = []
     colors: list[Rgb | None] = []
     for item in scene.objects:
         for look in item.looks:
             names.append(item.name)
-            parts.append(placed_mesh(look.mesh, item.pose, item.scale))
+            parts.append(place_mesh(look.mesh, item.pose, item.scale))
             plain = look.mesh.texture is None and look.mesh.vertex_colors is None
             colors.append(look.color if plain else None)
     return Scenery(tuple(names), tuple(parts), tuple(colors))
 
 
-def stitched(reference: Image.Image, views: Sequence[tuple[Picture, Picture]], side: int = CELL) -> bytes:
-    """The grid as a PNG file: a column for the reference and one for each method, in the order given."""
+def stitch_grid(reference: Image.Image, views: Sequence[tuple[Picture, Picture]], side: int = CELL) -> bytes:
+    """Stitch the grid as a PNG file: a column for the reference and one per method, in the given order."""
     grid = Image.new("RGB", (side * (1 + len(views)), HEADER + 2 * side), _PAPER)
     draw = ImageDraw.Draw(grid)
     font = ImageFont.load_default(size=HEADER - 8)
-    for column, title in enumerate(("Reference", *letters(len(views)))):
+    for column, title in enumerate(("Reference", *make_letters(len(views)))):
         draw.text((column * side + side / 2, HEADER / 2), title, fill=_INK, font=font, anchor="mm")
         draw.line([(column * side, 0), (column * side, grid.height)], fill=_INK)
     fitted = ImageOps.contain(reference, (side, side))
@@ -75,10 +75,10 @@ def stitched(reference: Image.Image, views: Sequence[tuple[Picture, Picture]], s
 
 
 def read_reference(data: bytes, name: str) -> Image.Image:
-    """A real picture, upright and in RGB.
+    """Decode a real picture, upright and in RGB.
 
     Raises:
-        InputError: `bad_reference` if it does not decode or is too large.
+        InputError: `bad_reference` if it cannot be decoded or is too large.
     """
     try:
         picture = Image.open(io.BytesIO(data))
@@ -86,4 +86,4 @@ def read_reference(data: bytes, name: str) -> Image.Image:
             raise InputError(f"{name}: {picture.width} x {picture.height} pixels are too many", "bad_reference")
         return ImageOps.exif_transpose(picture).convert("RGB")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise InputError(f"{name} is no picture: {error}"[:300], "bad_reference") from error
+        raise InputError(f"{name} is not a readable picture: {error}"[:300], "bad_reference") from error

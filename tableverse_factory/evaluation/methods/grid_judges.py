@@ -1,4 +1,4 @@
-"""Who looks at the grid: a model behind an address, or answers recorded earlier."""
+"""Judges of the grid: a model server, or recorded answers."""
 
 import json
 from collections.abc import Callable
@@ -28,23 +28,23 @@ MAX_RECORD_BYTES = 1_000_000
 
 
 class GridJudge(Protocol):
-    """The door of whoever compares methods."""
+    """Interface of a judge that compares methods."""
 
     def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:
-        """The marks of every method.
+        """Mark every method.
 
         Args:
             question: The scene and the order of its columns.
-            grid: Makes the picture, a PNG file; called only by those who look at it.
+            grid: Draws the picture as a PNG file; called only if the judge needs it.
 
         Raises:
-            ModelError: if there is no answer, or none that counts.
+            ModelError: if there is no valid answer.
         """
         ...
 
 
 class ModelGridJudge:
-    """A model: the grid and the prompt go out, the marks come back, invalid ones once more with the reason."""
+    """A model that gets the grid and the prompt, and after an invalid answer the reason."""
 
     def __init__(self, client: ModelClient) -> None:
         self._client = client
@@ -59,13 +59,13 @@ class ModelGridJudge:
 
 
 class ReplayedGridJudge:
-    """Ballots as `record` wrote them: `<scene>-<round>.json` in a folder."""
+    """Votes that `record_vote` wrote: `<scene>-<round>.json` in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:  # noqa: ARG002
-        """See `GridJudge`; the marks go to the methods that stood in the columns when the answer was recorded."""
+        """See `GridJudge`; the marks belong to the columns of the recorded answer."""
         value = _read_record(self._folder / f"{question.name}.json")
         columns = value.get("columns")
         if not isinstance(columns, list) or sorted(map(str, columns)) != sorted(question.columns):
@@ -74,19 +74,19 @@ class ReplayedGridJudge:
         return make_vote(shown, validate_vote(value.get("answer"), len(columns)))
 
 
-def record_vote(ballot: Vote, folder: Path) -> None:
-    """Keeps a ballot for `ReplayedGridJudge`."""
-    question = Question(ballot.scene, ballot.round, ballot.columns)
-    marks = [ballot.marks[method].model_dump() for method in ballot.columns]
+def record_vote(vote: Vote, folder: Path) -> None:
+    """Write a vote for `ReplayedGridJudge`."""
+    question = Question(vote.scene, vote.round, vote.columns)
+    marks = [vote.marks[method].model_dump() for method in vote.columns]
     columns = dict(zip(make_letters(len(marks)), marks, strict=True))
-    text = json.dumps({"columns": list(ballot.columns), "answer": {"columns": columns}}, indent=1)
+    text = json.dumps({"columns": list(vote.columns), "answer": {"columns": columns}}, indent=1)
     write_atomic(folder / f"{question.name}.json", f"{text}\n".encode())
 
 
 def summarize_recorded(folder: Path, most: int) -> tuple[int, frozenset[str]]:
-    """How many rounds of answers lie in a folder, of `most`, and the methods that they name.
+    """Count the rounds of answers in a folder, up to `most`, and collect the methods that they name.
 
-    Files that are no answers name nobody: `ReplayedGridJudge` refuses them when they are asked for.
+    Other files are ignored here; `ReplayedGridJudge` refuses them when they are requested.
     """
     rounds, named = 0, set[str]()
     for path in sorted(folder.glob("*-[0-9]*.json")):
@@ -109,14 +109,14 @@ def _read_record(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(data[:MAX_RECORD_BYTES])
     except (ValueError, RecursionError) as error:
-        raise AnswerInvalidError(f"{path.name} is no JSON: {error}"[:300]) from error
+        raise AnswerInvalidError(f"{path.name} is not JSON: {error}"[:300]) from error
     if not isinstance(value, dict):
-        raise AnswerInvalidError(f"{path.name} holds no JSON object")
+        raise AnswerInvalidError(f"{path.name} does not hold a JSON object")
     return value
 
 
 def make_grid_judge(config: CurateConfig, services: Services) -> GridJudge:
-    """The judge that the section `curate` of a configuration names.
+    """Make the judge that the section `curate` of a configuration names.
 
     Raises:
         ConfigError: for the rules, which cannot look at pictures; for a folder of answers that holds none.
@@ -124,7 +124,7 @@ def make_grid_judge(config: CurateConfig, services: Services) -> GridJudge:
     if config.judge == "replay":
         folder = Path(config.replay_dir)
         if not summarize_recorded(folder, MAX_METHODS)[1]:
-            what = "holds no answers" if folder.is_dir() else "is no folder"
+            what = "holds no answers" if folder.is_dir() else "is not a folder"
             raise ConfigError(
                 f"curate.replay_dir: {folder} {what}; give the folder answers/ that `evaluate gpt-score` wrote"
             )

@@ -1,4 +1,4 @@
-"""Layouts against the truth: where things stand, how large they are, how they are turned, what carries what."""
+"""Comparison of layouts with the truth: positions, sizes, headings, support and containment."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,37 +11,43 @@ from schemas.config import RectifyConfig
 from schemas.geometry import TriangleMesh, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.core.errors import TableverseError
-from tableverse_factory.evaluation.methods.heading import heading_error, heading_error_of_same, twist_about_z
-from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
-from tableverse_factory.evaluation.methods.truth import ReadTruth, Truth
+from tableverse_factory.evaluation.methods.heading import (
+    compute_heading_error,
+    compute_heading_error_of_same,
+    compute_twist_about_z,
+)
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, SceneSource
+from tableverse_factory.evaluation.methods.truth import ReadTruth, SceneTruth
 from tableverse_factory.geometry.convex.decompose import decompose
-from tableverse_factory.geometry.math.transforms import multiply_quaternions, transform_points
-from tableverse_factory.geometry.mesh.hulls import hull_volume
-from tableverse_factory.geometry.mesh.meshes import bounds, box_center, placed_mesh
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.math.transforms import conjugate_quaternion, multiply_quaternions, transform_points
+from tableverse_factory.geometry.mesh.hulls import compute_hull_volume
+from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh
 from tableverse_factory.geometry.relations.preserved import (
     PreservedRelations,
     Relations,
     compare_relations,
-    relations_of,
+    find_relations,
 )
 
-NOT_THERE = "not among the results"
-"""What is said of a scene that has a truth and no result."""
+NO_RESULT = "not among the results"
+"""Error of a scene that has a truth and no result."""
 
 SAME_PLACE = 0.6
-"""Without names, a result's object can stand for a true one within this share of the true box's diagonal."""
+"""Without names, objects match within this share of the diagonal of the true box."""
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
-    """A true object and what the result has for it.
+class ObjectMatch:
+    """A true object and its match in the result.
 
     Attributes:
-        found: Its name in the result; empty where it is missing, and then there are no errors.
-        position_error_m: Distance between the centres of the boxes [m]: of the mesh's own box where both sides have the
+        name: Name of the true object.
+        found: Name of the match; empty without one, and then there are no errors.
+        position_error_m: Distance between the centres of the boxes [m]: of the mesh's own box if both sides have the
             same mesh, as in the certificate and in `bench lccr`; else of the boxes along the axes of the table.
         size_error: Relative error of the size: the cube root of the ratio of the convex hulls' volumes, less 1.
-        heading_error_rad: About the vertical, symmetries of the true shape allowed; None for a round one [rad].
+        heading_error_rad: Error about the vertical up to symmetries; None for a round shape [rad].
     """
 
     name: str
@@ -53,73 +59,74 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class SceneLayout:
-    """One scene.
+    """Comparison of one scene.
 
     Attributes:
-        matches: A true object each.
-        extra: Names of the result's objects that stand for no true one.
-        kept: True relations of support and containment, and those of them that hold in the result.
-        error: Why the scene could not be compared; empty as a rule.
+        name: Name of the scene.
+        matches: One per true object.
+        extra: Names of objects of the result without a true object.
+        kept: True relations of support and containment, and those that hold in the result.
+        error: Reason why the scene could not be compared, or empty.
     """
 
     name: str
-    matches: tuple[Match, ...] = ()
+    matches: tuple[ObjectMatch, ...] = ()
     extra: tuple[str, ...] = ()
     kept: PreservedRelations = field(default_factory=PreservedRelations)
     error: str = ""
 
 
 def compare_layouts(
-    results: Mapping[str, Source], truths: Mapping[str, ReadTruth], cache_dir: Path
+    results: Mapping[str, SceneSource], truths: Mapping[str, ReadTruth], cache_dir: Path
 ) -> tuple[SceneLayout, ...]:
-    """Every scene that has a truth; of one that the results lack, or that cannot be read, all objects are missing."""
+    """Compare every scene with a truth; all objects of a scene without a readable result are missing."""
     compared = []
     for name, read_truth in sorted(truths.items()):
         if name not in results:
-            compared.append(_missing(name, read_truth, NOT_THERE))
+            compared.append(_make_missing(name, read_truth, NO_RESULT))
             continue
         try:
             result = results[name].read()
             compared.append(compare_scene(name, result, read_truth(result), cache_dir))
         except TableverseError as error:
-            compared.append(_missing(name, read_truth, str(error)))
+            compared.append(_make_missing(name, read_truth, str(error)))
     return tuple(compared)
 
 
-def _missing(name: str, read_truth: ReadTruth, error: str) -> SceneLayout:
-    """A scene without a result: what is truly there was not found."""
+def _make_missing(name: str, read_truth: ReadTruth, error: str) -> SceneLayout:
+    """Make the comparison of a scene without a result, with no object found."""
     try:
         truth = read_truth(MethodScene(()))
     except TableverseError as worse:
         return SceneLayout(name, error=f"{error}; {worse}" if str(worse) != error else error)
     names = [*(item.name for item in truth.objects), *truth.missing]
-    return SceneLayout(name, tuple(Match(missing) for missing in names), error=error)
+    return SceneLayout(name, tuple(ObjectMatch(missing) for missing in names), error=error)
 
 
-def compare_scene(name: str, result: MethodScene, truth: Truth, cache_dir: Path) -> SceneLayout:
-    """One scene against its truth.
+def compare_scene(name: str, result: MethodScene, truth: SceneTruth, cache_dir: Path) -> SceneLayout:
+    """Compare one scene with its truth.
 
     Raises:
         GeometryError: if a mesh cannot be cut into convex pieces.
     """
-    pairs = _by_name(result, truth) if truth.named else _by_place(result, truth)
+    pairs = _match_by_name(result, truth) if truth.named else _match_by_position(result, truth)
     used = {item.name for item in pairs if item is not None}
     matches = [
-        Match(true.name) if found is None else _measured(true, found, truth.same_meshes)
+        ObjectMatch(true.name) if found is None else _measure_match(true, found, truth.same_meshes)
         for true, found in zip(truth.objects, pairs, strict=True)
     ]
     return SceneLayout(
         name,
-        (*matches, *(Match(missing) for missing in truth.missing)),
+        (*matches, *(ObjectMatch(missing) for missing in truth.missing)),
         tuple(item.name for item in result.objects if item.name not in used),
-        compare_relations(_relations(truth.objects, cache_dir), _relations(pairs, cache_dir)),
+        compare_relations(_find_relations(truth.objects, cache_dir), _find_relations(pairs, cache_dir)),
     )
 
 
-def summary(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
-    """What the table shows, by the names of its rows; None where there is nothing to measure.
+def summarize_layouts(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
+    """Summarize scenes by row of the table; None where nothing was measured.
 
-    Objects of scenes that are missing count as not found; errors and relations are those of the scenes compared.
+    Objects of missing scenes count as not found; errors and relations are those of the scenes compared.
     """
     sound = [scene for scene in scenes if not scene.error]
     matches = [match for scene in scenes for match in scene.matches]
@@ -132,89 +139,89 @@ def summary(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
         "scenes": len(sound),
         "scenes missing": len(scenes) - len(sound),
         "true objects": len(matches),
-        "found [%]": _ratio(len(found), len(matches)),
+        "found [%]": _compute_percent(len(found), len(matches)),
         "extra objects": sum(len(scene.extra) for scene in sound),
-        "position, median [mm]": _percentile(position, 50.0),
-        "position, p90 [mm]": _percentile(position, 90.0),
-        "size, median [%]": _percentile(size, 50.0),
-        "size, p90 [%]": _percentile(size, 90.0),
+        "position, median [mm]": _compute_percentile(position, 50.0),
+        "position, p90 [mm]": _compute_percentile(position, 90.0),
+        "size, median [%]": _compute_percentile(size, 50.0),
+        "size, p90 [%]": _compute_percentile(size, 90.0),
         "objects with a heading": len(turned),
-        "heading, median [°]": _percentile(turned, 50.0),
-        "heading, p90 [°]": _percentile(turned, 90.0),
+        "heading, median [°]": _compute_percentile(turned, 50.0),
+        "heading, p90 [°]": _compute_percentile(turned, 90.0),
         "support relations": relations.carried,
-        "support kept [%]": _ratio(relations.carried_kept, relations.carried),
+        "support kept [%]": _compute_percent(relations.carried_kept, relations.carried),
         "containment relations": relations.contained,
-        "containment kept [%]": _ratio(relations.contained_kept, relations.contained),
+        "containment kept [%]": _compute_percent(relations.contained_kept, relations.contained),
     }
 
 
-def _by_name(result: MethodScene, truth: Truth) -> list[MethodObject | None]:
+def _match_by_name(result: MethodScene, truth: SceneTruth) -> list[MethodObject | None]:
     named = {item.name: item for item in result.objects}
     return [named.get(true.name) for true in truth.objects]
 
 
-def _by_place(result: MethodScene, truth: Truth) -> list[MethodObject | None]:
-    """The assignment of least total distance between boxes, without pairs that are too far apart.
+def _match_by_position(result: MethodScene, truth: SceneTruth) -> list[MethodObject | None]:
+    """Assign objects by least total distance between boxes, without pairs that are too far apart.
 
-    The distance is that of the lowest and the highest corners, in the mean: what lies in a bowl is not the bowl.
+    The distance is the mean of those of the lowest and the highest corners, so a content does not match its bowl.
     """
-    standing = [np.stack(bounds(_standing(item))) for item in result.objects]
-    true = [np.stack(bounds(_standing(item))) for item in truth.objects]
+    standing = [np.stack(aabb(_place_object(item).vertices)) for item in result.objects]
+    true = [np.stack(aabb(_place_object(item).vertices)) for item in truth.objects]
     distance = np.array([[float(np.linalg.norm(a - b, axis=1).mean()) for b in standing] for a in true])
     reach = np.array([SAME_PLACE * float(np.linalg.norm(high - low)) for low, high in true])
     pairs: list[MethodObject | None] = [None] * len(true)
     if not distance.size:
         return pairs
-    # Beyond its reach a pair costs the same however far: it never pulls another one apart.
+    # Beyond its reach a pair has a constant cost, so that it never breaks another pair.
     for i, j in zip(*linear_sum_assignment(np.minimum(distance, reach[:, None])), strict=True):
         if distance[i, j] < reach[i]:
             pairs[int(i)] = result.objects[int(j)]
     return pairs
 
 
-def _measured(true: MethodObject, found: MethodObject, same_meshes: bool) -> Match:
-    true_mesh, mesh = _standing(true), _standing(found)
-    volumes = hull_volume(mesh.vertices), hull_volume(true_mesh.vertices)
+def _measure_match(true: MethodObject, found: MethodObject, same_meshes: bool) -> ObjectMatch:
+    true_mesh, mesh = _place_object(true), _place_object(found)
+    volumes = compute_hull_volume(mesh.vertices), compute_hull_volume(true_mesh.vertices)
     size = float(np.cbrt(volumes[0] / volumes[1])) - 1.0 if min(volumes) > 0.0 else float("nan")
     if same_meshes:
-        back = true.pose.quaternion_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
-        turned = twist_about_z(multiply_quaternions(found.pose.quaternion_wxyz, back))
-        heading = heading_error_of_same(true_mesh, turned)
-        shift = float(np.linalg.norm(_own_center(found) - _own_center(true)))
+        back = conjugate_quaternion(true.pose.quaternion_wxyz)
+        turned = compute_twist_about_z(multiply_quaternions(found.pose.quaternion_wxyz, back))
+        heading = compute_heading_error_of_same(true_mesh, turned)
+        shift = float(np.linalg.norm(_compute_own_center(found) - _compute_own_center(true)))
     else:
-        heading = heading_error(mesh, true_mesh)
+        heading = compute_heading_error(mesh, true_mesh)
         shift = float(np.linalg.norm(box_center(mesh) - box_center(true_mesh)))
-    return Match(true.name, found.name, shift, size, heading)
+    return ObjectMatch(true.name, found.name, shift, size, heading)
 
 
-def _relations(items: Sequence[MethodObject | None], cache_dir: Path) -> Relations:
-    """Relations by the places in the list; what is missing has none."""
-    there = [(index, item) for index, item in enumerate(items) if item is not None]
-    poses, scales = [item.pose for _, item in there], [item.scale for _, item in there]
-    pieces = [item.pieces or decompose(item.mesh, RectifyConfig(), cache_dir) for _, item in there]
-    objects = [PlacedObject(item.name, "", 1.0, item.mesh, item.scale, item.pose) for _, item in there]
-    found = relations_of(objects, pieces, poses, scales)
+def _find_relations(items: Sequence[MethodObject | None], cache_dir: Path) -> Relations:
+    """Find relations by index in the list; missing objects have none."""
+    present = [(index, item) for index, item in enumerate(items) if item is not None]
+    poses, scales = [item.pose for _, item in present], [item.scale for _, item in present]
+    pieces = [item.pieces or decompose(item.mesh, RectifyConfig(), cache_dir) for _, item in present]
+    objects = [PlacedObject(item.name, "", 1.0, item.mesh, item.scale, item.pose) for _, item in present]
+    found = find_relations(objects, pieces, poses, scales)
     carried, on_pieces, contained = (
-        frozenset((there[i][0], there[j][0]) for i, j in pairs)
+        frozenset((present[i][0], present[j][0]) for i, j in pairs)
         for pairs in (found.carried, found.carried_on_pieces, found.contained)
     )
     return Relations(carried, on_pieces, contained)
 
 
-def _standing(item: MethodObject) -> TriangleMesh:
-    return placed_mesh(item.mesh, item.pose, item.scale)
+def _place_object(item: MethodObject) -> TriangleMesh:
+    return place_mesh(item.mesh, item.pose, item.scale)
 
 
-def _own_center(item: MethodObject) -> Vector3:
-    """Where the centre of the mesh's own box stands [m]: turning the object does not move it about."""
+def _compute_own_center(item: MethodObject) -> Vector3:
+    """Compute the centre of the mesh's own box in the scene [m], which turning the object does not move."""
     center: Vector3 = transform_points(item.pose, box_center(item.mesh)[None], item.scale)[0]
     return center
 
 
-def _percentile(values: Sequence[float], percent: float) -> float | None:
+def _compute_percentile(values: Sequence[float], percent: float) -> float | None:
     sound = [value for value in values if np.isfinite(value)]
     return float(np.percentile(sound, percent)) if sound else None
 
 
-def _ratio(some: int, of: int) -> float | None:
+def _compute_percent(some: int, of: int) -> float | None:
     return 100.0 * some / of if of else None

@@ -1,4 +1,4 @@
-"""Which methods are compared, as a user names them."""
+"""Methods to compare, from command-line arguments."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,8 +8,8 @@ from tableverse_factory.core.errors import InputError
 MAX_METHODS = 12
 
 
-def named_methods(paths: Sequence[Path], named: Sequence[str]) -> dict[str, Path]:
-    """Methods by their names, in the order given: bare paths first, named after their last part, then `NAME=PATH`.
+def parse_methods(paths: Sequence[Path], named: Sequence[str]) -> dict[str, Path]:
+    """Parse methods by name: paths first, named after their last part, then `NAME=PATH`.
 
     Raises:
         InputError: `bad_method` if there is none or too many, two have one name, or an entry lacks its name.

@@ -1,4 +1,4 @@
-"""Scenes of any method, whatever their format: what every measure of `tableverse evaluate` reads."""
+"""Scenes of any method and format, the input of every measure of `tableverse evaluate`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,12 +12,13 @@ class MethodObject(Frozen):
     """One object of a scene: `vertex_world = R(q) @ (scale * vertex) + position`, z up.
 
     Attributes:
-        name: Its id in the scene.
-        mesh: Its shape as one mesh, in its own frame: all that is seen, and solids that nothing seen stands for.
-        looks: What is seen, with colours, part by part.
-        pose: Its own frame in the scene.
-        pieces: Its own convex pieces where it brings them (MJCF), else None.
-        baked_scale: Scale that an export has put into the mesh already.
+        name: Id in the scene.
+        mesh: Shape as one mesh in its own frame: visual meshes, and solids without a visual mesh.
+        looks: Visual meshes with colours.
+        pose: Pose in the scene.
+        scale: Scale of the mesh.
+        pieces: Convex pieces if the file has them (MJCF), else None.
+        baked_scale: Scale that an export has already applied to the mesh.
     """
 
     name: str
@@ -31,12 +32,12 @@ class MethodObject(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class MethodScene:
-    """What one method made of one picture.
+    """A scene that one method made from one picture.
 
     Attributes:
-        objects: All but the table.
-        left_out: Names of what was taken for the table.
-        camera_to_scene: Pose of the picture's camera (OpenCV axes), where it is known.
+        objects: All objects but the table.
+        left_out: Names of bodies taken for the table.
+        camera_to_scene: Pose of the camera of the picture (OpenCV axes), if known.
     """
 
     objects: tuple[MethodObject, ...]
@@ -45,13 +46,13 @@ class MethodScene:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """A scene that can be read when its turn comes.
+class SceneSource:
+    """A scene that is read lazily.
 
     Attributes:
-        name: By which methods are compared: of the layout file, the GLB, the scene's folder, or the scene's id.
+        name: Name by which methods are matched: of the file or folder, or the scene id.
         format: `layout`, `glb`, `mjcf` or `dataset`.
-        read: Reads it; raises `TableverseError` where it cannot be read.
+        read: Reads the scene; raises `TableverseError` if it cannot be read.
     """
 
     name: str

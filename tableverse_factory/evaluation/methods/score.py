@@ -1,4 +1,4 @@
-"""The GPT-Score (paper, section 4 and table 1): means of a judge's marks over scenes, with bootstrap intervals."""
+"""GPT-Score (paper, section 4 and table 1): means of a judge's marks over scenes with bootstrap intervals."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,24 +9,24 @@ import numpy as np
 from jaxtyping import Float64
 
 from tableverse_factory.core.errors import ModelAccessError, TableverseError
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.evaluation.methods.comparison import Comparison
-from tableverse_factory.evaluation.methods.grid import letters
-from tableverse_factory.evaluation.methods.grid_judges import GridJudge, record
-from tableverse_factory.evaluation.methods.vlm_vote import METRICS, Question, Vote, questions
+from tableverse_factory.evaluation.methods.grid import make_letters
+from tableverse_factory.evaluation.methods.grid_judges import GridJudge, record_vote
+from tableverse_factory.evaluation.methods.vlm_vote import METRICS, Question, Vote, make_questions
 
 RESAMPLES = 2000
 MIN_SCENES = 5
-"""Fewer scenes say nothing of how they spread."""
+"""Least scenes for an interval."""
 
 LOW, HIGH = 2.5, 97.5
-"""Percentiles of the resampled means between which the true one lies with 95 % confidence."""
+"""Percentiles of the resampled means that bound the 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A mean over scenes and its 95 % bootstrap interval, None where there are fewer than `MIN_SCENES`."""
+    """A mean over scenes and its 95 % bootstrap interval; None for fewer than `MIN_SCENES` scenes."""
 
     mean: float
     low: float | None
@@ -34,8 +34,8 @@ class Interval:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
-    """A question without a ballot, and why."""
+class RefusedQuestion:
+    """A question without a valid answer, and the reason."""
 
     scene: str
     round: int
@@ -44,17 +44,11 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class VoteResults:
-    """All that was asked.
-
-    Attributes:
-        methods: In the order in which they were given.
-        ballots: Those that count.
-        refused: The rest.
-    """
+    """Results of all questions: the methods in the given order, valid votes, and refused questions."""
 
     methods: tuple[str, ...]
-    ballots: tuple[Vote, ...]
-    refused: tuple[Refused, ...]
+    votes: tuple[Vote, ...]
+    refused: tuple[RefusedQuestion, ...]
 
 
 def ask_all(
@@ -65,65 +59,65 @@ def ask_all(
     out: Path | None = None,
     watch: Callable[[Sequence[Question]], Iterable[Question]] = iter,
 ) -> VoteResults:
-    """Asks the judge about every scene that all methods have, `rounds` times each.
+    """Ask the judge about every scene that all methods have, `rounds` times each.
 
-    With a folder `out`, each grid that is looked at goes to `out/grids` and each ballot to `out/answers`, at once.
+    With a folder `out`, each grid is written to `out/grids` and each vote to `out/answers` at once.
 
     Args:
         comparison: The methods.
-        judge: Who is asked.
-        rounds: Times each scene is asked about.
-        seed: Of the order of columns.
+        judge: The judge.
+        rounds: Questions per scene.
+        seed: Seed of the order of columns.
         out: Folder to write to, or None.
-        watch: Passes the questions on and shows how far they are.
+        watch: Passes the questions on and shows progress.
 
     Raises:
-        ModelAccessError: if asking further is of no use: no key, no credit.
+        ModelAccessError: if further questions are pointless: no key, no credit.
     """
-    ballots: list[Vote] = []
-    refused: list[Refused] = []
-    for question in watch(_all_questions(comparison, rounds, seed)):
+    answered: list[Vote] = []
+    refused: list[RefusedQuestion] = []
+    for question in watch(_list_questions(comparison, rounds, seed)):
         try:
-            ballots.append(judge.vote(question, partial(_grid, comparison, question, out)))
+            answered.append(judge.vote(question, partial(_draw_grid, comparison, question, out)))
         except ModelAccessError:
             raise
         except TableverseError as error:
-            refused.append(Refused(question.scene, question.round, str(error)))
+            refused.append(RefusedQuestion(question.scene, question.round, str(error)))
             continue
         if out is not None:
-            record(ballots[-1], out / "answers")
-    return VoteResults(comparison.methods, tuple(ballots), tuple(refused))
+            record_vote(answered[-1], out / "answers")
+    return VoteResults(comparison.methods, tuple(answered), tuple(refused))
 
 
 def write_grids(comparison: Comparison, rounds: int, seed: int, out: Path) -> int:
-    """Writes every grid and asks nobody; returns how many.
+    """Write every grid without asking a judge; return their number.
 
     Raises:
         InputError: if a scene or its picture cannot be read.
     """
-    asked = _all_questions(comparison, rounds, seed)
+    asked = _list_questions(comparison, rounds, seed)
     for question in asked:
-        _grid(comparison, question, out)
+        _draw_grid(comparison, question, out)
     return len(asked)
 
 
-def _grid(comparison: Comparison, question: Question, out: Path | None) -> bytes:
+def _draw_grid(comparison: Comparison, question: Question, out: Path | None) -> bytes:
     data = comparison.grid(question)
     if out is not None:
         write_atomic(out / "grids" / f"{question.name}.png", data)
     return data
 
 
-def results(election: VoteResults, seed: int) -> dict[str, dict[str, Interval]]:
-    """Means by method and metric (`METRICS`), over scenes; the same scenes are drawn for every method.
+def compute_results(votes: VoteResults, seed: int) -> dict[str, dict[str, Interval]]:
+    """Compute means by method and metric (`METRICS`) over scenes, resampling the same scenes for every method.
 
-    Rounds of one scene are averaged first: they are not independent.
+    Rounds of one scene are averaged first, as they are not independent.
     """
-    table = _scene_means(election)
+    table = _compute_scene_means(votes)
     if not table.shape[0]:
         return {}
-    rng = rng_for(seed, "bootstrap", "gpt-score")
-    # How often each scene is drawn, not which: a matrix of counts, whatever the number of methods.
+    rng = make_rng(seed, "bootstrap", "gpt-score")
+    # Counts of draws per scene, one matrix for all methods.
     counts = rng.multinomial(len(table), np.full(len(table), 1.0 / len(table)), RESAMPLES)
     resampled = (counts @ table.reshape(len(table), -1) / len(table)).reshape(RESAMPLES, *table.shape[1:])
     means, bounds = table.mean(axis=0), np.percentile(resampled, (LOW, HIGH), axis=0)
@@ -133,56 +127,56 @@ def results(election: VoteResults, seed: int) -> dict[str, dict[str, Interval]]:
             metric: Interval(float(means[i, k]), *(map(float, bounds[:, i, k]) if enough else (None, None)))
             for k, metric in enumerate(METRICS)
         }
-        for i, method in enumerate(election.methods)
+        for i, method in enumerate(votes.methods)
     }
 
 
-def rank_by_column(election: VoteResults) -> dict[str, float]:
-    """Mean rank that each column got, whoever stood there: all alike where the judge minds no places."""
-    found: dict[str, list[int]] = {letter: [] for letter in letters(len(election.methods))}
-    for ballot in election.ballots:
-        for letter, method in zip(found, ballot.columns, strict=True):
-            found[letter].append(ballot.marks[method].rank)
+def compute_rank_by_column(votes: VoteResults) -> dict[str, float]:
+    """Compute the mean rank of each column over all methods; they are alike for a judge without position bias."""
+    found: dict[str, list[int]] = {letter: [] for letter in make_letters(len(votes.methods))}
+    for vote in votes.votes:
+        for letter, method in zip(found, vote.columns, strict=True):
+            found[letter].append(vote.marks[method].rank)
     return {letter: float(np.mean(ranks)) for letter, ranks in found.items() if ranks}
 
 
-def _all_questions(comparison: Comparison, rounds: int, seed: int) -> list[Question]:
+def _list_questions(comparison: Comparison, rounds: int, seed: int) -> list[Question]:
     scenes = comparison.scenes
-    return [question for scene in scenes for question in questions(scene, comparison.methods, rounds, seed)]
+    return [question for scene in scenes for question in make_questions(scene, comparison.methods, rounds, seed)]
 
 
-def _scene_means(election: VoteResults) -> Float64[np.ndarray, "s m 4"]:
-    """Marks by scene, method and metric."""
+def _compute_scene_means(votes: VoteResults) -> Float64[np.ndarray, "s m 4"]:
+    """Compute mean marks by scene, method and metric."""
     by_scene: dict[str, list[Vote]] = {}
-    for ballot in election.ballots:
-        by_scene.setdefault(ballot.scene, []).append(ballot)
-    rows = [np.mean([_marks(ballot, election.methods) for ballot in its], axis=0) for its in by_scene.values()]
-    return np.array(rows, dtype=np.float64).reshape(len(rows), len(election.methods), len(METRICS))
+    for vote in votes.votes:
+        by_scene.setdefault(vote.scene, []).append(vote)
+    rows = [np.mean([_list_marks(vote, votes.methods) for vote in its], axis=0) for its in by_scene.values()]
+    return np.array(rows, dtype=np.float64).reshape(len(rows), len(votes.methods), len(METRICS))
 
 
-def _marks(ballot: Vote, methods: Sequence[str]) -> list[list[float]]:
-    return [[float(getattr(ballot.marks[method], metric)) for metric in METRICS] for method in methods]
+def _list_marks(vote: Vote, methods: Sequence[str]) -> list[list[float]]:
+    return [[float(getattr(vote.marks[method], metric)) for metric in METRICS] for method in methods]
 
 
-def interval_text(value: Interval) -> str:
-    """`7.14 (6.90–7.35)`, and `7.14` without an interval."""
+def format_interval(value: Interval) -> str:
+    """Format `7.14 (6.90–7.35)`, or `7.14` without an interval."""
     if value.low is None or value.high is None:
         return f"{value.mean:.2f}"
     return f"{value.mean:.2f} ({value.low:.2f}–{value.high:.2f})"
 
 
-def as_json(election: VoteResults, seed: int) -> dict[str, object]:
-    """What a script reads."""
-    means: Mapping[str, Mapping[str, Interval]] = results(election, seed)
+def results_to_json(votes: VoteResults, seed: int) -> dict[str, object]:
+    """Return plain values for JSON."""
+    means: Mapping[str, Mapping[str, Interval]] = compute_results(votes, seed)
     return {
         "methods": {
             method: {metric: {"mean": its.mean, "low": its.low, "high": its.high} for metric, its in by_metric.items()}
             for method, by_metric in means.items()
         },
-        "scenes": len({ballot.scene for ballot in election.ballots}),
-        "ballots": len(election.ballots),
-        "rank_by_column": rank_by_column(election),
-        "refused": [{"scene": r.scene, "round": r.round, "reason": r.reason} for r in election.refused],
+        "scenes": len({vote.scene for vote in votes.votes}),
+        "ballots": len(votes.votes),
+        "rank_by_column": compute_rank_by_column(votes),
+        "refused": [{"scene": r.scene, "round": r.round, "reason": r.reason} for r in votes.refused],
         "seed": seed,
         "resamples": RESAMPLES,
     }

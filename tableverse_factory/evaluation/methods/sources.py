@@ -1,4 +1,4 @@
-"""Where the scenes of a method lie: datasets, layout files, GLB files, MJCF files, folders of them."""
+"""Discovery of the scenes of a method: datasets, layout files, GLB files, MJCF files, and folders of them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,35 +14,35 @@ from schemas.config import ObserveConfig
 from schemas.geometry import ConvexPieces, Pose
 from schemas.layout import LayoutPose
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, finite_number, parse_json, read_bytes
+from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_finite, parse_json, read_bytes
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.delivery.formats.folders import scene_file, scene_folders
-from tableverse_factory.delivery.formats.model_contents import ModelObject, VisualMesh, contents_of, is_table
+from tableverse_factory.delivery.formats.folders import find_scene_file, list_scene_folders
+from tableverse_factory.delivery.formats.model_contents import ModelObject, VisualMesh, is_table, read_model_contents
 from tableverse_factory.evaluation.methods.glb import GREY, read_glb_scene
-from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, SceneSource
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes
 from tableverse_factory.physics.mjcf.file_check import load_mjcf
-from tableverse_factory.physics.simulate.model_solids import joined
 from tableverse_factory.sources.discovery import is_source_file
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
 
 WORLD = "world"
-"""MuJoCo's name for the body that all others stand in."""
+"""Name of the world body in MuJoCo."""
 
 
-def find_scenes(path: Path) -> list[Source]:
-    """The scenes at a path, sorted by name.
+def find_scenes(path: Path) -> list[SceneSource]:
+    """Find the scenes at a path, sorted by name.
 
-    A file is a layout (.json), a GLB or an MJCF scene (.xml). A folder is one of our datasets; or a scene as the
-    authors of TableVerse release theirs (XML, assets and scene.glb, of which the XML is read); or a folder of such
-    files or folders. Layouts come first: beside them, other files are taken for their meshes.
+    A file is a layout (.json), a GLB or an MJCF scene (.xml). A folder is one of our datasets; or a scene as released
+    by the authors of TableVerse (XML, assets and scene.glb, of which the XML is read); or a folder of such files or
+    folders. Layouts have priority: other files beside them are taken for their meshes.
 
     Raises:
         InputError: `no_scenes` if there is none.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", "no_scenes")
-    sources = _file(path, path.parent) if path.is_file() else _folder(path)
+    sources = _find_in_file(path, path.parent) if path.is_file() else _find_in_folder(path)
     if not sources:
         raise InputError(
             f"{path}: no scenes; give a dataset, or layouts (*.json), GLB or MJCF scenes, or a folder of scene folders",
@@ -51,33 +51,33 @@ def find_scenes(path: Path) -> list[Source]:
     return sorted(sources, key=lambda source: source.name)
 
 
-def _file(path: Path, root: Path) -> list[Source]:
-    """One scene, named after its file; what an MJCF names lies below `root`."""
+def _find_in_file(path: Path, root: Path) -> list[SceneSource]:
+    """Make the source of one scene, named after its file; files that an MJCF names must be below `root`."""
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: give a file that ends in {', '.join(_READERS)}", "no_scenes")
     kind, read = reader
-    return [Source(path.stem, kind, partial(read_mjcf, path, root) if read is read_mjcf else partial(read, path))]
+    return [SceneSource(path.stem, kind, partial(read_mjcf, path, root) if read is read_mjcf else partial(read, path))]
 
 
-def _folder(folder: Path) -> list[Source]:
+def _find_in_folder(folder: Path) -> list[SceneSource]:
     if (folder / "run.json").is_file():
-        return _dataset(folder)
-    if (scene := scene_file(folder)) is not None:
-        return [_named(scene, folder.name, folder)]
+        return _find_in_dataset(folder)
+    if (scene := find_scene_file(folder)) is not None:
+        return [_make_named_source(scene, folder.name, folder)]
     entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     layouts = [entry for entry in entries if entry.suffix.lower() == ".json" and not is_source_file(entry.name)]
     if any(_looks_like_layout(entry) for entry in layouts):
-        return [source for entry in layouts for source in _file(entry, folder)]
+        return [source for entry in layouts for source in _find_in_file(entry, folder)]
     files = [entry for entry in entries if entry.is_file() and entry.suffix.lower() in (".glb", ".xml")]
     return [
-        *(source for entry in files for source in _file(entry, folder)),
-        *(_named(file, name, folder) for name, file in scene_folders(folder)),
+        *(source for entry in files for source in _find_in_file(entry, folder)),
+        *(_make_named_source(file, name, folder) for name, file in list_scene_folders(folder)),
     ]
 
 
-def _named(scene: Path, name: str, root: Path) -> Source:
-    return replace(_file(scene, root)[0], name=name)
+def _make_named_source(scene: Path, name: str, root: Path) -> SceneSource:
+    return replace(_find_in_file(scene, root)[0], name=name)
 
 
 def _looks_like_layout(path: Path) -> bool:
@@ -88,14 +88,14 @@ def _looks_like_layout(path: Path) -> bool:
     return isinstance(value, dict) and isinstance(value.get("objects"), list)
 
 
-def _dataset(folder: Path) -> list[Source]:
+def _find_in_dataset(folder: Path) -> list[SceneSource]:
     dataset = open_dataset(folder)
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"]).column(0).to_pylist()
-    return [Source(scene_id, "dataset", partial(_read_exported, dataset, scene_id)) for scene_id in done]
+    return [SceneSource(scene_id, "dataset", partial(_read_exported, dataset, scene_id)) for scene_id in done]
 
 
-def dropped_scenes(path: Path) -> int | None:
-    """How many scenes of a dataset are not done: dropped, or failed. None where the path is no dataset of ours."""
+def count_dropped_scenes(path: Path) -> int | None:
+    """Count the dropped and failed scenes of a dataset; None if the path is not one of our datasets."""
     if not (path / "run.json").is_file():
         return None
     return int(open_dataset(path).scenes.count_rows(filter=pc.field("status") != "done"))
@@ -103,61 +103,63 @@ def dropped_scenes(path: Path) -> int | None:
 
 def _read_exported(dataset: Dataset, scene_id: str) -> MethodScene:
     exported = dataset.scene(scene_id)
-    scene, meta = scene_of_model(exported.model()), exported.meta
-    scales = {str(entry["object_id"]): _scale(entry, f"{scene_id}: meta.json") for entry in meta.get("objects", ())}
+    scene, meta = read_model_scene(exported.model()), exported.meta
+    scales = {
+        str(entry["object_id"]): _read_scale(entry, f"{scene_id}: meta.json") for entry in meta.get("objects", ())
+    }
     objects = tuple(replace(item, baked_scale=scales.get(item.name, 1.0)) for item in scene.objects)
     camera = meta.get("camera_to_table")
     return replace(scene, objects=objects, camera_to_scene=None if camera is None else read_pose(camera))
 
 
-def _scale(entry: Mapping[str, Any], where: str) -> float:
-    scale = finite_number(entry.get("scale"))
+def _read_scale(entry: Mapping[str, Any], where: str) -> float:
+    scale = parse_finite(entry.get("scale"))
     if scale is None or scale <= 0.0:
         raise InputError(f"{where}: scale {entry.get('scale')!r:.60} of {entry['object_id']!r:.60}", "bad_meta")
     return scale
 
 
 def read_pose(value: Mapping[str, Any]) -> Pose:
-    """A pose as our JSON files write it.
+    """Read a pose of our JSON files.
 
     Raises:
-        InputError: `bad_pose` if it is none.
+        InputError: `bad_pose` for an invalid pose.
     """
     try:
         given = LayoutPose.model_validate({key: value[key] for key in ("position", "quaternion_wxyz")})
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{value!r:.200} is no pose: give position and quaternion_wxyz", "bad_pose") from error
-    return Pose(np.array(given.position), normalized_quaternion(np.array(given.quaternion_wxyz)))
+        raise InputError(f"{value!r:.200} is not a pose: give position and quaternion_wxyz", "bad_pose") from error
+    return Pose(np.array(given.position), normalize_quaternion(np.array(given.quaternion_wxyz)))
 
 
 def read_mjcf(path: Path, root: Path | None = None) -> MethodScene:
-    """The objects of an MJCF file with the shapes that collide; it may name files below `root` alone (`load_mjcf`).
+    """Read the objects of an MJCF file with their collision shapes; it may name only files below `root`.
 
     Raises:
-        InputError: `bad_mjcf` if it names others or too many, or MuJoCo does not load it.
+        InputError: `bad_mjcf` if it names other or too many files, or MuJoCo cannot load it.
     """
-    return scene_of_model(load_mjcf(path, root))
+    return read_model_scene(load_mjcf(path, root))
 
 
-def scene_of_model(model: mujoco.MjModel) -> MethodScene:
-    """The objects of a compiled model in its initial state: every solid body on the world but the table.
+def read_model_scene(model: mujoco.MjModel) -> MethodScene:
+    """Read the objects of a compiled model in its initial state: every solid body but the table.
 
-    Whether a body can move makes no difference: one that is fixed beside others may lie inside them all the same.
+    Fixed bodies count too, since they may overlap others.
     """
-    contents = contents_of(model)
+    contents = read_model_contents(model)
     fixed = tuple(its for its in contents.still if its.hulls and its.name != WORLD and not is_table(its.name))
-    objects = tuple(_item(content) for content in (*contents.objects, *fixed) if content.looks)
+    objects = tuple(_build_object(content) for content in (*contents.objects, *fixed) if content.looks)
     return MethodScene(objects, tuple(content.name for content in contents.still if content not in fixed))
 
 
-def _item(content: ModelObject) -> MethodObject:
-    mesh = joined([*(look.mesh for look in content.looks), *content.unseen])
+def _build_object(content: ModelObject) -> MethodObject:
+    mesh = concatenate_meshes([*(look.mesh for look in content.looks), *content.unseen])
     pieces = ConvexPieces(content.hulls, 1.0, 0.0, "given")
     return MethodObject(content.name, mesh, content.looks, content.pose, pieces=pieces)
 
 
 def read_layout_scene(path: Path) -> MethodScene:
-    """The objects of a layout file (`schemas.layout`).
+    """Read the objects of a layout file (`schemas.layout`).
 
     Raises:
         InputError: as `read_layout_file` and `read_layout_meshes`.

@@ -1,4 +1,4 @@
-"""What a judge is asked about one grid, and what counts as an answer (paper, appendix C.3)."""
+"""Prompt, answer schema and validation of the judge's vote on a grid (paper, appendix C.3)."""
 
 import json
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from tableverse_factory.models.remote.json_schema import INTEGER, STRING, Schema
 from tableverse_factory.models.remote.json_text import parse_json_object, validate_answer
 
 METRICS = ("layout_fidelity", "visual_quality", "geometry_quality", "rank")
-"""What a method gets from each ballot: three scores from 1 to 10, and its place, 1 being the best."""
+"""Marks of a method in each vote: three scores from 1 to 10, and its rank, 1 being the best."""
 
 Points = Annotated[StrictInt, Field(ge=1, le=10)]
 
@@ -56,7 +56,7 @@ class Question:
     """One grid: a scene, and which method stands in which column.
 
     Attributes:
-        round: How often the scene has been asked about before, with the columns moved on by one each time.
+        round: Number of earlier questions about the scene; the columns rotate by one each time.
         columns: The methods from the left.
     """
 
@@ -66,13 +66,13 @@ class Question:
 
     @property
     def name(self) -> str:
-        """Of its files."""
+        """Name of its files."""
         return f"{self.scene}-{self.round}"
 
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """An answer with the methods in their places.
+    """An answer with the marks by method.
 
     Attributes:
         columns: The methods from the left, as they were shown.
@@ -129,22 +129,22 @@ Answer with one JSON object and nothing else:
 
 
 def build_vote_schema(count: int) -> Schema:
-    """JSON schema of the answer, without bounds: servers refuse large grammars; `parse_vote` checks them."""
+    """Build the JSON schema of the answer, without bounds: servers refuse large grammars, `parse_vote` checks them."""
     marks = object_of({**dict.fromkeys(METRICS, INTEGER), "reason": STRING})
     return object_of({"columns": object_of(dict.fromkeys(make_letters(count), marks))})
 
 
 def parse_vote(text: str, count: int) -> GridAnswer:
-    """A model's words as an answer about `count` columns.
+    """Parse the answer of a model about `count` columns.
 
     Raises:
-        AnswerInvalidError: if it is no JSON, marks are out of bounds, columns are missing or ranks shared.
+        AnswerInvalidError: if it is not JSON, marks are out of bounds, columns are missing or ranks shared.
     """
     return validate_vote(parse_json_object(text), count)
 
 
 def validate_vote(value: Any, count: int) -> GridAnswer:
-    """The same of a JSON value.
+    """Validate the JSON value of an answer.
 
     Raises:
         AnswerInvalidError: as `parse_vote`.
@@ -156,7 +156,7 @@ def validate_vote(value: Any, count: int) -> GridAnswer:
 
 
 def make_vote(question: Question, answer: GridAnswer) -> Vote:
-    """The marks back with the methods that stood in the columns."""
+    """Assign the marks of the columns to their methods."""
     named = zip(make_letters(len(question.columns)), question.columns, strict=True)
     marks = {method: answer.columns[letter] for letter, method in named}
     return Vote(question.scene, question.round, question.columns, marks)

@@ -1,7 +1,4 @@
-"""What two closed meshes have to do with each other, before they are made solids.
-
-Nothing, where a plane parts them; else the parts of them that matter, a few faces in place of thousands.
-"""
+"""Broad phase for two closed meshes, before they are made solids: a separating plane, or the parts that may overlap."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,19 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.geometry import Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.aabb import aabb, size_around
+from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 
-MOST = 0.5
-"""With more of its vertices on the neighbour's side, the whole mesh is as good: it is made a solid once for all."""
+MAX_CROPPED_SHARE = 0.5
+"""With more of its vertices in the half-space a mesh is not cropped: its whole solid is made once for all."""
 
-STEPS = 20
-"""A plane between two things that stand beside each other is nearly always found by the third."""
+MAX_STEPS = 20
+"""Of Gilbert's walk: a plane between two objects beside each other is nearly always found by the third."""
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _TINY = np.finfo(np.float64).tiny
 
-_ASKEW = np.array([0.0137, 0.0219, 0.0321])
-"""Off every plane of symmetry, as a share of the extent."""
+_APEX_OFFSET = np.array([0.0137, 0.0219, 0.0321])
+"""Share of the extent: off every plane of symmetry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +27,8 @@ class OverlapSlab:
 
     Attributes:
         normal: The direction, a unit vector.
-        low: The first set has nothing before it [m].
-        high: The second set has nothing beyond it [m].
+        low: Least coordinate of the first set [m].
+        high: Greatest coordinate of the second set [m].
     """
 
     normal: Vector3
@@ -40,19 +37,19 @@ class OverlapSlab:
 
     @property
     def is_gap(self) -> bool:
-        """Whether a plane parts the sets, so that their hulls share nothing."""
+        """Whether a plane separates the sets."""
         return self.low > self.high
 
 
-def slab_between(a: Points, b: Points) -> OverlapSlab:
-    """A gap between two sets of points, if one is soon found; else a slab that holds few points of both.
+def find_separating_slab(a: Points, b: Points) -> OverlapSlab:
+    """Find a gap between two sets of points; else a slab that holds few points of both.
 
     Gilbert's walk (1966) towards the shortest difference of their hulls: each step is a direction. Where it finds no
     gap, the narrowest slab it saw is compared with those along the axes.
     """
-    step = _middle(a) - _middle(b)
+    step = _box_middle(a) - _box_middle(b)
     narrow: OverlapSlab | None = None
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         length = float(np.linalg.norm(step))
         if length == 0.0:
             break
@@ -66,15 +63,15 @@ def slab_between(a: Points, b: Points) -> OverlapSlab:
             narrow = slab
         onward = a[first] - b[last] - step
         step = step + min(max(-float(step @ onward) / max(float(onward @ onward), _TINY), 0.0), 1.0) * onward
-    return _emptiest(a, b, [*_AXES, *([] if narrow is None else [narrow.normal])])
+    return _find_emptiest_slab(a, b, [*_AXES, *([] if narrow is None else [narrow.normal])])
 
 
-def overlapping_regions(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | None:
-    """A closed mesh that bounds the same volume as the given one where `x @ normal < high`, and any beyond.
+def crop_to_half_space(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | None:
+    """Simplify a closed mesh outside a half-space; inside, `x @ normal < high`, it bounds the same volume.
 
-    What does not reach into that half-space is drawn together into one point far beyond it: whatever becomes of the
-    faces there, they stay beyond, for a half-space's complement is convex. The point is none of the mesh's own and lies
-    askew, or faces would be folded within a plane of the mesh, which manifold3d takes for degenerate and mends wrongly.
+    Vertices of faces that do not reach into the half-space collapse into one point far beyond it. As the complement of
+    a half-space is convex, the collapsed faces stay beyond. The point lies off all planes of the mesh: manifold3d takes
+    faces folded within a plane for degenerate and mends them wrongly.
 
     Args:
         mesh: Closed, of one shell.
@@ -82,11 +79,11 @@ def overlapping_regions(mesh: TriangleMesh, normal: Vector3, high: float) -> Tri
         high: Where the half-space ends [m].
 
     Returns:
-        None where more than `MOST` of the vertices are in the half-space: nothing would be gained.
+        None where more than `MAX_CROPPED_SHARE` of the vertices are in the half-space.
     """
     along = mesh.vertices @ normal
     inside = along < high
-    if np.count_nonzero(inside) > MOST * len(inside):
+    if np.count_nonzero(inside) > MAX_CROPPED_SHARE * len(inside):
         return None
     kept = np.zeros(len(inside), dtype=bool)
     kept[mesh.faces[inside[mesh.faces].any(axis=1)]] = True
@@ -97,14 +94,13 @@ def overlapping_regions(mesh: TriangleMesh, normal: Vector3, high: float) -> Tri
     number[kept] = np.arange(count, dtype=np.int32)
     faces = number[mesh.faces]
     whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    extent = float(size_around(mesh.vertices).max())
-    beyond = _middle(mesh.vertices) + extent * _ASKEW
+    extent = float(aabb_size(mesh.vertices).max())
+    beyond = _box_middle(mesh.vertices) + extent * _APEX_OFFSET
     beyond += (float(along.max()) + extent - float(beyond @ normal)) * normal
     return TriangleMesh(np.concatenate([mesh.vertices[kept], beyond[None]]), faces[whole])
 
 
-def _emptiest(a: Points, b: Points, normals: Sequence[Vector3]) -> OverlapSlab:
-    """Of the slabs across some directions, the one that holds the fewest points."""
+def _find_emptiest_slab(a: Points, b: Points, normals: Sequence[Vector3]) -> OverlapSlab:
     stacked = np.array(normals)
     along_a, along_b = a @ stacked.T, b @ stacked.T
     low, high = along_a.min(axis=0), along_b.max(axis=0)
@@ -113,7 +109,6 @@ def _emptiest(a: Points, b: Points, normals: Sequence[Vector3]) -> OverlapSlab:
     return OverlapSlab(stacked[k], float(low[k]), float(high[k]))
 
 
-def _middle(points: Points) -> Vector3:
+def _box_middle(points: Points) -> Vector3:
     low, high = aabb(points)
-    middle: Vector3 = (low + high) / 2
-    return middle
+    return (low + high) / 2

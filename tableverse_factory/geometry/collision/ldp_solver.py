@@ -13,48 +13,48 @@ Rows = Float64[np.ndarray, "m n"]
 Values = Float64[np.ndarray, " n"]
 Bounds = Float64[np.ndarray, " m"]
 Owners = Int64[np.ndarray, " m"]
-"""Which constraints belong together; -1 for those that never give way."""
+"""Group of each constraint; -1 for those that never give way."""
 
-INFEASIBLE = 1e-8
+INFEASIBLE_RESIDUAL = 1e-8
 """Residual of the dual below which no point satisfies all constraints (1 where none binds)."""
 
-ITERATIONS = 10
-"""The solver may take this many iterations for each unknown; a few are usual."""
-ROUNDS = 30
-VIOLATED = 1e-9
-"""In a round the constraints violated by more than this are taken up."""
+ITERATIONS_PER_UNKNOWN = 10
+"""A few are usual."""
+MAX_ROUNDS = 30
+VIOLATION_TOLERANCE = 1e-9
+"""Constraints violated by more than this become active in the next round."""
 
 
-class TooMuchWorkError(SolverError):
-    """A problem costs more than is left of the work allowed; it was not begun."""
+class WorkLimitError(SolverError):
+    """A problem costs more than is left of the work allowed; it was not started."""
 
 
 class SolverEffort:
-    """The work that a sequence of problems may cost; it is counted, not timed, so that the same work ends the same."""
+    """Budget of work for a sequence of problems; it is counted, not timed, so that results repeat."""
 
     def __init__(self, most: float = np.inf) -> None:
         self._left = float(most)
 
     def spend(self, work: float, what: str) -> None:
-        """Counts a problem before it is solved; what is refused costs nothing, so that smaller ones may still follow.
+        """Charge a problem before it is solved; a refused one costs nothing, so that smaller ones may still follow.
 
         Args:
-            work: In the unit of what is allowed.
+            work: In the unit of the budget.
             what: The problem, for the message.
 
         Raises:
             TooMuchWorkError: if it costs more than is left.
         """
         if work > self._left:
-            raise TooMuchWorkError(f"{what} are more than the work allowed")
+            raise WorkLimitError(f"{what} are more than the work allowed")
         self._left -= work
 
 
-def least_motion(rows: Rows, bounds: Bounds) -> Values | None:
-    """The shortest x with `rows @ x >= bounds`; None where there is none.
+def solve_least_motion(rows: Rows, bounds: Bounds) -> Values | None:
+    """Find the shortest x with `rows @ x >= bounds`; None where there is none.
 
     Raises:
-        SolverError: if rounding keeps the solver from an end.
+        SolverError: if the solver does not converge.
     """
     count = rows.shape[1]
     if not len(rows) or (bounds <= 0.0).all():
@@ -62,17 +62,16 @@ def least_motion(rows: Rows, bounds: Bounds) -> Values | None:
     target = np.zeros(count + 1)
     target[count] = 1.0
     try:
-        dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=ITERATIONS * (count + 1))
-    except RuntimeError as error:  # scipy's word for too many iterations
+        dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=ITERATIONS_PER_UNKNOWN * (count + 1))
+    except RuntimeError as error:  # scipy's: too many iterations
         raise SolverError(f"no least motion of {count} unknowns under {len(rows)} constraints: {error}") from error
     residual = np.concatenate([rows.T @ dual, [bounds @ dual - 1.0]])
-    if -residual[count] < INFEASIBLE:
+    if -residual[count] < INFEASIBLE_RESIDUAL:
         return None
-    motion: Values = -residual[:count] / residual[count]
-    return motion
+    return -residual[:count] / residual[count]
 
 
-def least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: float) -> Values:
+def solve_least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: float) -> Values:
     """A short x where the constraints contradict one another: those of one owner give way together, at a price.
 
     Minimises `|x|² + |s / softness|²` under `rows @ x + s[owners] >= bounds`; s is 0 where the owner is -1.
@@ -83,13 +82,13 @@ def least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: float)
     count = rows.shape[1]
     named, column = np.unique(owners, return_inverse=True)
     give = softness * np.eye(len(named))[column] * (owners >= 0)[:, None]
-    relaxed = least_motion(np.hstack([rows, give]), bounds)
+    relaxed = solve_least_motion(np.hstack([rows, give]), bounds)
     if relaxed is None:
         raise SolverError(f"{int((owners < 0).sum())} constraints that never give way contradict one another")
     return relaxed[:count]
 
 
-def balanced_motion(
+def solve_balanced_motion(
     rows: Rows,
     bounds: Bounds,
     owners: Owners,
@@ -98,39 +97,38 @@ def balanced_motion(
     softness: float,
     effort: SolverEffort,
 ) -> Values:
-    """The x that minimises `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
+    """Minimise `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
 
-    Where the constraints contradict one another they give way as in `least_violation`. Constraints are taken up as
-    they are violated: most never are.
+    Contradicting constraints give way as in `solve_least_violation`. Constraints become active once they are violated:
+    most never are.
 
     Raises:
-        SolverError: if it is more than the effort allows, or the solver comes to no end.
+        SolverError: if it is more than the effort allows, or the solver does not converge.
     """
     lower = np.linalg.cholesky(np.eye(rows.shape[1]) + wishes.T @ wishes)
     free = np.linalg.solve(lower.T, np.linalg.solve(lower, wishes.T @ wished))
     needed = bounds - rows @ free
     turned = np.linalg.solve(lower, rows.T).T
     motion, taken = np.zeros(rows.shape[1]), np.zeros(len(rows), dtype=bool)
-    for _ in range(ROUNDS):
-        violated = turned @ motion < needed - VIOLATED
+    for _ in range(MAX_ROUNDS):
+        violated = turned @ motion < needed - VIOLATION_TOLERANCE
         if not (violated & ~taken).any():
-            answer: Values = free + np.linalg.solve(lower.T, motion)
-            return answer
+            return free + np.linalg.solve(lower.T, motion)
         taken |= violated
-        motion = _shortest(turned[taken], needed[taken], owners[taken], softness, effort)
-    raise SolverError(f"constraints are still violated after {ROUNDS} rounds")
+        motion = _solve_shortest(turned[taken], needed[taken], owners[taken], softness, effort)
+    raise SolverError(f"constraints are still violated after {MAX_ROUNDS} rounds")
 
 
-def _shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effort: SolverEffort) -> Values:
-    """The least motion, or where there is none the least violation; constraints times unknowns squared are counted."""
+def _solve_shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float, effort: SolverEffort) -> Values:
+    """Solve for the least motion, or where there is none for the least violation; costs are charged."""
     _spend(effort, *rows.shape)
-    found = least_motion(rows, bounds)
+    found = solve_least_motion(rows, bounds)
     if found is not None:
         return found
     _spend(effort, len(rows), rows.shape[1] + len(np.unique(owners)))
-    return least_violation(rows, bounds, owners, softness)
+    return solve_least_violation(rows, bounds, owners, softness)
 
 
 def _spend(effort: SolverEffort, constraints: int, unknowns: int) -> None:
-    """About what the solver's time goes with."""
+    """Charge constraints times unknowns squared, which the solver's time is about proportional to."""
     effort.spend(constraints * unknowns**2, f"{constraints} constraints on {unknowns} unknowns")

@@ -1,6 +1,7 @@
-"""How deep objects lie inside one another: on their convex pieces, and on their meshes."""
+"""Penetration depth of objects: on their convex pieces, and on their meshes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import combinations
 
 import manifold3d
 import numpy as np
@@ -8,81 +9,82 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
-from tableverse_factory.geometry.collision.inscribed_ball import largest_ball
-from tableverse_factory.geometry.collision.solids import Solids, meetings, place_pieces
+from tableverse_factory.geometry.collision.inscribed_ball import find_largest_ball
+from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces, place_pieces
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.geometry.mesh.repair import as_mesh, closed_solid
+from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_mesh
 
 PairDepth = tuple[int, int, float]
 """Indices i < j of two objects and how deep they overlap [m], always > 0."""
 
-FINE_M = 1e-4
-"""What is nowhere thicker is not looked into: things at rest share micrometres with what carries them [m]."""
+THIN_M = 1e-4
+"""Thinner overlaps are not examined further: objects at rest share micrometres with what carries them [m]."""
 
 
-def piece_penetrations(
+def measure_piece_penetrations(
     pieces: Sequence[ConvexPieces], poses: Sequence[Pose], scales: Sequence[float]
 ) -> list[PairDepth]:
-    """Every pair of objects whose convex pieces overlap.
+    """Measure every pair of objects whose convex pieces overlap.
 
-    The depth of a pair is that of its deepest pair of pieces: the shortest translation that parts these two (EPA).
+    The depth of a pair is that of its deepest pair of pieces: the shortest translation that separates them (EPA).
     """
     solids = [place_pieces(p, pose, scale) for p, pose, scale in zip(pieces, poses, scales, strict=True)]
-    depths = ((i, j, _deepest(solids[i], solids[j])) for i, j in _index_pairs(len(solids)))
+    depths = ((i, j, _measure_piece_depth(solids[i], solids[j])) for i, j in combinations(range(len(solids)), 2))
     return [(i, j, depth) for i, j, depth in depths if depth > 0.0]
 
 
-def mesh_penetrations(
+def measure_mesh_penetrations(
     meshes: Sequence[TriangleMesh], poses: Sequence[Pose], scales: Sequence[float]
 ) -> list[PairDepth]:
-    """Every pair of objects whose meshes share volume, by exact Boolean intersection.
+    """Measure every pair of objects whose meshes share volume, by exact Boolean intersection.
 
-    The depth of a pair is that of its thickest connected region of shared volume (`region_thickness`).
-    Meshes that are not closed are measured as `closed_solid` repairs them.
+    The depth of a pair is that of its thickest connected region of shared volume (`measure_thickness`).
+    Meshes that are not closed are measured as `make_closed_solid` repairs them.
 
     Raises:
         GeometryError: if a mesh cannot be closed.
     """
     solids = [
-        closed_solid(mesh)[0].transform(scale_and_pose(pose, scale))
+        make_closed_solid(mesh)[0].transform(similarity_matrix(pose, scale))
         for mesh, pose, scale in zip(meshes, poses, scales, strict=True)
     ]
     boxes = [solid.bounding_box() for solid in solids]
     found = []
-    for i, j in _index_pairs(len(solids)):
-        if _boxes_meet(boxes[i], boxes[j]):
+    for i, j in combinations(range(len(solids)), 2):
+        a, b = boxes[i], boxes[j]
+        if all(a[k] < b[k + 3] and b[k] < a[k + 3] for k in range(3)):
             regions = (solids[i] ^ solids[j]).decompose()
-            depth = max((region_thickness(region) for region in regions), default=0.0)
+            depth = max((measure_thickness(region) for region in regions), default=0.0)
             if depth > 0.0:
                 found.append((i, j, depth))
     return found
 
 
-def scale_and_pose(pose: Pose, scale: float) -> Float64[np.ndarray, "3 4"]:
-    """The matrix `[scale R | position]` of the layout format."""
+def similarity_matrix(pose: Pose, scale: float) -> Float64[np.ndarray, "3 4"]:
+    """Make the matrix `[scale R | position]` of the layout format."""
     return np.column_stack([scale * rotation_matrix(pose.quaternion_wxyz), pose.position])
 
 
-def region_thickness(region: manifold3d.Manifold) -> float:
-    """How thick a region of shared volume is [m]; at least a third of any ball in it that is found.
+def measure_thickness(region: manifold3d.Manifold) -> float:
+    """Measure how thick a region of shared volume is [m]; at least a third of any ball found in it.
 
     The smaller of two bounds: its narrowest extent between parallel planes (along the normals of its convex hull),
-    and 6 V / S, which no convex region's largest inscribed ball exceeds in diameter. A plate of thickness t gives t, a
-    lens its height, a ball its diameter; a thin ring (two nested cups that graze) at most three times its thickness.
-    Where the second is smaller, the region may be a film on something thick: a foot sunk into a table that the thing
-    touches all around. The largest ball inside then says how thick it is, if it is larger.
+    and 6 V / S, which the largest ball inscribed in a convex region does not exceed in diameter. A plate of thickness t
+    gives t, a lens its height, a ball its diameter; a thin ring (two nested cups that graze) at most three times its
+    thickness. Where the second is smaller, the region may be a film on something thick, such as a foot sunk into a
+    table that is touched all around: then the largest ball inside decides, if it is larger.
     """
     volume, area = float(region.volume()), float(region.surface_area())
     if volume <= 0.0 or area <= 0.0:
         return 0.0
-    mesh = as_mesh(region)
-    mean, narrowest = 6.0 * volume / area, _narrowest_extent(mesh.vertices)
-    if mean >= narrowest or narrowest <= FINE_M:
+    mesh = solid_to_mesh(region)
+    mean, narrowest = 6.0 * volume / area, _measure_narrowest_extent(mesh.vertices)
+    if mean >= narrowest or narrowest <= THIN_M:
         return narrowest
-    return max(mean, largest_ball(mesh, mean, narrowest))
+    return max(mean, find_largest_ball(mesh, mean, narrowest))
 
 
-def _narrowest_extent(points: Points) -> float:
+def _measure_narrowest_extent(points: Points) -> float:
     try:
         normals = ConvexHull(points - points.mean(axis=0)).equations[:, :3]
     except QhullError:  # flat to rounding: no thickness
@@ -90,13 +92,5 @@ def _narrowest_extent(points: Points) -> float:
     return float(np.ptp(points @ normals.T, axis=0).min())
 
 
-def _deepest(a: Solids, b: Solids) -> float:
-    return max((-gap for gap, _ in meetings(a, b, 0.0)), default=0.0)
-
-
-def _boxes_meet(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    return all(a[k] < b[k + 3] and b[k] < a[k + 3] for k in range(3))
-
-
-def _index_pairs(count: int) -> Iterator[tuple[int, int]]:
-    return ((i, j) for i in range(count) for j in range(i + 1, count))
+def _measure_piece_depth(a: Solids, b: Solids) -> float:
+    return max((-gap for gap, _ in find_near_pieces(a, b, 0.0)), default=0.0)

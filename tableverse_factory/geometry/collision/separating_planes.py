@@ -1,10 +1,9 @@
-"""Planes that part convex pieces: what a layout must satisfy to be free, as linear constraints on its motions.
+"""Separating planes of convex pieces: collision-free layouts as linear constraints on motions.
 
-Two convex pieces are apart if along some direction n one lies beyond the other. For a fixed n that is linear in how
-the two are translated, so a translation that satisfies such a row for each pair of pieces ends free, not only to first
-order. For turns it is so to first order, at each of the corners that are nearest to the plane. n comes from the nearest
-points where the two are apart and from the shortest way out where they overlap (coal's EPA); how far apart they are
-along it is then measured on their corners, whatever coal answered.
+Two convex pieces are apart if one lies beyond the other along some direction n. For a fixed n this is linear in their
+translations, so a translation that satisfies the row of each pair ends free, not only to first order. For rotations it
+holds to first order, at each of the corners nearest to the plane. n comes from the nearest points where the two are
+apart and from the shortest way out where they overlap (coal's EPA); the distance along it is measured on the corners.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,27 +13,25 @@ import coal
 import numpy as np
 
 from schemas.geometry import Matrix3, Points, Vector3
-from tableverse_factory.geometry.collision.ray_clearance import GJK_TOLERANCE
-from tableverse_factory.geometry.collision.solids import Solids, convex_shape
+from tableverse_factory.geometry.collision.linear_sweep import GJK_TOLERANCE
+from tableverse_factory.geometry.collision.solids import Solids, make_convex_shape
+from tableverse_factory.geometry.math.transforms import cross_matrix
 
 SIDEWAYS_STRETCH = 6.0
-"""The way out that is sought with z stretched this much is a sideways one wherever there is any."""
+"""With z stretched this much, the shortest way out is a sideways one wherever there is any."""
 CORNER_DEPTH_M = 0.003
 """Corners this much further from a plane than the nearest one may become the nearest in one step [m]."""
-ALL_CORNERS_M = 0.006
-"""With more room than this, one corner is watched: nothing meets in one step that goes less far [m]."""
-CORNERS = 4
-"""Corners of either piece that are watched."""
-LEAST_RISE = 0.1
+SINGLE_CORNER_M = 0.006
+"""With more room than this, one corner is watched: one step goes less far [m]."""
+MAX_CORNERS = 4
+"""Watched corners of either piece."""
+MIN_RISE = 0.1
 
 
-class Stance:
-    """The pieces of a body, turned and moved.
+class PosedPieces:
+    """The pieces of a body, rotated about the origin and then shifted [m].
 
     Attributes:
-        solids: The pieces before.
-        rotation: Turns them about the origin.
-        shift: Moves them then [m].
         low: Lowest corner of each piece's box. Shape (k, 3) [m].
         high: Highest corner of each piece's box. Shape (k, 3) [m].
         least: Lowest corner of the box of all [m].
@@ -51,26 +48,26 @@ class Stance:
         self.most: Vector3 = self.high.max(axis=0)
 
     def corners(self, piece: int) -> Points:
-        """Where the vertices of a piece are [m]."""
+        """Vertices of a piece [m]."""
         return self._corners[piece]
 
     def pose(self) -> coal.Transform3s:
-        """Turn and motion as coal wants them."""
+        """Pose for coal."""
         return coal.Transform3s(self.rotation, self.shift)
 
     def stretched(self, piece: int, factors: Vector3) -> coal.Convex:
-        """A piece where it is, each axis scaled."""
-        return convex_shape(self.corners(piece) * factors, self.solids.faces(piece))
+        """Scale each axis of a piece where it is."""
+        return make_convex_shape(self.corners(piece) * factors, self.solids.faces(piece))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeparatingPlane:
-    """A direction along which one piece must stay beyond another.
+    """A direction along which a piece of body a must stay beyond a piece of body b.
 
     Attributes:
-        direction: Unit vector, from the other body to the one body.
-        spare_m: How much further apart along it than they must be the two are [m]; negative where they are too near.
-        points: Corners near the plane, of the one body as they are, of the other lifted to it. Shape (k, 3) [m].
+        direction: Unit vector, from b to a.
+        spare_m: Distance along it beyond the required one [m]; negative where they are too near.
+        points: Corners near the plane, those of b lifted to it. Shape (k, 3) [m].
         spares_m: `spare_m` at each of these corners. Shape (k,).
     """
 
@@ -80,8 +77,8 @@ class SeparatingPlane:
     spares_m: Points
 
 
-class Separator:
-    """Finds the planes between two bodies."""
+class PlaneFinder:
+    """Finds the separating planes of two bodies."""
 
     def __init__(self) -> None:
         self._request = coal.DistanceRequest()
@@ -90,15 +87,17 @@ class Separator:
         self._still = coal.Transform3s()
         self._factors = np.array([1.0, 1.0, SIDEWAYS_STRETCH])
 
-    def planes(self, a: Stance, b: Stance, margin_m: float, reach_m: float, rise: float) -> Iterator[SeparatingPlane]:
-        """A plane for each pair of pieces that come within `reach_m` of being nearer than the margin.
+    def planes(
+        self, a: PosedPieces, b: PosedPieces, margin_m: float, reach_m: float, rise: float
+    ) -> Iterator[SeparatingPlane]:
+        """Find a plane for each pair of pieces that are no further apart than `margin_m + reach_m`.
 
         Args:
             a: One body.
             b: The other.
             margin_m: The least distance between the two [m].
-            reach_m: Pairs further apart than this are left out [m].
-            rise: Where pieces overlap: 1 if the one body belongs above the other, -1 if below, 0 if beside it.
+            reach_m: Pairs further beyond the margin than this are left out [m].
+            rise: Where pieces overlap: 1 if `a` belongs above `b`, -1 if below, 0 if beside it.
         """
         reach = margin_m + reach_m
         if (a.least > b.most + reach).any() or (b.least > a.most + reach).any():
@@ -114,11 +113,11 @@ class Separator:
             direction = -np.array(self._result.normal)
             if gap < 0.0:
                 direction = self._way_out(a, i, b, j, direction, rise)
-            yield _plane(direction, a.corners(i), b.corners(j), margin_m)
+            yield _make_plane(direction, a.corners(i), b.corners(j), margin_m)
 
-    def _way_out(self, a: Stance, i: int, b: Stance, j: int, shortest: Vector3, rise: float) -> Vector3:
+    def _way_out(self, a: PosedPieces, i: int, b: PosedPieces, j: int, shortest: Vector3, rise: float) -> Vector3:
         if rise:
-            return np.array([0.0, 0.0, rise]) if rise * shortest[2] < -LEAST_RISE else shortest
+            return np.array([0.0, 0.0, rise]) if rise * shortest[2] < -MIN_RISE else shortest
         self._result.clear()
         first, second = a.stretched(i, self._factors), b.stretched(j, self._factors)
         coal.distance(first, self._still, second, self._still, self._request, self._result)
@@ -127,31 +126,25 @@ class Separator:
         return direction
 
 
-def cross_matrix(vector: Vector3) -> Matrix3:
-    """The matrix M with `a @ M` the cross product of a and the vector."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def _plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> SeparatingPlane:
+def _make_plane(direction: Vector3, above: Points, below: Points, margin_m: float) -> SeparatingPlane:
     heights, depths = above @ direction, below @ direction
     least, most = heights.min(), depths.max()
     spare = float(least - most) - margin_m
-    if spare > ALL_CORNERS_M:
+    if spare > SINGLE_CORNER_M:
         first = int(heights.argmin())
         return SeparatingPlane(direction, spare, above[first : first + 1], np.array([spare]))
-    of_a = _nearest(heights - least, above, direction)
-    of_b = _nearest(most - depths, below, direction)
+    of_a = _select_corners(heights - least, above, direction)
+    of_b = _select_corners(most - depths, below, direction)
     lifted = below[of_b] + (most - depths[of_b])[:, None] * direction
     points = np.concatenate([above[of_a], lifted])
     spares = np.concatenate([heights[of_a] - most, least - depths[of_b]]) - margin_m
     return SeparatingPlane(direction, spare, points, spares)
 
 
-def _nearest(depths: Points, corners: Points, direction: Vector3) -> Sequence[int]:
-    """Of the corners near a plane, the nearest and the outermost ones along it."""
+def _select_corners(depths: Points, corners: Points, direction: Vector3) -> Sequence[int]:
+    """Select the nearest of the corners near a plane, and the outermost ones along it."""
     [near] = (depths <= CORNER_DEPTH_M).nonzero()
-    if len(near) <= CORNERS:
+    if len(near) <= MAX_CORNERS:
         return list(near)
     turn = cross_matrix(direction)
     across = turn[int(np.abs(direction).argmin())]

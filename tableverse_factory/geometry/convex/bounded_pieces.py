@@ -1,20 +1,18 @@
-"""Clusters of points as pieces of few vertices; merges are taken back where those vertices cost too much volume."""
+"""Convex pieces of few vertices; merges are undone where the vertex limit costs too much volume."""
 
 import heapq
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-
-import manifold3d
 
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.geometry.convex.cut_and_merge import PieceCluster
-from tableverse_factory.geometry.mesh.hulls import bounded_hull, hull_of
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.hulls import make_bounded_hull, unite_hulls
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 
 MAX_HULL_VERTICES = 64
-"""MuJoCo and GPU simulators are fast up to here."""
+"""MuJoCo and GPU simulators are fast up to this number."""
 HULL_TOLERANCE = 4e-4
-"""Points this near to a hull need no corner of their own. Lengths here are shares of the mesh's longest side."""
+"""Points this near to a hull need no corner, as a share of the mesh's longest side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,28 +22,30 @@ class _Piece:
     cluster: PieceCluster
 
 
-def piece_of(points: Points) -> TriangleMesh:
-    """A hull of at most `MAX_HULL_VERTICES` that covers the points, or nearly."""
-    return bounded_hull(points, MAX_HULL_VERTICES, HULL_TOLERANCE)
+def make_piece(points: Points) -> TriangleMesh:
+    """Make a hull of at most `MAX_HULL_VERTICES` that covers the points, or nearly."""
+    return make_bounded_hull(points, MAX_HULL_VERTICES, HULL_TOLERANCE)
 
 
-def bounded_pieces(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[TriangleMesh]:
-    """A piece for each cluster, or for the two it was merged from, those first where this saves most.
+def make_bounded_pieces(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[TriangleMesh]:
+    """Make a piece of each cluster, or of the two it was merged from, where this saves most volume.
 
     Args:
-        clusters: As `cut_and_merge` gives them.
+        clusters: From `cut_and_merge`.
         max_pieces: No more pieces than this, unless there are more clusters.
-        volume_allowed: Volume of the union of the pieces beyond which merges are taken back. Afterwards only sums are
-            looked at, and the share of them that overlaps is taken to stay what it was.
+        volume_allowed: Volume of the union of the pieces beyond which merges are undone. Afterwards only sums of
+            volumes are updated, assuming that the overlapping share stays the same.
     """
-    pieces = {k: _piece(cluster) for k, cluster in enumerate(clusters)}
+    pieces = {k: _measure_piece(cluster) for k, cluster in enumerate(clusters)}
     total = sum(piece.volume for piece in pieces.values())
-    sum_allowed = volume_allowed * total / _united_volume(pieces.values()) if total > volume_allowed else total
+    sum_allowed = total
+    if total > volume_allowed:
+        sum_allowed = volume_allowed * total / float(unite_hulls(piece.hull for piece in pieces.values()).volume())
     if total <= sum_allowed:
         return [piece.hull for piece in pieces.values()]
     waiting: list[tuple[float, int, list[_Piece]]] = []
     for k, piece in pieces.items():
-        _offer(waiting, k, piece)
+        _push_split(waiting, k, piece)
     key = len(pieces)
     while waiting and total > sum_allowed and len(pieces) < max_pieces:
         saving, k, halves = heapq.heappop(waiting)
@@ -53,23 +53,18 @@ def bounded_pieces(clusters: Sequence[PieceCluster], max_pieces: int, volume_all
         total += saving
         for half in halves:
             pieces[key] = half
-            _offer(waiting, key, half)
+            _push_split(waiting, key, half)
             key += 1
     return [piece.hull for piece in pieces.values()]
 
 
-def _united_volume(pieces: Iterable[_Piece]) -> float:
-    solids = [hull_of(piece.hull.vertices) for piece in pieces]
-    return float(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).volume())
-
-
-def _offer(waiting: list[tuple[float, int, list[_Piece]]], key: int, piece: _Piece) -> None:
-    """Puts a merged piece on the heap with what taking it back changes (negative: a saving)."""
+def _push_split(waiting: list[tuple[float, int, list[_Piece]]], key: int, piece: _Piece) -> None:
+    """Push a merged piece on the heap with the change of volume that undoing it brings."""
     if piece.cluster.halves:
-        halves = [_piece(half) for half in piece.cluster.halves]
+        halves = [_measure_piece(half) for half in piece.cluster.halves]
         heapq.heappush(waiting, (sum(half.volume for half in halves) - piece.volume, key, halves))
 
 
-def _piece(cluster: PieceCluster) -> _Piece:
-    hull = piece_of(cluster.points)
-    return _Piece(hull, signed_volume(hull), cluster)
+def _measure_piece(cluster: PieceCluster) -> _Piece:
+    hull = make_piece(cluster.points)
+    return _Piece(hull, compute_signed_volume(hull), cluster)

@@ -1,4 +1,4 @@
-"""Convex pieces on disk, by the content of the shape. Safe to share between processes, and to delete at any time."""
+"""Disk cache of convex pieces by the content of the shape; shared between processes, safe to delete at any time."""
 
 from contextlib import suppress
 from functools import cache
@@ -16,25 +16,27 @@ from tableverse_factory.core.disk_cache import DiskCache
 
 VERSION = b"pieces 5"
 """Changes whenever the same shape and parameters would give other pieces."""
-_DECIDING = ("coacd", "manifold3d", "numpy", "scipy")
+_PACKAGES = ("coacd", "manifold3d", "numpy", "scipy")
 """Packages whose versions may change the pieces of the same shape."""
 
 
 class PieceCache:
-    """Pieces of shapes about 1 large, a file each (`schemas.codec`)."""
+    """Pieces of shapes of extent 1, a file each (`schemas.codec`)."""
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
         self._files = DiskCache(folder / "pieces", ".arrow")
-        self._parameters = f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {_versions()}".encode()
+        self._parameters = (
+            f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {_get_versions()}".encode()
+        )
 
     def key(self, shape: TriangleMesh) -> str:
-        """Hash of what decides the pieces: the triangles and the parameters."""
+        """Hash the triangles and the parameters."""
         vertices = (shape.vertices + 0.0).astype("<f8")  # no negative zeros
         faces = shape.faces.astype("<i4")
         return content_hash(VERSION, self._parameters, vertices.tobytes(), np.ascontiguousarray(faces).tobytes())
 
     def get(self, key: str) -> ConvexPieces | None:
-        """The pieces stored under a key; None where there are none, or the file is damaged."""
+        """Return the pieces stored under a key; None where there are none, or the file is damaged."""
         payload = self._files.get(key)
         if payload is None:
             return None
@@ -45,12 +47,12 @@ class PieceCache:
         return record if isinstance(record, ConvexPieces) else None
 
     def put(self, key: str, pieces: ConvexPieces) -> None:
-        """Stores pieces. A cache that cannot be written (full, read-only, deleted meanwhile) costs time, no scene."""
+        """Store pieces, as far as the disk allows: an unwritable cache costs time, but no scene."""
         with suppress(OSError):
             self._files.put(key, encode(pieces))
 
 
 @cache
-def _versions() -> str:
-    """Of the packages that decide; they do not change while a process runs, and looking costs 10 ms each."""
-    return " ".join(version(name) for name in _DECIDING)
+def _get_versions() -> str:
+    """Versions of the packages; cached, as each look-up takes 10 ms."""
+    return " ".join(version(name) for name in _PACKAGES)

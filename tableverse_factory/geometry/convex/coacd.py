@@ -1,4 +1,4 @@
-"""CoACD (Wei et al., 2022), the paper's convex decomposition, with a search that a factory can afford."""
+"""CoACD (Wei et al., 2022), the paper's convex decomposition, with a reduced search."""
 
 from types import ModuleType
 
@@ -14,20 +14,20 @@ MAX_HULL_VERTICES = 64
 _LIGHT_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}
 
 
-def coacd_library() -> ModuleType:
-    """CoACD, quiet, and loaded after Open3D: the other way round Open3D does not load (`std::bad_cast`)."""
+def load_coacd() -> ModuleType:
+    """Import CoACD, quiet and after Open3D, which fails with `std::bad_cast` when it is loaded second."""
     import open3d  # noqa: F401
     import coacd  # isort: skip
 
     coacd.set_log_level("error")
-    return coacd  # type: ignore[no-any-return]
+    return coacd
 
 
-def coacd_pieces(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
-    """Corners of the convex pieces of a closed mesh about 1 large, in CoACD's order. The seed is fixed.
+def decompose_with_coacd(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
+    """Decompose a closed mesh of extent 1 into the corners of convex pieces, with a fixed seed.
 
     Args:
-        mesh: Closed and oriented: CoACD's own remeshing is off, it would swell thin walls.
+        mesh: Closed and oriented: CoACD's own remeshing, which swells thin walls, is off.
         max_pieces: No more pieces than this.
 
     Raises:
@@ -35,7 +35,7 @@ def coacd_pieces(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
     """
     if len(mesh.faces) > MAX_FACES:
         raise GeometryError(f"a mesh of {len(mesh.faces)} triangles is too large for CoACD: at most {MAX_FACES}")
-    coacd = coacd_library()
+    coacd = load_coacd()
     pieces = coacd.run_coacd(
         coacd.Mesh(np.array(mesh.vertices), np.array(mesh.faces)),
         threshold=THRESHOLD,

@@ -1,4 +1,4 @@
-"""How well convex pieces stand for a mesh: volume, distances, what sticks out, what stays open."""
+"""Quality of convex pieces: volume, distances to the mesh, uncovered parts, cavities kept."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,26 +9,25 @@ from jaxtyping import Float64
 from trimesh.triangles import closest_point
 
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
-from tableverse_factory.geometry.mesh.hulls import face_heights, hull_of, protrusion
-from tableverse_factory.geometry.mesh.repair import as_mesh
-from tableverse_factory.geometry.mesh.surface_samples import distance_to_surface, surface_samples
+from tableverse_factory.geometry.mesh.hulls import compute_face_heights, measure_protrusion, unite_hulls
+from tableverse_factory.geometry.mesh.repair import solid_to_mesh
+from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to_surface, sample_surface
 
 SAMPLES = 10_000
 MAX_POINTS = 30_000
-INSIDE = 1e-9
-LEAST_CAVITY = 0.01
+INSIDE_TOLERANCE = 1e-9
+MIN_CAVITY_SHARE = 0.01
 """Share of the hull's volume below which there is no cavity to keep."""
 
 
-def with_metrics(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPieces:
-    """The pieces with their figures, measured against the solid they stand for."""
-    hulls = [hull_of(hull.vertices) for hull in pieces.hulls]
-    union = manifold3d.Manifold.batch_boolean(hulls, manifold3d.OpType.Add)
-    mesh, around = as_mesh(solid), as_mesh(union)
+def add_metrics(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPieces:
+    """Measure pieces against the solid that they stand for."""
+    union = unite_hulls(pieces.hulls)
+    mesh, around = solid_to_mesh(solid), solid_to_mesh(union)
     stride = -(-len(mesh.vertices) // MAX_POINTS)
-    points = np.concatenate([mesh.vertices[::stride], surface_samples(mesh, SAMPLES)[0]])
-    uncovered = float(distance_to_pieces(points, pieces.hulls).max())
-    back = float(distance_to_surface(surface_samples(around, SAMPLES)[0], mesh, 2 * SAMPLES).max())
+    points = np.concatenate([mesh.vertices[::stride], sample_surface(mesh, SAMPLES)[0]])
+    uncovered = float(measure_distance_to_pieces(points, pieces.hulls).max())
+    back = float(measure_distance_to_surface(sample_surface(around, SAMPLES)[0], mesh, 2 * SAMPLES).max())
     volume, filled, hull = float(solid.volume()), float(union.volume()), float(solid.hull().volume())
     cavity = hull - volume
     return replace(
@@ -36,45 +35,46 @@ def with_metrics(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPiec
         volume_ratio=filled / volume,
         hausdorff_m=max(uncovered, back),
         uncovered_m=uncovered,
-        cavity_kept=float(np.clip((hull - filled) / cavity, 0.0, 1.0)) if cavity > LEAST_CAVITY * hull else 1.0,
+        cavity_kept=float(np.clip((hull - filled) / cavity, 0.0, 1.0)) if cavity > MIN_CAVITY_SHARE * hull else 1.0,
     )
 
 
-def distance_to_pieces(points: Points, hulls: Sequence[TriangleMesh]) -> Float64[np.ndarray, " n"]:
-    """Distance of each point to the nearest piece, 0 inside."""
+def measure_distance_to_pieces(points: Points, hulls: Sequence[TriangleMesh]) -> Float64[np.ndarray, " n"]:
+    """Measure the distance of each point to the nearest piece, 0 inside."""
     outside = np.ones(len(points), dtype=bool)
     for hull in hulls:
         low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
-        near = np.flatnonzero(outside & (points >= low - INSIDE).all(axis=1) & (points <= high + INSIDE).all(axis=1))
-        outside[near] = protrusion(hull, points[near])[0] > INSIDE
+        near = np.flatnonzero(
+            outside & (points >= low - INSIDE_TOLERANCE).all(axis=1) & (points <= high + INSIDE_TOLERANCE).all(axis=1)
+        )
+        outside[near] = measure_protrusion(hull, points[near])[0] > INSIDE_TOLERANCE
     distances = np.zeros(len(points))
-    distances[outside] = _to_nearest(points[outside], hulls)
+    distances[outside] = _measure_distance_outside(points[outside], hulls)
     return distances
 
 
-def _to_nearest(points: Points, hulls: Sequence[TriangleMesh]) -> Float64[np.ndarray, " n"]:
-    """Distance of points that lie in none of the hulls to the nearest; a hull is looked at where its box is near."""
-    boxes = np.stack([_to_box(points, hull) for hull in hulls], axis=1)
+def _measure_distance_outside(points: Points, hulls: Sequence[TriangleMesh]) -> Float64[np.ndarray, " n"]:
+    """Measure the distance of points outside all hulls to the nearest; boxes limit the hulls that are tried."""
+    boxes = np.stack([_measure_distance_to_box(points, hull) for hull in hulls], axis=1)
     nearest = np.argmin(boxes, axis=1)
     distances = np.full(len(points), np.inf)
     for k, hull in enumerate(hulls):
         mine = nearest == k
-        distances[mine] = _to_hull(points[mine], hull)
+        distances[mine] = _measure_distance_to_hull(points[mine], hull)
     for k, hull in enumerate(hulls):
         nearer = np.flatnonzero((nearest != k) & (boxes[:, k] < distances))
-        distances[nearer] = np.minimum(distances[nearer], _to_hull(points[nearer], hull))
+        distances[nearer] = np.minimum(distances[nearer], _measure_distance_to_hull(points[nearer], hull))
     return distances
 
 
-def _to_box(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
+def _measure_distance_to_box(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
     low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
-    beyond: Float64[np.ndarray, " n"] = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
-    return beyond
+    return np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
 
 
-def _to_hull(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
-    """Distance to a hull, 0 inside: what is nearest lies on a face that the point sees."""
-    point, face = np.nonzero(face_heights(hull, points) > INSIDE)
+def _measure_distance_to_hull(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
+    """Measure the distance to a hull, 0 inside: the nearest point lies on a face that the point sees."""
+    point, face = np.nonzero(compute_face_heights(hull, points) > INSIDE_TOLERANCE)
     apart = closest_point(hull.vertices[hull.faces[face]], points[point]) - points[point]
     distances = np.full(len(points), np.inf)
     np.minimum.at(distances, point, np.linalg.norm(apart, axis=1))

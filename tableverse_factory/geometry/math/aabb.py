@@ -8,16 +8,12 @@ Box = tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]
 
 
 def aabb(points: Float64[np.ndarray, "n k"]) -> Box:
-    """The box of at least one point.
-
-    Numpy goes down the long side of such an array row by row; of its transpose, the same takes a hundredth of the time.
-    """
+    """Compute the box of at least one point; column by column, which takes numpy a hundredth of the time."""
     columns = np.ascontiguousarray(points.T)
     return columns.min(axis=1), columns.max(axis=1)
 
 
-def size_around(points: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
-    """Sides of the box of at least one point."""
+def aabb_size(points: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, " k"]:
+    """Compute the sides of the box of at least one point."""
     low, high = aabb(points)
-    size: Float64[np.ndarray, " k"] = high - low
-    return size
+    return high - low

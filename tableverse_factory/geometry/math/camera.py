@@ -1,9 +1,19 @@
 """Pixels to points and back, for pinhole cameras with OpenCV axes."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float64
 
-from schemas.geometry import Camera, DepthImage, Points
+from schemas.geometry import Camera, DepthImage, Frozen, Points, Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedCamera(Frozen):
+    """A pinhole camera (OpenCV axes) and its pose in the table frame."""
+
+    camera: Camera
+    camera_to_table: Pose
 
 
 def backproject(depth: DepthImage, camera: Camera) -> Float64[np.ndarray, "h w 3"]:

@@ -27,14 +27,14 @@ class Rectangle(Frozen):
     yaw: float
 
     def distance(self, point: Float64[np.ndarray, "2"]) -> float:
-        """How far a point lies outside [m]; 0 within."""
+        """Distance of a point outside [m]; 0 within."""
         cos, sin = np.cos(self.yaw), np.sin(self.yaw)
         offset = np.array([[cos, sin], [-sin, cos]]) @ (point - self.center)
         return float(np.linalg.norm(np.maximum(np.abs(offset) - self.half_size, 0.0)))
 
 
-def smallest_rectangle(points: Points2) -> Rectangle:
-    """The rectangle of least area that holds all points (one of its sides lies on an edge of their hull).
+def fit_min_rectangle(points: Points2) -> Rectangle:
+    """Fit the rectangle of least area around all points (one of its sides lies on an edge of their hull).
 
     Raises:
         GeometryError: if the points lie on a line.

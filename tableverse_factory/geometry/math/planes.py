@@ -1,4 +1,4 @@
-"""Planes in point sets: least squares, seeded RANSAC, and the smallest rectangle around points of a plane."""
+"""Planes in point sets (least squares, seeded RANSAC) and convex outlines in a plane."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ PerPoint = Float64[np.ndarray, " n"]
 Selection = Bool[np.ndarray, " n"]
 
 HYPOTHESES = 400
-REFINED = 12
+REFINED_HYPOTHESES = 12
 REFINEMENTS = 3
-_CHUNK = 100
-_ROWS = 20_000
+_HYPOTHESES_PER_BLOCK = 100
+_POINTS_PER_BLOCK = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,8 +34,7 @@ class Plane(Frozen):
 
     def heights(self, points: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape"]:
         """Signed distances along the normal [m]."""
-        distances: Float64[np.ndarray, "*shape"] = points @ self.normal - self.offset
-        return distances
+        return points @ self.normal - self.offset
 
     def facing(self, viewpoint: Vector3) -> "Plane":
         """The same plane, its normal on the viewpoint's side."""
@@ -43,7 +42,7 @@ class Plane(Frozen):
 
 
 def fit_plane(points: Points) -> Plane:
-    """Total least squares: the plane that minimises the sum of squared distances.
+    """Fit a plane by total least squares.
 
     Raises:
         ValueError: for fewer than three points.
@@ -57,8 +56,8 @@ def fit_plane(points: Points) -> Plane:
     return Plane(normal, float(normal @ center))
 
 
-def refined_plane(plane: Plane, points: Points, tolerance: PerPoint) -> Plane:
-    """Least squares on the inliers, a few times over; the plane itself where fewer than three are left."""
+def refine_plane(plane: Plane, points: Points, tolerance: PerPoint) -> Plane:
+    """Refit a plane to its inliers a few times; unchanged where fewer than three are left."""
     for _ in range(REFINEMENTS):
         inliers = np.abs(plane.heights(points)) <= tolerance
         if int(inliers.sum()) < 3:
@@ -67,8 +66,8 @@ def refined_plane(plane: Plane, points: Points, tolerance: PerPoint) -> Plane:
     return plane
 
 
-def shared_normal(patches: Sequence[Points]) -> Vector3:
-    """The normal of parallel planes, total least squares: each patch may lie at its own offset. Sign as it comes.
+def fit_shared_normal(patches: Sequence[Points]) -> Vector3:
+    """Fit the common normal of parallel planes, each at its own offset, by total least squares. Its sign is arbitrary.
 
     Args:
         patches: Points of each plane; multiplied by weights where some are worth less. Shape (n, 3) each.
@@ -80,25 +79,20 @@ def shared_normal(patches: Sequence[Points]) -> Vector3:
         raise ValueError("fewer than 3 points span no plane")
     offsets = np.vstack([points - points.mean(axis=0) for points in patches if len(points)])
     _, vectors = np.linalg.eigh(offsets.T @ offsets)
-    normal: Vector3 = vectors[:, 0]
-    return normal
+    return vectors[:, 0]
 
 
-def dominant_planes(
-    points: Points,
-    tolerance: PerPoint,
-    rng: np.random.Generator,
-    max_planes: int,
-    min_inliers: int,
+def find_dominant_planes(
+    points: Points, tolerance: PerPoint, rng: np.random.Generator, max_planes: int, min_inliers: int
 ) -> Iterator[tuple[Plane, Selection]]:
-    """Planes in order of their inliers, each found by RANSAC in what the ones before it left over.
+    """Find planes in order of their inliers, each by RANSAC in the points that the ones before it left over.
 
     Args:
         points: In an order where neighbours in space are near one another (rows of an image): the three points of
             a hypothesis are drawn close together, so that small planes are hit as well. Shape (n, 3) [m].
         tolerance: Distance within which each point counts as an inlier [m]. Shape (n,).
         rng: Draws the hypotheses.
-        max_planes: Stop after so many.
+        max_planes: Stop after this many.
         min_inliers: Stop where the best plane has fewer.
 
     Yields:
@@ -109,7 +103,7 @@ def dominant_planes(
         index = np.flatnonzero(left)
         if len(index) < max(min_inliers, 3):
             return
-        plane = _best_plane(points[index], tolerance[index], rng)
+        plane = _find_best_plane(points[index], tolerance[index], rng)
         inliers = left & (np.abs(plane.heights(points)) <= tolerance)
         if int(inliers.sum()) < max(min_inliers, 3):
             return
@@ -117,27 +111,30 @@ def dominant_planes(
         left &= ~inliers
 
 
-def _best_plane(points: Points, tolerance: PerPoint, rng: np.random.Generator) -> Plane:
-    normals, offsets = _hypotheses(points, rng)
+def _find_best_plane(points: Points, tolerance: PerPoint, rng: np.random.Generator) -> Plane:
+    normals, offsets = _draw_hypotheses(points, rng)
     counts = np.concatenate(
         [
-            (np.abs(points @ normals[k : k + _CHUNK].T - offsets[k : k + _CHUNK]) <= tolerance[:, None]).sum(axis=0)
-            for k in range(0, len(normals), _CHUNK)
+            (
+                np.abs(points @ normals[k : k + _HYPOTHESES_PER_BLOCK].T - offsets[k : k + _HYPOTHESES_PER_BLOCK])
+                <= tolerance[:, None]
+            ).sum(axis=0)
+            for k in range(0, len(normals), _HYPOTHESES_PER_BLOCK)
         ]
     )
     best, best_count = Plane(normals[0], float(offsets[0])), -1
-    for k in np.argsort(-counts, kind="stable")[:REFINED]:
-        plane = refined_plane(Plane(normals[k], float(offsets[k])), points, tolerance)
+    for k in np.argsort(-counts, kind="stable")[:REFINED_HYPOTHESES]:
+        plane = refine_plane(Plane(normals[k], float(offsets[k])), points, tolerance)
         count = int((np.abs(plane.heights(points)) <= tolerance).sum())
         if count > best_count:
             best, best_count = plane, count
     return best
 
 
-def _hypotheses(
+def _draw_hypotheses(
     points: Points, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "k 3"], Float64[np.ndarray, " k"]]:
-    """Planes through three points each: half of the triples from anywhere, half from a stretch of the order."""
+    """Draw planes through three points: half of the triples from anywhere, half from a stretch of the order."""
     n = len(points)
     first = rng.integers(0, n, HYPOTHESES)
     reach = np.where(np.arange(HYPOTHESES) % 2 == 0, n, max(n // 10, 3))
@@ -149,8 +146,8 @@ def _hypotheses(
     return normals, np.einsum("ij,ij->i", normals, a)
 
 
-def convex_outline(points_xy: Points2) -> Points2:
-    """Corners of the convex hull, counter-clockwise; a small square around points that lie on a line. Shape (m, 2)."""
+def compute_convex_outline(points_xy: Points2) -> Points2:
+    """Compute the convex hull, counter-clockwise; a small box around points that lie on a line. Shape (m, 2)."""
     try:
         return np.asarray(points_xy[ConvexHull(points_xy).vertices], dtype=np.float64)
     except (QhullError, ValueError):
@@ -158,8 +155,8 @@ def convex_outline(points_xy: Points2) -> Points2:
         return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
-def depth_inside(outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
-    """How far each point lies inside a convex counter-clockwise outline, negative outside [m].
+def measure_depth_inside(outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
+    """Measure how far each point lies inside a convex counter-clockwise outline, negative outside [m].
 
     Outside, near a corner, the distance is that to the nearer edge's line.
     """
@@ -168,17 +165,16 @@ def depth_inside(outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"]) -
     offsets = np.einsum("ij,ij->i", inward, outline)
     flat = points_xy.reshape(-1, 2)
     depths = np.full(len(flat), np.inf)
-    for k in range(0, len(flat), _ROWS):  # blocks that stay in the processor's cache
-        x, y = np.ascontiguousarray(flat[k : k + _ROWS].T)
-        block = depths[k : k + _ROWS]
+    for k in range(0, len(flat), _POINTS_PER_BLOCK):  # blocks that stay in the processor's cache
+        x, y = np.ascontiguousarray(flat[k : k + _POINTS_PER_BLOCK].T)
+        block = depths[k : k + _POINTS_PER_BLOCK]
         for (a, b), offset in zip(inward, offsets, strict=True):
             np.minimum(block, a * x + b * y - offset, out=block)
     return depths.reshape(points_xy.shape[:-1])
 
 
-def inside_outline(
+def is_inside_outline(
     outline: Points2, points_xy: Float64[np.ndarray, "*shape 2"], margin: float = 0.0
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether each point lies in a convex counter-clockwise outline, or within `margin` of its edges [m]."""
-    inside: Bool[np.ndarray, "*shape"] = depth_inside(outline, points_xy) >= -margin
-    return inside
+    return measure_depth_inside(outline, points_xy) >= -margin

@@ -1,7 +1,6 @@
 """Rotations and rigid motions: quaternions wxyz, active, right-handed."""
 
 import numpy as np
-from jaxtyping import Float64
 
 from schemas.geometry import Matrix3, Matrix4, Points, Pose, Quaternion, Vector3
 
@@ -11,8 +10,8 @@ def identity_pose() -> Pose:
     return Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-def normalized_quaternion(quaternion_wxyz: Quaternion) -> Quaternion:
-    """Unit length, real part not negative: one representative of q and -q.
+def normalize_quaternion(quaternion_wxyz: Quaternion) -> Quaternion:
+    """Scale a quaternion to unit length, real part not negative: one representative of q and -q.
 
     Raises:
         ValueError: if the length is zero or not finite.
@@ -27,7 +26,7 @@ def normalized_quaternion(quaternion_wxyz: Quaternion) -> Quaternion:
 
 
 def rotation_matrix(quaternion_wxyz: Quaternion) -> Matrix3:
-    """The matrix of a unit quaternion. Shape (3, 3)."""
+    """Rotation matrix of a unit quaternion. Shape (3, 3)."""
     w, x, y, z = quaternion_wxyz
     return np.array(
         [
@@ -39,7 +38,7 @@ def rotation_matrix(quaternion_wxyz: Quaternion) -> Matrix3:
 
 
 def quaternion_from_matrix(rotation: Matrix3) -> Quaternion:
-    """The unit quaternion of a rotation matrix, stable for every angle (largest of four candidates)."""
+    """Unit quaternion of a rotation matrix, stable for every angle (largest of four candidates)."""
     m = rotation
     four_squares = np.array(
         [
@@ -57,7 +56,7 @@ def quaternion_from_matrix(rotation: Matrix3) -> Quaternion:
             [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], four_squares[3]],
         ]
     )
-    return normalized_quaternion(columns[int(np.argmax(four_squares))])
+    return normalize_quaternion(columns[int(np.argmax(four_squares))])
 
 
 def quaternion_about_z(angle: float) -> Quaternion:
@@ -73,53 +72,71 @@ def quaternion_from_rotation_vector(rotation_vector: Vector3) -> Quaternion:
 
 
 def multiply_quaternions(a_wxyz: Quaternion, b_wxyz: Quaternion) -> Quaternion:
-    """The rotation that turns by `b` first and by `a` then."""
+    """Compose two rotations: `b` first, then `a`."""
     w, x, y, z = a_wxyz
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product: Float64[np.ndarray, "4"] = left @ b_wxyz
-    return product
+    return left @ b_wxyz
+
+
+def conjugate_quaternion(quaternion_wxyz: Quaternion) -> Quaternion:
+    """The inverse rotation of a unit quaternion."""
+    return quaternion_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def rotation_angle(a_wxyz: Quaternion, b_wxyz: Quaternion) -> float:
     """Smallest angle between two orientations [rad]."""
-    conjugate = np.asarray(a_wxyz) * np.array([1.0, -1.0, -1.0, -1.0])
-    between = multiply_quaternions(conjugate, b_wxyz)
+    between = multiply_quaternions(conjugate_quaternion(np.asarray(a_wxyz)), b_wxyz)
     return float(2 * np.arctan2(np.linalg.norm(between[1:]), abs(between[0])))
 
 
 def pose_from_matrix(local_to_parent: Matrix4) -> Pose:
-    """The pose of a homogeneous matrix."""
-    return Pose(np.array(local_to_parent[:3, 3], dtype=np.float64), quaternion_from_matrix(local_to_parent[:3, :3]))
+    """Pose of a homogeneous matrix."""
+    return pose_from_rotation(local_to_parent[:3, 3], local_to_parent[:3, :3])
+
+
+def pose_from_rotation(position: Vector3, rotation: Matrix3) -> Pose:
+    """Pose of a position and a rotation matrix."""
+    return Pose(np.array(position, dtype=np.float64), quaternion_from_matrix(rotation))
 
 
 def matrix_from_pose(pose: Pose) -> Matrix4:
     """Homogeneous matrix. Shape (4, 4)."""
+    return homogeneous_matrix(rotation_matrix(pose.quaternion_wxyz), pose.position)
+
+
+def homogeneous_matrix(rotation: Matrix3, position: Vector3 | None = None) -> Matrix4:
+    """Homogeneous matrix of a rotation and a translation, none by default. Shape (4, 4)."""
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrix(pose.quaternion_wxyz)
-    matrix[:3, 3] = pose.position
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = 0.0 if position is None else position
     return matrix
 
 
-def compose(parent: Pose, child: Pose) -> Pose:
-    """`child` seen from the frame that `parent` is given in."""
+def compose_poses(parent: Pose, child: Pose) -> Pose:
+    """Express `child`, given in the frame `parent`, in the frame that `parent` is given in."""
     return Pose(
         transform_points(parent, child.position[None])[0],
-        normalized_quaternion(multiply_quaternions(parent.quaternion_wxyz, child.quaternion_wxyz)),
+        normalize_quaternion(multiply_quaternions(parent.quaternion_wxyz, child.quaternion_wxyz)),
     )
 
 
-def inverse(pose: Pose) -> Pose:
-    """The motion back."""
-    conjugate = pose.quaternion_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+def invert_pose(pose: Pose) -> Pose:
+    """Invert a rigid motion."""
+    conjugate = conjugate_quaternion(pose.quaternion_wxyz)
     return Pose(-(rotation_matrix(conjugate) @ pose.position), conjugate)
 
 
-def translated(pose: Pose, offset: Vector3) -> Pose:
-    """The same orientation, moved by `offset` in the parent frame [m]."""
+def translate_pose(pose: Pose, offset: Vector3) -> Pose:
+    """Move a pose by `offset` in the parent frame [m]."""
     return Pose(pose.position + offset, pose.quaternion_wxyz)
 
 
 def transform_points(pose: Pose, points: Points, scale: float = 1.0) -> Points:
-    """`R(q) @ (scale * point) + position` for each row. Shape (n, 3)."""
-    moved: Points = scale * points @ rotation_matrix(pose.quaternion_wxyz).T + pose.position
-    return moved
+    """Compute `R(q) @ (scale * point) + position` for each row. Shape (n, 3)."""
+    return scale * points @ rotation_matrix(pose.quaternion_wxyz).T + pose.position
+
+
+def cross_matrix(vector: Vector3) -> Matrix3:
+    """The matrix M with `M @ a` the cross product of the vector and a, and `a @ M` that of a and the vector."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

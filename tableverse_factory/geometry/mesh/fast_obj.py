@@ -1,4 +1,4 @@
-"""The plainest OBJ files, vertices and then triangles, read at once; all others are left to a reader of the format."""
+"""Fast reader for plain OBJ files: vertices, then triangles; all others are left to a general reader."""
 
 import numpy as np
 import pyarrow as pa
@@ -10,14 +10,14 @@ _PLAIN = b"0123456789.+-e vf\r\n"
 _NO_INDEX = (b".", b"e")
 _MOST_NUMBERS = 6
 _FEW_BYTES = 50_000
-"""Below it numpy is the quicker one: pieces are read by the thousand."""
+"""Below it numpy is faster than Arrow: pieces are read by the thousand."""
 
 _LARGEST = 1e9
-"""No mesh of ours has greater numbers, and no arithmetic overflows below."""
+"""No arithmetic overflows below it."""
 
 
 def read_plain_obj(data: bytes) -> TriangleMesh | None:
-    """The mesh of a file of lines `v x y z` or `v x y z r g b`, then lines `f i j k`, and nothing else.
+    """Read a file of lines `v x y z` or `v x y z r g b`, then lines `f i j k`, and nothing else.
 
     Colours are sRGB, 0 to 1. None for any other file, and where a vertex belongs to no face or a number is huge.
     """
@@ -42,23 +42,23 @@ def read_plain_obj(data: bytes) -> TriangleMesh | None:
 
 
 def _all_used(faces: Faces, count: int) -> bool:
-    """Whether every vertex is a corner of a face: the slow reader drops the others, and boxes depend on them."""
+    """Whether every vertex is a corner of a face: the general reader drops others, and boxes depend on them."""
     used = np.zeros(count, dtype=bool)
     used[faces] = True
     return bool(used.all())
 
 
 def _table(text: bytes, letter: bytes, kind: pa.DataType) -> np.ndarray | None:
-    """The numbers after the letter of each line, as many in each; None where a line is anything else.
+    """Parse the numbers after the letter of each line, as many in each; None where a line is anything else.
 
-    Arrow reads many numbers in half of numpy's time, and takes longer to begin.
+    Arrow reads many numbers in half of numpy's time, but takes longer to start.
     """
     lines = text.count(b"\n") + (not text.endswith(b"\n"))
     if not lines == text.count(letter) == (b"\n" + text).count(b"\n" + letter + b" "):
         return None
     try:
         return _by_numpy(text, letter) if len(text) < _FEW_BYTES else _by_arrow(text, kind)
-    except ValueError:  # of numbers or of columns; Arrow's own are such errors too
+    except ValueError:  # Arrow's errors are ValueErrors too
         return None
 
 
@@ -67,7 +67,7 @@ def _by_numpy(text: bytes, letter: bytes) -> np.ndarray:
 
 
 def _by_arrow(text: bytes, kind: pa.DataType) -> np.ndarray | None:
-    """A table of words with a blank between them is a CSV file; its first column is the letter."""
+    """Parse it as CSV with blanks between the columns, the first of which is the letter."""
     count = text.partition(b"\n")[0].rstrip(b"\r").count(b" ")
     if count > _MOST_NUMBERS:
         return None

@@ -1,25 +1,23 @@
-"""A body seen straight from above and from below, as heights on a grid that all bodies of a scene share.
+"""Height maps: a body seen from above and from below, on a grid that all bodies of a scene share.
 
-Maps answer what placement asks: how low a body can be dropped here, what it then rests on, and where a vessel has
-room. They err towards the full: a cell is as high as its highest ray, vertex or sharp edge, so a rim thinner than a
-cell closes; one as sharp as a knife, of walls that both slant, may not.
+For placement: how low a body can be dropped, what it then rests on, and where a vessel has room. A cell is as high as
+its highest ray, vertex or sharp edge, so a rim thinner than a cell closes; a knife-sharp one of two slanted walls may
+not.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
 from skimage.morphology import reconstruction
 
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, pack_rays
 
 Heights = Float64[np.ndarray, "nx ny"]
 CellMask = Bool[np.ndarray, "nx ny"]
-
-Caster = o3d.t.geometry.RaycastingScene
 
 CELL_M = 0.003
 """Spacing of the grid: the walls of household vessels are 2 to 5 mm."""
@@ -29,13 +27,13 @@ MIN_CAVITY_WIDTH_M = 0.025
 MIN_CAVITY_ASPECT = 0.12
 """Depth over width of the opening: a plate of 25 cm with a rim of 2 cm is no container, a frying pan is one."""
 
-FLAT_M = 0.0025
+LEVEL_TOLERANCE_M = 0.0025
 MIN_FLAT_WIDTH_M = 0.04
-"""A thing carries others on a level patch of at least this diameter."""
+"""A body carries others on a level patch of at least this diameter."""
 
 _RAYS_PER_SIDE = 2
-_SHALLOW_M = 0.003
-_STEEP = 0.35
+_MIN_WATER_DEPTH_M = 0.003
+_MAX_STEEP_SINE = 0.35
 """Faces whose normals rise by no more than this sine stand upright: rays 1.5 mm apart miss the rim between them."""
 
 
@@ -58,18 +56,17 @@ class HeightMap(Frozen):
     @property
     def filled(self) -> CellMask:
         """Cells that the body covers."""
-        mask: CellMask = np.isfinite(self.top)
-        return mask
+        return np.isfinite(self.top)
 
     def shifted(self, cells: tuple[int, int], rise: float) -> "HeightMap":
-        """The map of the body moved by whole cells and lifted by `rise` [m]."""
+        """Move the map by whole cells and lift it by `rise` [m]."""
         corner = (self.corner[0] + cells[0], self.corner[1] + cells[1])
         if rise == 0.0:
             return HeightMap(self.cell, corner, self.top, self.bottom)
         return HeightMap(self.cell, corner, self.top + rise, self.bottom + rise)
 
     def window(self, other: "HeightMap", values: np.ndarray, outside: float | bool) -> np.ndarray:
-        """`values` of `other`'s cells on the cells of this map; `outside` where `other` has none."""
+        """Bring `values` on `other`'s cells to the cells of this map; `outside` where `other` has none."""
         result = np.full(self.top.shape, outside, dtype=values.dtype)
         di, dj = other.corner[0] - self.corner[0], other.corner[1] - self.corner[1]
         i0, i1 = max(di, 0), min(di + values.shape[0], self.top.shape[0])
@@ -81,11 +78,11 @@ class HeightMap(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cavity(Frozen):
-    """Room in a vessel that opens upwards: what water would fill.
+    """Room in a vessel that opens upwards, as water would fill it.
 
     Attributes:
         cells: The water's surface, on the cells of the vessel's own map.
-        opening: The same and one cell around: what is in the vessel may touch its wall.
+        opening: The same and one cell around: contents may touch the wall.
         rim_z: Height of that surface, where the vessel would spill [m].
         floor_z: Its deepest point [m].
         volume_m3: Of the water [m³].
@@ -103,46 +100,35 @@ class Cavity(Frozen):
         return self.rim_z - self.floor_z
 
 
-def column_caster(mesh: TriangleMesh) -> Caster:
-    """A ray caster over one mesh; exact up to float32, single-threaded where it is called so."""
-    caster = o3d.t.geometry.RaycastingScene(nthreads=1)
-    caster.add_triangles(
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.vertices, dtype=np.float32)),
-        o3d.core.Tensor.from_numpy(np.ascontiguousarray(mesh.faces, dtype=np.uint32)),
-    )
-    return caster
-
-
-def height_map(mesh: TriangleMesh, caster: Caster, cell: float = CELL_M) -> HeightMap:
-    """The map of a mesh as it stands; `caster` holds the same mesh."""
+def compute_height_map(mesh: TriangleMesh, caster: RaycastingScene, cell: float = CELL_M) -> HeightMap:
+    """Compute the map of a mesh; `caster` holds the same mesh."""
     low, high = aabb(mesh.vertices)
     first = np.floor(low[:2] / cell).astype(int)
     shape = np.maximum(np.ceil(high[:2] / cell).astype(int) - first, 1)
     steps = [(first[k] + (np.arange(shape[k] * _RAYS_PER_SIDE) + 0.5) / _RAYS_PER_SIDE) * cell for k in range(2)]
-    top = high[2] + 0.01 - _first_hits(caster, steps, high[2] + 0.01, -1.0)
-    bottom = low[2] - 0.01 + _first_hits(caster, steps, low[2] - 0.01, 1.0)
+    top = high[2] + 0.01 - _cast_columns(caster, steps, high[2] + 0.01, -1.0)
+    bottom = low[2] - 0.01 + _cast_columns(caster, steps, low[2] - 0.01, 1.0)
     blocks = (shape[0], _RAYS_PER_SIDE, shape[1], _RAYS_PER_SIDE)
     top, bottom = top.reshape(blocks).max(axis=(1, 3)), bottom.reshape(blocks).min(axis=(1, 3))
     _add_edges(mesh, first, cell, top, bottom)
     return HeightMap(cell, (int(first[0]), int(first[1])), top, bottom)
 
 
-def _first_hits(caster: Caster, steps: list[np.ndarray], from_z: float, direction: float) -> np.ndarray:
-    """Distance along vertical rays from the plane `from_z` to the mesh, inf where they miss."""
+def _cast_columns(caster: RaycastingScene, steps: list[np.ndarray], from_z: float, direction: float) -> np.ndarray:
+    """Measure along vertical rays from the plane `from_z` to the mesh, inf where they miss."""
     x, y = np.meshgrid(*steps, indexing="ij")
-    rays = np.zeros((x.size, 6), dtype=np.float32)
-    rays[:, 0], rays[:, 1], rays[:, 2], rays[:, 5] = x.ravel(), y.ravel(), from_z, direction
-    hits: np.ndarray = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
+    rays = pack_rays(np.stack([x.ravel(), y.ravel(), np.full(x.size, from_z)], axis=1), np.array([0.0, 0.0, direction]))
+    hits = caster.cast_rays(rays, nthreads=1)["t_hit"].numpy()
     return hits.astype(np.float64).reshape(x.shape)
 
 
 def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights, bottom: Heights) -> None:
-    """Raises and lowers cells to the vertices and sharp edges in them: thin rims and spikes that fall between rays."""
+    """Raise and lower cells to the vertices and sharp edges in them: thin rims and spikes that fall between rays."""
     at = np.column_stack([mesh.vertices[:, :2] / cell - first, mesh.vertices[:, 2]])
     _add_points(at[:, :2], at[:, 2], top, bottom)
-    edges = _outlines(mesh.vertices, mesh.faces)
+    edges = _find_sharp_edges(mesh.vertices, mesh.faces)
     start, end = at[edges[:, 0]], at[edges[:, 1]]
-    edge, share = _parts_of(start[:, :2], end[:, :2])
+    edge, share = _split_at_grid_lines(start[:, :2], end[:, :2])
     same = edge[1:] == edge[:-1]
     edge, before, after = edge[1:][same], share[:-1][same], share[1:][same]
     start, way = start[edge], (end - start)[edge]
@@ -151,15 +137,15 @@ def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights,
         _add_points(middle, start[:, 2] + at_share * way[:, 2], top, bottom)
 
 
-def _outlines(vertices: Points, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
-    """Edges across which a surface turns from level to steep or downwards, or ends; rays see what is between."""
+def _find_sharp_edges(vertices: Points, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
+    """Find edges across which a surface turns from level to steep or downwards, or ends; rays see the rest."""
     columns = np.ascontiguousarray(vertices.T)
     start = columns[:, faces[:, 0]]
     (ax, ay, az), (bx, by, bz) = columns[:, faces[:, 1]] - start, columns[:, faces[:, 2]] - start
     across = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2
     up = ax * by - ay * bx
-    facing = np.sign(up) * (up**2 > _STEEP**2 * (across + up**2))
-    either = _at_outlines(facing, faces, len(vertices))
+    facing = np.sign(up) * (up**2 > _MAX_STEEP_SINE**2 * (across + up**2))
+    either = _find_sharp_vertices(facing, faces, len(vertices))
     a, b, c = (either[faces[:, k]] for k in range(3))
     near = np.flatnonzero((a & b) | (b & c) | (c & a))
     ends = np.sort(faces[near][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64), axis=1)
@@ -175,30 +161,26 @@ def _outlines(vertices: Points, faces: np.ndarray) -> Int64[np.ndarray, "n 2"]:
     return np.column_stack([chosen // len(vertices), chosen % len(vertices)])
 
 
-def _at_outlines(facing: np.ndarray, faces: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
-    """Vertices at which faces of two ways meet, or at which a surface may end: few, where sorting all edges is slow."""
+def _find_sharp_vertices(facing: np.ndarray, faces: np.ndarray, count: int) -> Bool[np.ndarray, " n"]:
+    """Find vertices at which faces of two kinds meet, or a surface may end: few, as sorting all edges is slow."""
     ways = np.zeros(count, dtype=np.int8)
     for way in (-1, 0, 1):
         seen = np.zeros(count, dtype=bool)
         seen[faces[facing == way]] = True
         ways += seen
-    # Where each edge has its reverse, what a vertex gets for its edges out it loses for those in; where not, sums of
-    # random numbers differ almost surely.
+    # Where each edge has its reverse, sums of random numbers over a vertex's edges out and in are equal; where not,
+    # they differ almost surely.
     number = np.random.default_rng(0).integers(2**32, size=count).astype(np.float64)
     a, b, c = faces.T
     out, back = np.concatenate([a, b, c]), np.concatenate([b, c, a])
     gained, lost = np.bincount(out, number[back], count), np.bincount(back, number[out], count)
-    either: Bool[np.ndarray, " n"] = (ways > 1) | (gained != lost)
-    return either
+    return (ways > 1) | (gained != lost)
 
 
-def _parts_of(start: np.ndarray, end: np.ndarray) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Where edges begin, cross the lines of the grid, and end: the edge and the share of its length, in order.
-
-    Args:
-        start: Shape (m, 2), in cells.
-        end: Likewise.
-    """
+def _split_at_grid_lines(
+    start: np.ndarray, end: np.ndarray
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Split edges (m, 2), in cells, where they cross grid lines: edge and share of its length, ends included."""
     every = np.arange(len(start))
     edges, shares = [every, every], [np.zeros(len(start)), np.ones(len(start))]
     for k in range(2):
@@ -214,24 +196,24 @@ def _parts_of(start: np.ndarray, end: np.ndarray) -> tuple[Int64[np.ndarray, " n
 
 
 def _add_points(at: np.ndarray, height: np.ndarray, top: Heights, bottom: Heights) -> None:
-    """Raises and lowers cells to points: where they are, in cells, and their heights [m]."""
+    """Raise and lower cells to points, given in cells, of these heights [m]."""
     index = np.clip(np.floor(at).astype(np.int64), 0, np.array(top.shape) - 1)
     np.maximum.at(top, (index[:, 0], index[:, 1]), height)
     np.minimum.at(bottom, (index[:, 0], index[:, 1]), height)
 
 
-def cavity_of(body: HeightMap) -> Cavity | None:
-    """The largest pool that forms when water is poured over the body from above, if a vessel's worth.
+def find_cavity(body: HeightMap) -> Cavity | None:
+    """Find the largest pool that forms when water is poured over the body, if it is large enough for a vessel.
 
     Flooding by morphological reconstruction (Vincent 1993); a rim broken by one cell counts as whole.
     """
     dry = float(body.bottom[body.filled].min()) - 1.0
     ground = np.pad(np.where(body.filled, body.top, dry), 2, constant_values=dry)
     ground = np.maximum(ground, ndimage.grey_closing(ground, size=(3, 3)))
-    # Water runs off the edge and through holes: there the surface starts dry.
+    # Water runs off the edge and through holes.
     seed = np.where(ground > dry + 0.5, ground.max(), dry)
     depth = (reconstruction(seed, ground, method="erosion") - ground)[2:-2, 2:-2]
-    labels, count = ndimage.label(depth > _SHALLOW_M)
+    labels, count = ndimage.label(depth > _MIN_WATER_DEPTH_M)
     if count == 0:
         return None
     volumes = ndimage.sum_labels(depth, labels, index=np.arange(1, count + 1)) * body.cell**2
@@ -240,44 +222,43 @@ def cavity_of(body: HeightMap) -> Cavity | None:
     rim_z = float((body.top + depth)[cells].max())
     opening = ndimage.binary_dilation(cells, np.ones((3, 3), dtype=bool))
     cavity = Cavity(cells, opening, rim_z, rim_z - float(depth[cells].max()), float(volumes[best - 1]))
-    width = inscribed_width(cells, body.cell)
+    width = measure_inscribed_width(cells, body.cell)
     enough = max(MIN_CAVITY_DEPTH_M, MIN_CAVITY_ASPECT * width)
     return cavity if width >= MIN_CAVITY_WIDTH_M and cavity.depth >= enough else None
 
 
-def flat_cells(body: HeightMap) -> CellMask:
-    """Cells around which the top is level to `FLAT_M`, without those where no disc of `MIN_FLAT_WIDTH_M` fits."""
+def find_flat_cells(body: HeightMap) -> CellMask:
+    """Find cells around which the top is level, without those where no disc of `MIN_FLAT_WIDTH_M` fits."""
     top = np.where(body.filled, body.top, -1e3)
     span = ndimage.maximum_filter(top, 3, mode="nearest") - ndimage.minimum_filter(top, 3, mode="nearest")
-    labels, count = ndimage.label(body.filled & (span <= FLAT_M))
+    labels, count = ndimage.label(body.filled & (span <= LEVEL_TOLERANCE_M))
     flat = np.zeros(top.shape, dtype=bool)
     for value, box in enumerate(ndimage.find_objects(labels, count), start=1):
         cells = labels[box] == value
         # The outermost cells of a level top are not level themselves: the disc grows back by one.
         least = MIN_FLAT_WIDTH_M - 2 * body.cell
-        if (min(cells.shape) + 1) * body.cell >= least and inscribed_width(cells, body.cell) >= least:
+        if (min(cells.shape) + 1) * body.cell >= least and measure_inscribed_width(cells, body.cell) >= least:
             flat[box] |= cells
     return flat
 
 
-def turned_quarter(body: HeightMap) -> HeightMap:
-    """The map of the body turned by 90° about the table frame's own z."""
+def rotate_quarter_turn(body: HeightMap) -> HeightMap:
+    """Rotate the map by 90° about the z axis of the table frame."""
     # (x, y) goes to (-y, x): column j becomes row -1 - j.
     corner = (-body.corner[1] - body.top.shape[1], body.corner[0])
     top, bottom = (np.ascontiguousarray(values.T[::-1]) for values in (body.top, body.bottom))
     return HeightMap(body.cell, corner, top, bottom)
 
 
-def inscribed_width(cells: CellMask, cell: float) -> float:
-    """Diameter of the largest disc in the cells [m]."""
+def measure_inscribed_width(cells: CellMask, cell: float) -> float:
+    """Measure the diameter of the largest disc in the cells [m]."""
     return float(2 * ndimage.distance_transform_edt(np.pad(cells, 1)).max() * cell)
 
 
-def column_center(body: HeightMap) -> Vector3:
-    """Centre of the columns between bottom and top [m]: of the volume, for bodies without holes and overhangs."""
+def compute_column_center(body: HeightMap) -> Vector3:
+    """Compute the centre of the columns between bottom and top [m]: of the volume, without holes and overhangs."""
     i, j = np.nonzero(body.filled)
     top, bottom = body.top[i, j], body.bottom[i, j]
     weight = np.maximum(top - bottom, 1e-4)
     x, y = (body.corner[0] + i + 0.5) * body.cell, (body.corner[1] + j + 0.5) * body.cell
-    center: Vector3 = np.array([x, y, (top + bottom) / 2]) @ weight / weight.sum()
-    return center
+    return np.array([x, y, (top + bottom) / 2]) @ weight / weight.sum()

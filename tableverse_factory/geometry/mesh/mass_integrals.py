@@ -1,4 +1,4 @@
-"""Volume, centre and second moments of what closed meshes enclose."""
+"""Volume, centre and second moments of closed meshes."""
 
 from collections.abc import Sequence
 
@@ -11,14 +11,14 @@ from tableverse_factory.geometry.math.aabb import aabb
 Rows = Float64[np.ndarray, "3 m"]
 
 
-def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
-    """Volume [m³], centre [m] and second moments of volume about the centre [m⁵] of a closed mesh.
+def integrate_volume(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
+    """Compute volume [m³], centre [m] and second moments about the centre [m⁵] of a closed mesh.
 
     Sums signed tetrahedra from the middle of the box: exact for polyhedra.
     """
     low, high = aabb(mesh.vertices)
     middle = (low + high) / 2
-    corners, six_volumes = _tetrahedra(mesh.vertices - middle, mesh.faces)
+    corners, six_volumes = _make_tetrahedra(mesh.vertices - middle, mesh.faces)
     volume = float(six_volumes.sum() / 6)
     if volume == 0.0:
         return 0.0, middle, np.zeros((3, 3))
@@ -28,18 +28,20 @@ def volume_integrals(mesh: TriangleMesh) -> tuple[float, Vector3, Matrix3]:
     return volume, middle + center, outer / 120 - volume * np.outer(center, center)
 
 
-def signed_volume(mesh: TriangleMesh) -> float:
-    """Volume by the divergence theorem [m³]; meaningful for closed meshes, negative where they are inside out."""
-    _, six_volumes = _tetrahedra(mesh.vertices, mesh.faces)
+def compute_signed_volume(mesh: TriangleMesh) -> float:
+    """Compute the volume by the divergence theorem [m³]; negative for closed meshes that are inside out."""
+    _, six_volumes = _make_tetrahedra(mesh.vertices, mesh.faces)
     return float(six_volumes.sum() / 6)
 
 
-def volumes_and_centers(meshes: Sequence[TriangleMesh], least_m3: float) -> tuple[Float64[np.ndarray, " n"], Points]:
-    """Volume [m³] and centre [m] of each of some small closed meshes, all at once.
+def compute_volumes_and_centers(
+    meshes: Sequence[TriangleMesh], least_m3: float
+) -> tuple[Float64[np.ndarray, " n"], Points]:
+    """Compute volume [m³] and centre [m] of many small closed meshes at once.
 
     Args:
         meshes: At least one.
-        least_m3: Those of no more have this volume, and their centre in the mean of their corners.
+        least_m3: Smaller ones get this volume, and the mean of their corners as centre.
 
     Raises:
         ValueError: if one has no corner or no face.
@@ -52,7 +54,7 @@ def volumes_and_centers(meshes: Sequence[TriangleMesh], least_m3: float) -> tupl
     starts = np.cumsum(sizes) - sizes
     middles: Points = np.add.reduceat(vertices, starts) / sizes[:, None]
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
-    corners, six_volumes = _tetrahedra(vertices - np.repeat(middles, sizes, axis=0), faces)
+    corners, six_volumes = _make_tetrahedra(vertices - np.repeat(middles, sizes, axis=0), faces)
     first = np.cumsum(counts) - counts
     volumes: Float64[np.ndarray, " n"] = np.add.reduceat(six_volumes, first) / 6
     moments = np.add.reduceat((corners[0] + corners[1] + corners[2]) * six_volumes, first, axis=1).T / 24
@@ -61,8 +63,8 @@ def volumes_and_centers(meshes: Sequence[TriangleMesh], least_m3: float) -> tupl
     return np.maximum(volumes, least_m3), middles
 
 
-def _tetrahedra(vertices: Points, faces: np.ndarray) -> tuple[tuple[Rows, Rows, Rows], Float64[np.ndarray, " m"]]:
-    """The corners of each face, by coordinates, and six times the volume between it and the origin."""
+def _make_tetrahedra(vertices: Points, faces: np.ndarray) -> tuple[tuple[Rows, Rows, Rows], Float64[np.ndarray, " m"]]:
+    """Corners of each face, by coordinates, and six times the volume between it and the origin."""
     columns = np.ascontiguousarray(vertices.T)
     corners = columns[:, faces[:, 0]], columns[:, faces[:, 1]], columns[:, faces[:, 2]]
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners

@@ -1,4 +1,4 @@
-"""Meshes of a file as one, with their colours: pictures on faces, plain materials, or colours of vertices."""
+"""Merge the meshes of a file with their colours: textures, plain materials, or vertex colours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from PIL import Image
 
 from schemas.geometry import Colors, Matrix4, Picture, Points, Texture, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.core.storage.untrusted import PICTURE_FORMATS
+from tableverse_factory.core.storage.untrusted import IMAGE_FORMATS
 
 MAX_SIDE = 2048
-"""Larger pictures are reduced: a texture of this size is as fine as a picture of the whole table."""
+"""Larger pictures are reduced."""
 MAX_SHEET = 4096
-"""Side of the sheet that holds the pictures of several materials."""
-PLAIN = (178, 178, 184)
-"""sRGB of what has no colour, beside parts that have one."""
+"""Side of the atlas that holds the pictures of several materials."""
+DEFAULT_COLOR = (178, 178, 184)
+"""sRGB of uncoloured parts beside coloured ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class MaterialPart:
     """A mesh of a file, and where it stands in it.
 
     Attributes:
-        mesh: As trimesh read it; it is not changed, and pictures forget their format when they are copied.
+        mesh: As trimesh read it; not copied, as pictures would lose their format.
         matrix: From its own frame to the file's. Shape (4, 4).
     """
 
@@ -33,31 +33,30 @@ class MaterialPart:
     matrix: Matrix4
 
     def vertices(self) -> Points:
-        """In the file's frame."""
+        """Vertices in the file's frame."""
         own = np.asarray(self.mesh.vertices, dtype=np.float64)
         if np.array_equal(self.matrix, np.eye(4)):
             return own
-        moved: Points = own @ self.matrix[:3, :3].T + self.matrix[:3, 3]
-        return moved
+        return own @ self.matrix[:3, :3].T + self.matrix[:3, 3]
 
     def faces(self) -> np.ndarray:
-        """Counter-clockwise seen from outside, also where the node mirrors."""
+        """Faces, counter-clockwise seen from outside also where the node mirrors."""
         own = np.asarray(self.mesh.faces, dtype=np.int64)
         return own[:, ::-1] if np.linalg.det(self.matrix[:3, :3]) < 0.0 else own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Paint:
-    """A part's picture and the points of it at its vertices, or its plain colour (`uv` is None)."""
+    """A part's picture with uv coordinates of the vertices, or its plain colour (`uv` is None)."""
 
     picture: Picture
     uv: Float64[np.ndarray, "n 2"] | None
 
 
 def merge_parts(parts: Sequence[MaterialPart], max_pixels: int) -> TriangleMesh:
-    """One mesh of all parts, with one texture if any part has a picture, else with colours of vertices if any has one.
+    """Merge parts into one mesh, with one texture if any part has a picture, else with vertex colours if any has one.
 
-    Where there is a texture, vertices at the same place become one: files split them at its seams.
+    With a texture, vertices at the same place become one: files split them at its seams.
 
     Raises:
         GeometryError: if a picture has more pixels than allowed, or there are no parts.
@@ -68,37 +67,39 @@ def merge_parts(parts: Sequence[MaterialPart], max_pixels: int) -> TriangleMesh:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     vertices = np.concatenate([part.vertices() for part in parts])
     faces = np.concatenate([part.faces() + start for part, start in zip(parts, starts, strict=True)])
-    paints = [_paint(mesh, max_pixels) for mesh in meshes]
+    paints = [_read_paint(mesh, max_pixels) for mesh in meshes]
     if any(paint is not None and paint.uv is not None for paint in paints):
-        vertices, index = _welded(vertices)
-        return TriangleMesh(vertices, index[faces].astype(np.int32), None, _texture(parts, paints))
-    return TriangleMesh(vertices, faces.astype(np.int32), _vertex_colors(meshes, paints))
+        vertices, index = _weld_vertices(vertices)
+        return TriangleMesh(vertices, index[faces].astype(np.int32), None, _merge_textures(parts, paints))
+    return TriangleMesh(vertices, faces.astype(np.int32), _merge_vertex_colors(meshes, paints))
 
 
-def _paint(mesh: trimesh.Trimesh, max_pixels: int) -> _Paint | None:
-    """What a material says; None where there is none. An OBJ's plain colour does not tint its picture."""
+def _read_paint(mesh: trimesh.Trimesh, max_pixels: int) -> _Paint | None:
+    """Read a material, if there is one; an OBJ's plain colour does not tint its picture."""
     if mesh.visual.kind != "texture":
         return None
     material, uv = mesh.visual.material, mesh.visual.uv
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     linear, plain = getattr(material, "baseColorFactor", None), getattr(material, "kwargs", {}).get("kd")
-    # trimesh puts a picture of its own, without a format, where there is none
+    # trimesh supplies a picture of its own, without a format, where there is none
     if (
         isinstance(image, Image.Image)
-        and image.format in PICTURE_FORMATS
+        and image.format in IMAGE_FORMATS
         and uv is not None
         and len(uv) == len(mesh.vertices)
     ):
-        return _Paint(_tinted(_pixels(image, max_pixels), linear), np.nan_to_num(np.asarray(uv, dtype=np.float64)))
+        return _Paint(
+            _apply_tint(_decode_picture(image, max_pixels), linear), np.nan_to_num(np.asarray(uv, dtype=np.float64))
+        )
     if linear is not None:
-        return _Paint(_tinted(np.full((1, 1, 3), 255, dtype=np.uint8), linear), None)
+        return _Paint(_apply_tint(np.full((1, 1, 3), 255, dtype=np.uint8), linear), None)
     if plain is not None and len(plain) >= 3:
-        return _Paint(_as_bytes(255.0 * np.asarray(plain[:3], dtype=np.float64)).reshape(1, 1, 3), None)
+        return _Paint(_round_to_bytes(255.0 * np.asarray(plain[:3], dtype=np.float64)).reshape(1, 1, 3), None)
     return None
 
 
-def _pixels(image: Image.Image, max_pixels: int) -> Picture:
-    """The picture in sRGB, reduced to at most `MAX_SIDE` a side."""
+def _decode_picture(image: Image.Image, max_pixels: int) -> Picture:
+    """Decode a picture to sRGB, reduced to at most `MAX_SIDE` a side."""
     width, height = image.size
     if not 0 < width * height <= max_pixels:
         raise GeometryError(f"a texture of {width} x {height} pixels; at most {max_pixels} are decoded")
@@ -107,14 +108,13 @@ def _pixels(image: Image.Image, max_pixels: int) -> Picture:
     return np.array(opaque)
 
 
-def _tinted(picture: Picture, factor: np.ndarray | None) -> Picture:
-    """The picture times glTF's colour factor, which is given in linear light."""
+def _apply_tint(picture: Picture, factor: np.ndarray | None) -> Picture:
+    """Multiply a picture by glTF's colour factor, which is given in linear light."""
     if factor is None or (np.asarray(factor)[:3] == 255).all():
         return picture
     levels = np.arange(256)[:, None] / 255.0
-    table = _as_bytes(255.0 * _to_srgb(_to_linear(levels) * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)))
-    tinted: Picture = np.stack([table[picture[..., k], k] for k in range(3)], axis=-1)
-    return tinted
+    table = _round_to_bytes(255.0 * _to_srgb(_to_linear(levels) * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)))
+    return np.stack([table[picture[..., k], k] for k in range(3)], axis=-1)
 
 
 def _to_linear(srgb: np.ndarray) -> np.ndarray:
@@ -125,33 +125,32 @@ def _to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def _as_bytes(values: np.ndarray) -> np.ndarray:
-    rounded: np.ndarray = np.rint(np.clip(np.nan_to_num(values), 0.0, 255.0)).astype(np.uint8)
-    return rounded
+def _round_to_bytes(values: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(np.nan_to_num(values), 0.0, 255.0)).astype(np.uint8)
 
 
-def _vertex_colors(meshes: Sequence[trimesh.Trimesh], paints: Sequence[_Paint | None]) -> Colors | None:
-    """Colours of the vertices of all meshes; None where no mesh has any."""
+def _merge_vertex_colors(meshes: Sequence[trimesh.Trimesh], paints: Sequence[_Paint | None]) -> Colors | None:
+    """Join the vertex colours of all meshes; None where no mesh has any."""
     if not any(p is not None or mesh.visual.kind == "vertex" for mesh, p in zip(meshes, paints, strict=True)):
         return None
-    colors = np.concatenate([_of_vertices(mesh, paint) for mesh, paint in zip(meshes, paints, strict=True)])
+    colors = np.concatenate([_make_vertex_colors(mesh, paint) for mesh, paint in zip(meshes, paints, strict=True)])
     return np.ascontiguousarray(colors, dtype=np.uint8)
 
 
-def _of_vertices(mesh: trimesh.Trimesh, paint: _Paint | None) -> Colors:
+def _make_vertex_colors(mesh: trimesh.Trimesh, paint: _Paint | None) -> Colors:
     if mesh.visual.kind == "vertex":
-        colors: Colors = np.asarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8)
-        return colors
-    color = np.array(PLAIN, dtype=np.uint8) if paint is None else paint.picture[0, 0]
+        return np.asarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8)
+    color = np.array(DEFAULT_COLOR, dtype=np.uint8) if paint is None else paint.picture[0, 0]
     return np.tile(color, (len(mesh.vertices), 1))
 
 
-def _texture(parts: Sequence[MaterialPart], paints: Sequence[_Paint | None]) -> Texture:
-    """All pictures in one, above one another; each part's points moved to its own.
+def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | None]) -> Texture:
+    """Stack all pictures into an atlas and map each part's uv coordinates to its own.
 
-    Points that wrap around a picture are brought back into it face by face; a face over several repetitions shows one.
+    Coordinates that wrap around are brought back into the picture face by face; a face over several repetitions shows
+    one.
     """
-    pictures = [_own_picture(part.mesh, paint) for part, paint in zip(parts, paints, strict=True)]
+    pictures = [_make_part_picture(part.mesh, paint) for part, paint in zip(parts, paints, strict=True)]
     keys = [(picture.shape, picture.tobytes()) for picture in pictures]
     unique = dict(zip(keys, pictures, strict=True))
     rows = dict(zip(unique, np.cumsum([0, *(p.shape[0] for p in unique.values())])[:-1].tolist(), strict=True))
@@ -161,31 +160,33 @@ def _texture(parts: Sequence[MaterialPart], paints: Sequence[_Paint | None]) -> 
     for part, paint, picture, key in zip(parts, paints, pictures, keys, strict=True):
         height, width = picture.shape[:2]
         sheet[rows[key] : rows[key] + height, :width] = picture
-        uv = _corners_within(part, paint)
-        if len(unique) > 1:  # to the centres of the outer pixels, so that no neighbour shines in
+        uv = _wrap_corner_uv(part, paint)
+        if len(unique) > 1:  # to the centres of the outer pixels, so that no neighbour bleeds in
             pixel = 0.5 + np.stack([uv[..., 0] * (width - 1), rows[key] + (1.0 - uv[..., 1]) * (height - 1)], axis=-1)
             uv = np.array([0.0, 1.0]) + pixel / sheet_size * np.array([1.0, -1.0])
         corners.append(uv)
-    return Texture(_bounded(sheet), np.concatenate(corners))
+    return Texture(_limit_size(sheet), np.concatenate(corners))
 
 
-def _own_picture(mesh: trimesh.Trimesh, paint: _Paint | None) -> Picture:
-    """A part's picture; of colours of vertices, their mean."""
-    return _as_bytes(_of_vertices(mesh, paint).mean(axis=0)).reshape(1, 1, 3) if paint is None else paint.picture
+def _make_part_picture(mesh: trimesh.Trimesh, paint: _Paint | None) -> Picture:
+    """A part's picture, or the mean of its vertex colours."""
+    return (
+        _round_to_bytes(_make_vertex_colors(mesh, paint).mean(axis=0)).reshape(1, 1, 3)
+        if paint is None
+        else paint.picture
+    )
 
 
-def _corners_within(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:
+def _wrap_corner_uv(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:
     if paint is None or paint.uv is None:
         return np.full((len(part.mesh.faces), 3, 2), 0.5)
     corners = np.clip(paint.uv, -1e6, 1e6)[part.faces()]
     outside = ((corners < 0.0) | (corners > 1.0)).any(axis=(1, 2))
     corners[outside] -= np.floor(corners[outside].min(axis=1, keepdims=True))
-    within: Float64[np.ndarray, "m 3 2"] = np.clip(corners, 0.0, 1.0)
-    return within
+    return np.clip(corners, 0.0, 1.0)
 
 
-def _bounded(sheet: Picture) -> Picture:
-    """The picture reduced until no side is longer than `MAX_SHEET`."""
+def _limit_size(sheet: Picture) -> Picture:
     if max(sheet.shape[:2]) <= MAX_SHEET:
         return sheet
     image = Image.fromarray(sheet)
@@ -193,8 +194,8 @@ def _bounded(sheet: Picture) -> Picture:
     return np.array(image)
 
 
-def _welded(vertices: Points) -> tuple[Points, np.ndarray]:
-    """The distinct vertices, in the order in which they first appear, and the place of each."""
+def _weld_vertices(vertices: Points) -> tuple[Points, np.ndarray]:
+    """Distinct vertices, in order of first appearance, and the index of each vertex among them."""
     _, first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     place = np.empty(len(first), dtype=np.int64)
     place[np.argsort(first, kind="stable")] = np.arange(len(first))

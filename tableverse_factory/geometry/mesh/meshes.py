@@ -8,12 +8,12 @@ from pathlib import PurePosixPath
 
 import numpy as np
 import trimesh
-from jaxtyping import Float64
 from PIL import Image
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.aabb import aabb, size_around
+from tableverse_factory.geometry.math.aabb import aabb, aabb_size
+from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.fast_obj import read_plain_obj
 from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
@@ -25,17 +25,15 @@ MAX_PIXELS = 40_000_000
 MAX_EXTENT_M = 1000.0
 MAX_COORDINATE_M = 1e5
 
-_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-
 
 def read_mesh(
     data: bytes, file_name: str, beside: Mapping[str, bytes] | None = None, max_pixels: int = MAX_PIXELS
 ) -> TriangleMesh:
-    """Decodes an OBJ, PLY, STL or GLB file into one mesh with its colours; GLB is turned from Y-up to Z-up.
+    """Decode an OBJ, PLY, STL or GLB file into one mesh with its colours; GLB is turned from Y-up to Z-up.
 
     Args:
         data: The file.
-        file_name: Its ending says what it is.
+        file_name: Its ending tells the format.
         beside: The material file and the pictures that an OBJ names, by the names there.
         max_pixels: Of each picture.
 
@@ -48,52 +46,56 @@ def read_mesh(
     if len(data) > MAX_FILE_BYTES:
         raise GeometryError(f"mesh {file_name!r}: {len(data)} bytes; at most {MAX_FILE_BYTES} are read")
     if suffix == ".obj" and (plain := read_plain_obj(data)) is not None:
-        return checked(plain, file_name)
+        return check_mesh(plain, file_name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides
             scene = trimesh.load_scene(
                 io.BytesIO(data),
                 file_type=suffix[1:],
-                resolver=_Beside(beside or {}),
+                resolver=_MemoryResolver(beside or {}),
                 process=False,
                 skip_materials=suffix == ".obj" and not beside,
             )
-            mesh = merge_parts(_parts(scene), max_pixels)
+            mesh = merge_parts(_collect_parts(scene), max_pixels)
     except Exception as error:
         raise GeometryError(f"mesh {file_name!r} does not decode: {type(error).__name__}: {error}"[:500]) from error
     if suffix == ".glb":
-        mesh = replace(mesh, vertices=mesh.vertices @ _Y_UP_TO_Z_UP.T)
-    return checked(mesh, file_name)
+        mesh = replace(mesh, vertices=mesh.vertices @ Y_UP_TO_Z_UP.T)
+    return check_mesh(mesh, file_name)
 
 
-class _Beside(trimesh.resolvers.Resolver):  # type: ignore[misc]
-    """Files in memory, in place of a folder: trimesh reads nothing else."""
+class _MemoryResolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
+    """Files in memory, the only ones that trimesh may read."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = files
 
     def get(self, name: str) -> bytes:
-        """The file of this name."""
+        """Return a file."""
         if name not in self._files:
             raise FileNotFoundError(name)
         return self._files[name]
 
     def keys(self) -> Iterable[str]:
-        """The names of the files."""
+        """List the names."""
         return self._files.keys()
 
     def write(self, name: str, data: bytes) -> None:  # noqa: ARG002
-        """Refuses: nothing is written."""
+        """Refuse to write."""
         raise PermissionError(name)
 
-    def namespaced(self, namespace: str) -> "_Beside":  # noqa: ARG002
-        """The same files, whatever the folder."""
+    def namespaced(self, namespace: str) -> "_MemoryResolver":  # noqa: ARG002
+        """Return the same files for any folder."""
         return self
 
 
-def _parts(scene: trimesh.Scene) -> list[MaterialPart]:
-    """The scene's meshes and where its nodes put them, if together they are not too many."""
+def _collect_parts(scene: trimesh.Scene) -> list[MaterialPart]:
+    """Collect the scene's meshes with their node transforms.
+
+    Raises:
+        GeometryError: if there are too many triangles.
+    """
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     parts = [MaterialPart(scene.geometry[name], matrix) for matrix, name in placed]
     parts = [part for part in parts if isinstance(part.mesh, trimesh.Trimesh) and len(part.mesh.faces)]
@@ -102,8 +104,8 @@ def _parts(scene: trimesh.Scene) -> list[MaterialPart]:
     return parts
 
 
-def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
-    """Returns the mesh if its numbers can be computed with.
+def check_mesh(mesh: TriangleMesh, name: str) -> TriangleMesh:
+    """Return the mesh if it is usable.
 
     Raises:
         GeometryError: if it is empty, not finite, too large, or its indices point nowhere.
@@ -121,7 +123,7 @@ def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
         raise GeometryError(
             f"mesh {name!r} reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"
         )
-    extent = float(size_around(mesh.vertices).max())
+    extent = float(aabb_size(mesh.vertices).max())
     if not 0.0 < extent <= MAX_EXTENT_M:
         raise GeometryError(
             f"mesh {name!r} is {extent:g} m large; give metres, more than 0 and at most {MAX_EXTENT_M:g}"
@@ -130,7 +132,7 @@ def checked(mesh: TriangleMesh, name: str) -> TriangleMesh:
 
 
 def from_trimesh(mesh: trimesh.Trimesh) -> TriangleMesh:
-    """Copies a trimesh, vertex colours included where it has them."""
+    """Copy a trimesh, vertex colours included where it has them."""
     colors = None
     if getattr(mesh, "visual", None) is not None and mesh.visual.kind == "vertex":
         colors = np.ascontiguousarray(mesh.visual.vertex_colors[:, :3], dtype=np.uint8)
@@ -140,19 +142,19 @@ def from_trimesh(mesh: trimesh.Trimesh) -> TriangleMesh:
 
 
 def to_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
-    """A trimesh that shares nothing with the record and is not processed."""
+    """Make an unprocessed trimesh that shares no memory with the mesh."""
     return trimesh.Trimesh(
         mesh.vertices.copy(), mesh.faces.copy(), vertex_colors=mesh.vertex_colors, process=False, validate=False
     )
 
 
-def placed_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMesh:
-    """The mesh in the parent frame of `pose`."""
+def place_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMesh:
+    """Transform a mesh to the parent frame of `pose`."""
     return replace(mesh, vertices=transform_points(pose, mesh.vertices, scale))
 
 
 def concatenate_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """All of them as one mesh without colours; empty where there are none."""
+    """Join meshes into one without colours; empty where there are none."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertices = [np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
@@ -161,13 +163,7 @@ def concatenate_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     )
 
 
-def bounds(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
-    """Lowest and highest corner of the axis-aligned box [m]."""
-    return aabb(mesh.vertices)
-
-
 def box_center(mesh: TriangleMesh) -> Vector3:
     """Centre of the axis-aligned box [m]."""
-    low, high = bounds(mesh)
-    center: Float64[np.ndarray, "3"] = (low + high) / 2
-    return center
+    low, high = aabb(mesh.vertices)
+    return (low + high) / 2

@@ -1,4 +1,4 @@
-"""From any triangles to a closed solid, with a word for what had to be done."""
+"""Repair of meshes: from any triangles to a closed solid, with the name of the repair."""
 
 from collections.abc import Callable
 
@@ -9,11 +9,12 @@ from jaxtyping import Int64
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.mesh.meshes import bounds, checked, from_trimesh, to_trimesh
-from tableverse_factory.geometry.mesh.remesh import remeshed
-from tableverse_factory.geometry.mesh.surface_samples import surface_area
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.meshes import check_mesh, from_trimesh, to_trimesh
+from tableverse_factory.geometry.mesh.remesh import remesh
+from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 
-LEAST_FILL = 1e-7
+MIN_FILL_SHARE = 1e-7
 """A solid that fills less than this share of the cube of its extent is flat: it is remeshed, which gives it body."""
 MAX_CAP_SHARE = 0.25
 """Holes are capped if the caps have at most this share of the surface: an open bowl of one sheet must stay open."""
@@ -21,8 +22,8 @@ MAX_FACES_STITCHED = 300_000
 """Larger broken meshes are remeshed at once; finding their neighbours face by face would take minutes."""
 
 
-def closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
-    """The mesh as a closed solid of positive volume, in the mesh's own frame, and how it was repaired.
+def make_closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
+    """Make a closed solid of positive volume of a mesh, in its own frame, and tell how it was repaired.
 
     The least repair that works is taken: none (empty), `merged` (vertices that coincide), `oriented` (faces turned),
     `filled` (small holes capped), `remeshed` (voxels). Shells inside one another or overlapping count as one body.
@@ -30,64 +31,64 @@ def closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
     Raises:
         GeometryError: if the mesh has no finite triangles, or encloses nothing even then.
     """
-    checked(mesh, "mesh")
-    low, high = bounds(mesh)
+    check_mesh(mesh, "mesh")
+    low, high = aabb(mesh.vertices)
     center, size = (low + high) / 2, float((high - low).max())
-    solid = _united(as_solid(mesh))
-    if abs(solid.volume()) > LEAST_FILL * size**3:
+    solid = _unite_shells(mesh_to_solid(mesh))
+    if abs(solid.volume()) > MIN_FILL_SHARE * size**3:
         return solid, ""
     shape = TriangleMesh((mesh.vertices - center) / size, mesh.faces)  # tolerances of what follows are absolute
     for note, repair in _REPAIRS:
-        solid = _united(as_solid(repair(shape)))
-        if abs(solid.volume()) > LEAST_FILL:
+        solid = _unite_shells(mesh_to_solid(repair(shape)))
+        if abs(solid.volume()) > MIN_FILL_SHARE:
             return solid.scale([size] * 3).translate(center), note
     raise GeometryError(f"a mesh of {len(mesh.faces)} triangles encloses nothing, even where it is remeshed")
 
 
-def as_solid(mesh: TriangleMesh) -> manifold3d.Manifold:
-    """The mesh as a manifold3d solid; empty where it is not closed."""
+def mesh_to_solid(mesh: TriangleMesh) -> manifold3d.Manifold:
+    """Convert a mesh to a manifold3d solid; empty where it is not closed."""
     return manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64)))
 
 
-def as_mesh(solid: manifold3d.Manifold) -> TriangleMesh:
-    """The surface of a solid."""
+def solid_to_mesh(solid: manifold3d.Manifold) -> TriangleMesh:
+    """Convert a solid to its surface."""
     mesh = solid.to_mesh64()
     return TriangleMesh(np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int32))
 
 
-def outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
-    """The shell, turned where it is inside out."""
+def orient_outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
+    """Turn a shell that is inside out."""
     if shell.volume() >= 0.0:
         return shell
-    mesh = as_mesh(shell)
-    return as_solid(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1].copy()))
+    mesh = solid_to_mesh(shell)
+    return mesh_to_solid(TriangleMesh(mesh.vertices, mesh.faces[:, ::-1].copy()))
 
 
-def _united(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    """The union of the solid's shells, those that are inside out turned."""
-    shells = [outward(shell) for shell in solid.decompose()]
+def _unite_shells(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    """Unite the shells of a solid, those that are inside out turned."""
+    shells = [orient_outward(shell) for shell in solid.decompose()]
     if len(shells) < 2:
         return shells[0] if shells else solid
     return manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add)
 
 
-def _merged(mesh: TriangleMesh) -> TriangleMesh:
-    return from_trimesh(_tidied(mesh))
+def _merge_vertices(mesh: TriangleMesh) -> TriangleMesh:
+    return from_trimesh(_tidy(mesh))
 
 
-def _oriented(mesh: TriangleMesh) -> TriangleMesh:
-    tidied = _tidied(mesh)
+def _orient_faces(mesh: TriangleMesh) -> TriangleMesh:
+    tidied = _tidy(mesh)
     if len(tidied.faces) <= MAX_FACES_STITCHED:
         trimesh.repair.fix_winding(tidied)
     return from_trimesh(tidied)
 
 
-def _filled(mesh: TriangleMesh) -> TriangleMesh:
-    oriented = _oriented(mesh)
-    return _capped(oriented) if len(oriented.faces) <= MAX_FACES_STITCHED else oriented
+def _fill_holes(mesh: TriangleMesh) -> TriangleMesh:
+    oriented = _orient_faces(mesh)
+    return _cap_holes(oriented) if len(oriented.faces) <= MAX_FACES_STITCHED else oriented
 
 
-def _tidied(mesh: TriangleMesh) -> trimesh.Trimesh:
+def _tidy(mesh: TriangleMesh) -> trimesh.Trimesh:
     loose = to_trimesh(mesh)
     loose.merge_vertices()
     loose.update_faces(loose.nondegenerate_faces() & loose.unique_faces())
@@ -95,11 +96,11 @@ def _tidied(mesh: TriangleMesh) -> trimesh.Trimesh:
     return loose
 
 
-def _capped(mesh: TriangleMesh) -> TriangleMesh:
-    """Each boundary loop closed by a fan around its centre, if all fans together are small."""
+def _cap_holes(mesh: TriangleMesh) -> TriangleMesh:
+    """Close each boundary loop by a fan around its centre, if all fans together are small."""
     vertices, faces = [mesh.vertices], [mesh.faces]
     cap_area = 0.0
-    for loop in _boundary_loops(mesh):
+    for loop in _find_boundary_loops(mesh):
         ring = mesh.vertices[loop]
         center = ring.mean(axis=0)
         following = np.roll(loop, -1)
@@ -108,13 +109,13 @@ def _capped(mesh: TriangleMesh) -> TriangleMesh:
         faces.append(np.stack([following, loop, apex], axis=1).astype(np.int32))
         spokes = np.cross(ring - center, mesh.vertices[following] - center)
         cap_area += float(np.linalg.norm(spokes, axis=1).sum()) / 2
-    if cap_area > MAX_CAP_SHARE * surface_area(mesh):
+    if cap_area > MAX_CAP_SHARE * compute_surface_area(mesh):
         return mesh
     return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
-    """Closed chains of edges that one face alone has, in the direction of that face; none passes a vertex twice."""
+def _find_boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
+    """Find closed chains of edges of one face each, in its direction; none passes a vertex twice."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]).tolist()
     known = {(a, b) for a, b in edges}
     onward: dict[int, list[int]] = {}
@@ -134,8 +135,8 @@ def _boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
 
 
 _REPAIRS: tuple[tuple[str, Callable[[TriangleMesh], TriangleMesh]], ...] = (
-    ("merged", _merged),
-    ("oriented", _oriented),
-    ("filled", _filled),
-    ("remeshed", remeshed),
+    ("merged", _merge_vertices),
+    ("oriented", _orient_faces),
+    ("filled", _fill_holes),
+    ("remeshed", remesh),
 )

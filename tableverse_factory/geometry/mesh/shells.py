@@ -1,4 +1,4 @@
-"""The shells of a mesh, and what several closed ones enclose together: overlaps once, hollows not."""
+"""Shells of a mesh: how many there are, and the volume that several enclose, overlaps once and hollows excluded."""
 
 import manifold3d
 import numpy as np
@@ -7,24 +7,24 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.geometry import Faces, TriangleMesh
 from tableverse_factory.core.memoize import memoize_by_content
-from tableverse_factory.geometry.mesh.repair import as_mesh, as_solid, outward
+from tableverse_factory.geometry.mesh.repair import mesh_to_solid, orient_outward, solid_to_mesh
 
 WITHIN_SHARE = 0.01
 """A shell is within others if no more than this share of it is outside them."""
 SAME_SHARE = 1e-9
 """Volumes that differ by no more than this share are the same."""
 REMEMBERED_BYTES = 4 * 1024
-"""Yes or no for the meshes of some scenes."""
+"""One flag for each mesh of some scenes."""
 
 
 def is_one_shell(mesh: TriangleMesh) -> bool:
-    """Whether all its faces hang together."""
+    """Whether all faces are connected."""
     return _is_one_shell(mesh.faces)
 
 
 @memoize_by_content(REMEMBERED_BYTES)
 def _is_one_shell(faces: Faces) -> bool:
-    """Asked of the same triangles by three stages, wherever their corners are."""
+    """Cached by the triangles alone: three stages need it for the same ones."""
     n = int(faces.max(initial=0)) + 1
     ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     edges = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(n, n))
@@ -32,30 +32,30 @@ def _is_one_shell(faces: Faces) -> bool:
     return bool((label[faces[:, 0]] == label[faces[:1, 0]]).all())
 
 
-def bounded_by_shells(mesh: TriangleMesh) -> TriangleMesh:
-    """A surface around what a closed mesh of several shells encloses; the mesh itself where nothing is amiss with it.
+def unite_shells(mesh: TriangleMesh) -> TriangleMesh:
+    """Make one surface of a closed mesh of several shells; the mesh itself where its shells are consistent.
 
-    The outward shells that lie in no larger one that is inside out are united first. One that is inside out and within
-    them bounds a hollow, which is taken away; elsewhere it was turned the wrong way and adds what it encloses. What
-    lies in hollows is added, from the outside in. An inner wall that is turned outwards bounds no hollow.
+    Outward shells that lie in no larger inverted one are united first. An inverted shell within them bounds a hollow,
+    which is subtracted; elsewhere it was inverted by mistake and is added. Then shells in hollows are added, from
+    outside in. An inner wall that is turned outwards bounds no hollow.
     """
-    shells = as_solid(mesh).decompose()
-    turned = [outward(shell) for shell in shells if shell.volume() < 0.0]
+    shells = mesh_to_solid(mesh).decompose()
+    turned = [orient_outward(shell) for shell in shells if shell.volume() < 0.0]
     first, others = manifold3d.Manifold(), []
     for shell in shells:
-        is_outward, solid = shell.volume() >= 0.0, outward(shell)
-        if is_outward and not any(solid.volume() < hull.volume() and _within(solid, hull) for hull in turned):
+        is_outward, solid = shell.volume() >= 0.0, orient_outward(shell)
+        if is_outward and not any(solid.volume() < hull.volume() and _is_within(solid, hull) for hull in turned):
             first += solid
         else:
             others.append((is_outward, solid))
     united = first
     for is_outward, solid in sorted(others, key=lambda other: -float(other[1].volume())):
-        united = united - solid if not is_outward and _within(solid, first) else united + solid
+        united = united - solid if not is_outward and _is_within(solid, first) else united + solid
     volume = float(united.volume())
     if abs(sum(float(shell.volume()) for shell in shells) - volume) <= SAME_SHARE * volume:
         return mesh
-    return as_mesh(united)
+    return solid_to_mesh(united)
 
 
-def _within(solid: manifold3d.Manifold, others: manifold3d.Manifold) -> bool:
+def _is_within(solid: manifold3d.Manifold, others: manifold3d.Manifold) -> bool:
     return bool((solid - others).volume() <= WITHIN_SHARE * solid.volume())

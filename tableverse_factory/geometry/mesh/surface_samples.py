@@ -1,4 +1,4 @@
-"""Points on a surface, evenly spread and the same every time, and distances to it."""
+"""Deterministic, evenly spread samples of a surface, and distances to it."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -7,53 +7,49 @@ from trimesh.triangles import closest_point
 
 from schemas.geometry import Points, TriangleMesh
 
-_SEVENTH = 0.7548776662466927  # the plastic number's inverse and its square: a sequence that fills the unit square
-_FIFTH = 0.5698402909980532
+_R2_FIRST = 0.7548776662466927  # the plastic number's inverse and its square: a sequence that fills the unit square
+_R2_SECOND = 0.5698402909980532
 
 
-def surface_samples(mesh: TriangleMesh, count: int) -> tuple[Points, Int64[np.ndarray, " n"]]:
-    """`count` points spread over the triangles by area, the same for the same mesh, and the triangle of each.
+def sample_surface(mesh: TriangleMesh, count: int) -> tuple[Points, Int64[np.ndarray, " n"]]:
+    """Sample `count` points by area, the same for the same mesh, with the triangle of each.
 
-    Of a mesh without area, the first corner of every triangle.
+    A mesh without area gives the first corner of every triangle.
     """
-    areas = _doubled_areas(mesh)
+    areas = _compute_doubled_areas(mesh)
     if not areas.sum() > 0.0:
         return mesh.vertices[mesh.faces[:, 0]], np.arange(len(mesh.faces))
     ends = np.cumsum(areas) / areas.sum()
     triangle = np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count), len(areas) - 1)
-    u, v = (np.arange(count) * _SEVENTH) % 1.0, (np.arange(count) * _FIFTH) % 1.0
+    u, v = (np.arange(count) * _R2_FIRST) % 1.0, (np.arange(count) * _R2_SECOND) % 1.0
     fold = u + v > 1.0
     u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
     a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
     return a + u * (b - a) + v * (c - a), triangle
 
 
-def surface_area(mesh: TriangleMesh) -> float:
-    """Area of all triangles [m²]."""
-    return float(_doubled_areas(mesh).sum()) / 2
+def compute_surface_area(mesh: TriangleMesh) -> float:
+    """Compute the area of all triangles [m²]."""
+    return float(_compute_doubled_areas(mesh).sum()) / 2
 
 
-def _doubled_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " m"]:
-    """By coordinates: numpy's cross product of rows takes four times as long."""
+def _compute_doubled_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " m"]:
+    """Compute twice the areas, by coordinates: numpy's cross product of rows takes four times as long."""
     columns = np.ascontiguousarray(mesh.vertices.T)
     start = columns[:, mesh.faces[:, 0]]
     (ax, ay, az), (bx, by, bz) = columns[:, mesh.faces[:, 1]] - start, columns[:, mesh.faces[:, 2]] - start
-    doubled: Float64[np.ndarray, " m"] = np.sqrt(
-        (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
-    )
-    return doubled
+    return np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
 
 
-def distance_to_surface(
+def measure_distance_to_surface(
     points: Points, mesh: TriangleMesh, samples: int, neighbours: int = 8
 ) -> Float64[np.ndarray, " n"]:
-    """Distance of each point to the triangles nearest to it, found by the samples nearest to it [m]."""
-    on_surface, triangle = surface_samples(mesh, samples)
+    """Measure the distance of each point to the triangles of the samples nearest to it [m]."""
+    on_surface, triangle = sample_surface(mesh, samples)
     _, near = cKDTree(on_surface).query(points, k=min(neighbours, len(on_surface)))
     near = near.reshape(len(points), -1)
     candidates = triangle[near]
     repeated = np.repeat(points, candidates.shape[1], axis=0)
     closest = closest_point(mesh.vertices[mesh.faces[candidates.ravel()]], repeated)
     distances = np.linalg.norm(closest - repeated, axis=1).reshape(candidates.shape)
-    smallest: Float64[np.ndarray, " n"] = distances.min(axis=1)
-    return smallest
+    return distances.min(axis=1)

@@ -1,4 +1,4 @@
-"""Solids as sampled fields: a regular grid, marching cubes that always close, and simplification that keeps so."""
+"""Solids as sampled fields: a regular grid, marching cubes and simplification, both always closed."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from skimage.measure import marching_cubes
 
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.mesh.repair import mesh_to_solid, solid_to_mesh
 
 Field = Float64[np.ndarray, "nx ny nz"]
 
@@ -37,19 +38,19 @@ class VoxelGrid(Frozen):
         return tuple(self.origin[k] + self.cell * np.arange(self.shape[k]) for k in range(3))
 
 
-def grid_over(low: Vector3, high: Vector3, cell: float) -> VoxelGrid:
-    """The grid with this spacing that covers a box with half a cell to spare on every side."""
+def make_grid(low: Vector3, high: Vector3, cell: float) -> VoxelGrid:
+    """Make the grid with this spacing that covers a box with half a cell to spare on every side."""
     counts = np.maximum(np.ceil((high - low) / cell).astype(int) + 1, 2)
     spare = counts * cell - (high - low)
     shape = (int(counts[0]), int(counts[1]), int(counts[2]))
     return VoxelGrid(low - spare / 2 + cell / 2, cell, shape)
 
 
-def solid_surface(field: Field, grid: VoxelGrid) -> TriangleMesh:
-    """The closed surface around the positive samples, crossing where the field is zero.
+def extract_surface(field: Field, grid: VoxelGrid) -> TriangleMesh:
+    """Extract the closed surface around the positive samples, where the field is zero.
 
     The field is a signed distance near its zero (positive inside, [m]) and is clamped to two cells; a border of
-    outside samples closes whatever reaches the grid's edge.
+    outside samples closes the surface at the grid's edge.
 
     Raises:
         GeometryError: if no sample is positive.
@@ -67,38 +68,36 @@ def solid_surface(field: Field, grid: VoxelGrid) -> TriangleMesh:
 
 
 def to_manifold(mesh: TriangleMesh) -> manifold3d.Manifold:
-    """The mesh as a solid.
+    """Convert a mesh to a solid.
 
     Raises:
         GeometryError: if it is not the closed, oriented surface of one.
     """
-    solid = manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices.copy(), mesh.faces.astype(np.uint64)))
+    solid = mesh_to_solid(mesh)
     if solid.status() != manifold3d.Error.NoError or solid.is_empty():
         raise GeometryError(f"the mesh bounds no solid: {solid.status().name}")
     return solid
 
 
 def from_manifold(solid: manifold3d.Manifold) -> TriangleMesh:
-    """The surface of a solid as a closed triangle mesh.
+    """Convert a solid to its closed surface.
 
     Raises:
         GeometryError: if the solid is empty.
     """
     if solid.is_empty():
         raise GeometryError("the solid is empty")
-    mesh = solid.to_mesh64()
-    vertices = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
-    return TriangleMesh(vertices, np.array(mesh.tri_verts, dtype=np.int32))
+    return solid_to_mesh(solid)
 
 
-def largest_part(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    """The connected part with the greatest volume; crumbs beside it are dropped."""
+def find_largest_part(solid: manifold3d.Manifold) -> manifold3d.Manifold:
+    """Find the connected part with the greatest volume."""
     parts = solid.decompose()
     return max(parts, key=lambda part: float(part.volume())) if len(parts) > 1 else solid
 
 
-def simplified(solid: manifold3d.Manifold, max_faces: int, tolerance: float) -> manifold3d.Manifold:
-    """Fewer faces, still closed: within `tolerance` [m] first, then by quadric error down to `max_faces`.
+def simplify_solid(solid: manifold3d.Manifold, max_faces: int, tolerance: float) -> manifold3d.Manifold:
+    """Reduce faces, still closed: within `tolerance` [m] first, then by quadric error down to `max_faces`.
 
     Where the quadric decimation would break the surface, the tolerance grows instead, by half at a time.
     """
@@ -106,7 +105,7 @@ def simplified(solid: manifold3d.Manifold, max_faces: int, tolerance: float) -> 
     if result.num_tri() <= max_faces:
         return result
     try:
-        return to_manifold(_decimated(from_manifold(result), max_faces))
+        return to_manifold(_decimate(from_manifold(result), max_faces))
     except GeometryError:
         for _ in range(12):
             tolerance *= 1.5
@@ -116,7 +115,7 @@ def simplified(solid: manifold3d.Manifold, max_faces: int, tolerance: float) -> 
         return result
 
 
-def _decimated(mesh: TriangleMesh, max_faces: int) -> TriangleMesh:
+def _decimate(mesh: TriangleMesh, max_faces: int) -> TriangleMesh:
     """Quadric error decimation (Garland and Heckbert, SIGGRAPH 1997)."""
     raw = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices.copy()), o3d.utility.Vector3iVector(mesh.faces.copy())

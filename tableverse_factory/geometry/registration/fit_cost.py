@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Points
-from tableverse_factory.geometry.registration.icp import Fit, PartialView, Sampled, subsample
+from tableverse_factory.geometry.registration.icp import Fit, PartialView, SampledMesh, subsample
 
 BODY_POINTS = 300
 UPRIGHT = 0.9
@@ -30,7 +30,7 @@ BELOW_TABLE_M = 0.003
 Prices = Float64[np.ndarray, " n"]
 
 
-def chamfer_costs(mesh: Sampled, view: PartialView, fits: Sequence[Fit], points: Points) -> Prices:
+def compute_chamfer_costs(mesh: SampledMesh, view: PartialView, fits: Sequence[Fit], points: Points) -> Prices:
     """Chamfer distance of each fit for a partial view, and what an unusual stand costs [m].
 
     Args:
@@ -54,5 +54,4 @@ def chamfer_costs(mesh: Sampled, view: PartialView, fits: Sequence[Fit], points:
     price += EMPTY_WEIGHT * np.clip(-empty - EMPTY_SLACK_M, 0.0, FARTHEST_M).mean(axis=1)
     stretch = np.log(sizes) - np.log(sizes).mean(axis=1, keepdims=True)
     price += STRETCHED_M * (stretch**2).sum(axis=1) / PROPORTIONS_STD**2
-    total: Prices = price + np.where(turns[:, 2, 2] > UPRIGHT, 0.0, ODD_PRICE_M)
-    return total
+    return price + np.where(turns[:, 2, 2] > UPRIGHT, 0.0, ODD_PRICE_M)

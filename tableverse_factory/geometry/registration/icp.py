@@ -1,8 +1,8 @@
-"""The last step of a registration: point-to-plane ICP with a size along each axis, and how sure its answer is.
+"""Point-to-plane ICP with a size along each axis, and the uncertainty of its result.
 
-The answer minimises the points' squared distances to the mesh, weighted down where they are far, over their measured
-noise, plus what is known before: a mesh keeps its proportions about, and stands on its support. What the picture
-leaves open, such as the far side of a box, is then as uncertain as those proportions are.
+Minimises the squared distances of the points to the mesh, robustly weighted, over their measured noise, plus a prior:
+a mesh roughly keeps its proportions and stands on its support. Parts that the view leaves open, such as the far side
+of a box, are then as uncertain as those proportions.
 """
 
 from collections.abc import Callable
@@ -13,39 +13,40 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Matrix3, Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.mesh.surface_samples import surface_samples
+from tableverse_factory.geometry.math.transforms import cross_matrix
+from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
 SAMPLES = 3000
 ROBUST_M = 0.004
 NOISE_M = 0.0004
-"""The points' noise is not believed to be smaller."""
+"""Lower bound of the points' noise."""
 OUTLINE_M = 0.002
-"""How exactly the space seen to be empty is known: a pixel or two, and the error of its depth."""
+"""Accuracy of the free space: a pixel or two, and the error of its depth."""
 OUTLINE_POINTS = 300
 IN_COMMON = 2.0
-"""The scatter within one picture shows about half of the error: its parts err together. Measured on synthetic truth."""
+"""The scatter within one picture shows about half of the error, measured on synthetic truth."""
 SYSTEMATIC_M, SYSTEMATIC_RAD = 0.0015, 0.0035
-"""No better than this is any answer: outlines a pixel too narrow, the depth's own steps. Measured likewise."""
+"""Lower bound of the error, from outlines a pixel too narrow and depth quantisation; measured likewise."""
 OUTLINES = 30
-"""Errors of the outline are alike over most of it: so many of its points count."""
+"""Effective number of outline points: their errors are correlated."""
 INDEPENDENT = 300
-"""The errors of neighbouring readings are alike: so many of the points count, however many there are."""
+"""Effective number of observed points, at most: errors of neighbours are correlated."""
 SCALE_STD = 1.0
-"""Of the logarithm of the overall size: next to nothing is known of it before."""
+"""Of the logarithm of the overall size: nearly unconstrained."""
 SIZE_RANGE = (0.6, 1.6)
 """Bounds of the size along each axis, against its start."""
 CELLS = 4
-"""Points in one cell of a grid of so many cells along the object's longest side have errors in common."""
+"""Cells along the object's longest side; points within one have errors in common."""
 
 Emptiness = Callable[[Points], Float64[np.ndarray, " n"]]
-"""How far each point lies from space that was seen to be empty [m], negative inside of it."""
+"""Signed distance of each point to the space seen to be empty [m], negative inside it."""
 Gaps = Float64[np.ndarray, " n"]
 Rows = Float64[np.ndarray, "n 9"]
 Matrix9 = Float64[np.ndarray, "9 9"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sampled(Frozen):
+class SampledMesh(Frozen):
     """A surface as points about the middle of its box.
 
     Attributes:
@@ -72,14 +73,14 @@ class Fit(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialView(Frozen):
-    """What one view says of an object.
+    """Observations of an object from one view, table frame.
 
     Attributes:
-        points: Observed, table frame [m]. Shape (n, 3).
-        eye: Position of the camera, table frame [m].
-        support_z: Height of what it stands on [m]; where it clearly does not stand there, this is forgotten.
-        support_std_m: How well that is known: hardly in a container, whose floor is hidden [m].
-        emptiness: Of the same view, table frame: the points alone do not say where a face ends.
+        points: Observed [m]. Shape (n, 3).
+        eye: Position of the camera [m].
+        support_z: Height of the support [m]; ignored where the object clearly does not stand there.
+        support_std_m: Its standard deviation, large in a container, whose floor is hidden [m].
+        emptiness: Free space of the same view: the points alone do not show where a face ends.
     """
 
     points: Points
@@ -90,8 +91,8 @@ class PartialView(Frozen):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Step(Frozen):
-    """The fit's linear equations at one place, in the mesh's own directions: turn, move, logarithms of the sizes.
+class _LinearSystem(Frozen):
+    """Linearised equations of a fit in the mesh frame: rotation, translation, logarithms of the sizes.
 
     One row for each of `points`, and the last for the foot.
     """
@@ -104,42 +105,43 @@ class _Step(Frozen):
     pull: Float64[np.ndarray, "9"]
 
 
-def sampled(mesh: TriangleMesh, middle: Vector3) -> Sampled:
-    """Evenly spread points of a mesh about `middle`, with their normals."""
-    samples, triangle = surface_samples(mesh, SAMPLES)
+def sample_mesh(mesh: TriangleMesh, middle: Vector3) -> SampledMesh:
+    """Sample a mesh about `middle`, with normals."""
+    samples, triangle = sample_surface(mesh, SAMPLES)
     a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     normals: Points = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
     samples = samples - middle
-    return Sampled(samples, normals, cKDTree(samples), float(np.ptp(samples, axis=0).max()))
+    return SampledMesh(samples, normals, cKDTree(samples), float(np.ptp(samples, axis=0).max()))
 
 
 def subsample(points: Points, count: int) -> Points:
-    """About `count` of the points, evenly over their order."""
-    few: Points = points[:: max(1, len(points) // count)]
-    return few
+    """Select about `count` points, evenly over their order."""
+    return points[:: max(1, len(points) // count)]
 
 
-def run_icp(mesh: Sampled, view: PartialView, start: Fit, steps: int, settled: float, proportions_std: float) -> Fit:
-    """The fit near `start` that agrees best with what was view.
+def run_icp(
+    mesh: SampledMesh, view: PartialView, start: Fit, steps: int, settled: float, proportions_std: float
+) -> Fit:
+    """Find the fit near `start` that agrees best with the view.
 
     Args:
         mesh: What is fitted.
         view: What it is fitted to.
         start: Within the reach of the search: about 30° and a third of its size.
-        steps: At most so many.
+        steps: At most this many.
         settled: A step smaller than this is the last [m, rad].
-        proportions_std: Of the logarithm of the size along an axis against the others, before anything was view.
+        proportions_std: Prior standard deviation of the logarithm of the size along an axis against the others.
     """
     fit = start
     for k in range(steps):
         width = max(ROBUST_M, 0.03 * (1.0 - k / steps) * mesh.length * float(fit.size.mean()))
-        step = _step(mesh, view, fit, start.size, width, proportions_std)
+        step = _linearize(mesh, view, fit, start.size, width, proportions_std)
         weighted = step.rows * step.weights[:, None]
         change = np.linalg.solve(weighted.T @ step.rows + step.prior, weighted.T @ step.gaps + step.pull)
         size = fit.size * np.exp(np.clip(change[6:], -0.1, 0.1))
         fit = Fit(
-            fit.rotation @ rotated(np.clip(change[:3], -0.2, 0.2)),
+            fit.rotation @ rotation_from_vector(np.clip(change[:3], -0.2, 0.2)),
             np.clip(size, SIZE_RANGE[0] * start.size, SIZE_RANGE[1] * start.size),
             fit.shift + fit.rotation @ change[3:6],
         )
@@ -148,18 +150,18 @@ def run_icp(mesh: Sampled, view: PartialView, start: Fit, steps: int, settled: f
     return fit
 
 
-def pose_covariance(mesh: Sampled, view: PartialView, fit: Fit, proportions_std: float) -> tuple[float, float]:
-    """Standard deviation of the middle's position [m] and of the heading [rad] at a fit.
+def estimate_pose_std(mesh: SampledMesh, view: PartialView, fit: Fit, proportions_std: float) -> tuple[float, float]:
+    """Estimate the standard deviations of the centre [m] and of the heading [rad] at a fit.
 
-    The inverse of the information matrix of the last step, around the scatter of what the parts of the surface say
-    (clusters of points, as neighbours err together): so both the points' noise and a mesh of a slightly wrong shape
-    show in it. To that comes what no single picture shows, calibrated (`tableverse bench placement`).
+    Sandwich estimator: the inverse information matrix around the scatter of clusters of points, as neighbours err
+    together. It reflects both the points' noise and a slightly wrong mesh; a calibrated share that no single picture
+    shows is added (`tableverse bench placement`).
     """
-    step = _step(mesh, view, fit, fit.size, ROBUST_M, proportions_std)
+    step = _linearize(mesh, view, fit, fit.size, ROBUST_M, proportions_std)
     weighted = step.rows * step.weights[:, None]
     inverse = np.linalg.inv(weighted.T @ step.rows + step.prior)
     said = weighted * step.gaps[:, None]
-    cells = _cells(step.points)
+    cells = _number_cells(step.points)
     cells = np.append(cells, cells.max() + 1)
     parts = np.stack([np.bincount(cells, weights=said[:, k]) for k in range(9)], axis=1)
     scatter = parts.T @ parts * (len(parts) / max(len(parts) - 1, 1))
@@ -170,7 +172,9 @@ def pose_covariance(mesh: Sampled, view: PartialView, fit: Fit, proportions_std:
     return float(np.hypot(IN_COMMON * position, SYSTEMATIC_M)), float(np.hypot(IN_COMMON * heading, SYSTEMATIC_RAD))
 
 
-def _step(mesh: Sampled, view: PartialView, fit: Fit, kept: Vector3, width: float, proportions_std: float) -> _Step:
+def _linearize(
+    mesh: SampledMesh, view: PartialView, fit: Fit, kept: Vector3, width: float, proportions_std: float
+) -> _LinearSystem:
     local = (view.points - fit.shift) @ fit.rotation
     _, index = mesh.tree.query(local / fit.size)
     q = mesh.points[index] * fit.size
@@ -179,13 +183,13 @@ def _step(mesh: Sampled, view: PartialView, fit: Fit, kept: Vector3, width: floa
     gaps = ((local - q) * n).sum(axis=1)
     noise = max(NOISE_M, 1.4826 * float(np.median(np.abs(gaps))))
     weights = min(1.0, INDEPENDENT / len(gaps)) / (noise**2 * (1.0 + (gaps / width) ** 2))
-    foot, off = _foot(mesh, fit, view.support_z)
+    foot, off = _linearize_foot(mesh, fit, view.support_z)
     standing = 1.0 / (view.support_std_m**2 * (1.0 + (off / width) ** 2))
-    out_rows, out_gaps, out_points = _outside(mesh, view, fit)
+    out_rows, out_gaps, out_points = _linearize_protrusions(mesh, view, fit)
     out_weights = 1.0 / (OUTLINE_M**2 * (1.0 + (out_gaps / (3 * width)) ** 2)) * OUTLINES / OUTLINE_POINTS
-    prior, pull = _prior(fit, kept, proportions_std)
-    return _Step(
-        np.concatenate([_rows(local, n, q), out_rows, foot[None]]),
+    prior, pull = _make_prior(fit, kept, proportions_std)
+    return _LinearSystem(
+        np.concatenate([_make_rows(local, n, q), out_rows, foot[None]]),
         np.concatenate([gaps, out_gaps, [off]]),
         np.concatenate([weights, out_weights, [standing]]),
         np.concatenate([view.points, out_points]),
@@ -194,8 +198,8 @@ def _step(mesh: Sampled, view: PartialView, fit: Fit, kept: Vector3, width: floa
     )
 
 
-def _outside(mesh: Sampled, view: PartialView, fit: Fit) -> tuple[Rows, Gaps, Points]:
-    """The points of the mesh that lie in space seen to be empty: how far, and how that changes."""
+def _linearize_protrusions(mesh: SampledMesh, view: PartialView, fit: Fit) -> tuple[Rows, Gaps, Points]:
+    """Linearise the depth of mesh points that lie in free space."""
     q = subsample(mesh.points, OUTLINE_POINTS) * fit.size
     points = q @ fit.rotation.T + fit.shift
     depth = view.emptiness(points) + OUTLINE_M
@@ -208,14 +212,13 @@ def _outside(mesh: Sampled, view: PartialView, fit: Fit) -> tuple[Rows, Gaps, Po
     return np.concatenate([np.cross(q, away), away, away * q], axis=1), -depth, points
 
 
-def _rows(local: Points, n: Points, q: Points) -> Rows:
-    """How the gap along the normal changes with turn, move and sizes."""
-    rows: Rows = np.concatenate([np.cross(local, n), n, n * q], axis=1)
-    return rows
+def _make_rows(local: Points, n: Points, q: Points) -> Rows:
+    """Derivatives of the gap along the normal by rotation, translation and sizes."""
+    return np.concatenate([np.cross(local, n), n, n * q], axis=1)
 
 
-def _foot(mesh: Sampled, fit: Fit, support_z: float) -> tuple[Float64[np.ndarray, "9"], float]:
-    """How the height of the lowest point changes, and how far it has to rise to stand [m]."""
+def _linearize_foot(mesh: SampledMesh, fit: Fit, support_z: float) -> tuple[Float64[np.ndarray, "9"], float]:
+    """Linearise the height of the lowest point, and measure how far it has to rise to stand [m]."""
     up = fit.rotation[2]
     heights = mesh.points @ (fit.size * up)
     q = mesh.points[int(np.argmin(heights))] * fit.size
@@ -223,32 +226,28 @@ def _foot(mesh: Sampled, fit: Fit, support_z: float) -> tuple[Float64[np.ndarray
     return row, support_z - float(heights.min() + fit.shift[2])
 
 
-def _prior(fit: Fit, kept: Vector3, proportions_std: float) -> tuple[Matrix9, Float64[np.ndarray, "9"]]:
-    """What is known of the sizes before: alike along all axes against `kept`."""
+def _make_prior(fit: Fit, kept: Vector3, proportions_std: float) -> tuple[Matrix9, Float64[np.ndarray, "9"]]:
+    """Make the prior of the sizes: alike along all axes against `kept`."""
     mean = np.full((3, 3), 1.0 / 3.0)
     sizes = (np.eye(3) - mean) / proportions_std**2 + mean / SCALE_STD**2
     prior = np.zeros((9, 9))
-    # A round thing has no heading: next to nothing keeps it where it is.
+    # A round object has no heading: a weak prior keeps it in place.
     prior[:6, :6] = np.diag([1.0] * 3 + [1e2] * 3)
     prior[6:, 6:] = sizes
     return prior, np.concatenate([np.zeros(6), sizes @ np.log(kept / fit.size)])
 
 
-def _cells(points: Points) -> Int64[np.ndarray, " n"]:
-    """Numbers of the cells that the points lie in."""
+def _number_cells(points: Points) -> Int64[np.ndarray, " n"]:
     low = points.min(axis=0)
     cell = max(float(np.ptp(points, axis=0).max()) / CELLS, 1e-9)
     _, which = np.unique(np.floor((points - low) / cell).astype(np.int64), axis=0, return_inverse=True)
-    cells: Int64[np.ndarray, " n"] = which.ravel()
-    return cells
+    return which.ravel()
 
 
-def rotated(vector: Vector3) -> Matrix3:
-    """The rotation about a vector by its length (Rodrigues)."""
+def rotation_from_vector(vector: Vector3) -> Matrix3:
+    """Rotation about a vector by its length [rad] (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:
         return np.eye(3)
-    x, y, z = vector / angle
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn: Matrix3 = np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
-    return turn
+    k = cross_matrix(vector / angle)
+    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)

@@ -1,9 +1,7 @@
-"""Where a registration begins: a few rough placements of a mesh, no two of them alike (paper section 3.1).
+"""Initial poses of a registration: a few rough, distinct placements of a mesh (paper section 3.1).
 
-For each face that can be down, the headings on a grid, then a continuous search about the best of them; and the ways in
-which the longest sides of mesh and points fall together.
-
-Of the headings at which a shape looks alike, only those nearest to its own are tried.
+For each face that can be down, headings on a grid, then a continuous search about the best of them; and alignments of
+the longest axes of mesh and points. Of symmetric headings, only those nearest to the mesh's own are tried.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,21 +12,21 @@ from jaxtyping import Float64
 from scipy.optimize import minimize_scalar
 
 from schemas.geometry import Frozen, Matrix3, Points, Vector3
-from tableverse_factory.geometry.registration.fit_cost import UPRIGHT, chamfer_costs
-from tableverse_factory.geometry.registration.icp import Fit, PartialView, Sampled, subsample
-from tableverse_factory.geometry.registration.symmetry import turn_about
+from tableverse_factory.geometry.registration.fit_cost import UPRIGHT, compute_chamfer_costs
+from tableverse_factory.geometry.registration.icp import Fit, PartialView, SampledMesh, subsample
+from tableverse_factory.geometry.registration.symmetry import rotation_about_axis
 
 POINTS = 150
 HEADING_STEP = float(np.deg2rad(5.0))
 TIPPED_STEP = float(np.deg2rad(15.0))
-TRIED, USUAL = 7, 3
-"""So many, and so many of them on the mesh's own lower face."""
+MAX_STARTS, MAX_UPRIGHT_STARTS = 7, 3
+"""In all, and of them those on the mesh's own lower face at first."""
 APART_RAD, OTHER_SIZE = 0.3, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Spread(Frozen):
-    """Where the observed points lie: their 1 % and 99 % quantiles, their middle and their top [m]."""
+    """Extent of the observed points: their 1 % and 99 % quantiles, their mean and their top [m]."""
 
     low: Vector3
     high: Vector3
@@ -36,34 +34,36 @@ class _Spread(Frozen):
     top: float
 
 
-def initial_poses(mesh: Sampled, view: PartialView, folds: Sequence[int]) -> list[Fit]:
-    """The best few starts of all kinds, no two of them alike.
+def find_initial_poses(mesh: SampledMesh, view: PartialView, folds: Sequence[int]) -> list[Fit]:
+    """Find the best few starts of all kinds, no two of them alike.
 
     Args:
         mesh: What is registered.
         view: What it is registered to.
-        folds: How many turns about each of the mesh's own axes leave it alike, 0 for all of them.
+        folds: Rotational symmetry about each of the mesh's own axes, 0 for a round one.
     """
-    guesses = list(_guesses(mesh, view, folds))
-    price = chamfer_costs(mesh, view, guesses, subsample(view.points, POINTS))
+    guesses = list(_generate_guesses(mesh, view, folds))
+    price = compute_chamfer_costs(mesh, view, guesses, subsample(view.points, POINTS))
     ordered = [guesses[k] for k in np.argsort(price, kind="stable")]
     usual = [fit for fit in ordered if fit.rotation[2, 2] > UPRIGHT]
-    return [_polished(mesh, view, fit) for fit in _apart([*_apart(usual, USUAL), *ordered], TRIED)]
+    return [
+        _refine_heading(mesh, view, fit)
+        for fit in _drop_similar([*_drop_similar(usual, MAX_UPRIGHT_STARTS), *ordered], MAX_STARTS)
+    ]
 
 
-def _guesses(mesh: Sampled, view: PartialView, folds: Sequence[int]) -> Iterator[Fit]:
-    """Starts over all headings of each face that can be down, and over the ways the longest sides fall together."""
+def _generate_guesses(mesh: SampledMesh, view: PartialView, folds: Sequence[int]) -> Iterator[Fit]:
     low, high = np.quantile(view.points, (0.01, 0.99), axis=0)
     spread = _Spread(low, high, view.points.mean(axis=0), float(np.quantile(view.points[:, 2], 0.995)))
-    for index, (down, axis) in enumerate(_downs()):
+    for index, (down, axis) in enumerate(_list_down_rotations()):
         step = TIPPED_STEP if index else HEADING_STEP
-        for heading in _headings(folds[axis], step):
-            yield from _standing(mesh, view, spread, turn_about(2, heading) @ down)
-    yield from _along(mesh, view)
+        for heading in _list_headings(folds[axis], step):
+            yield from _place_standing(mesh, view, spread, rotation_about_axis(2, heading) @ down)
+    yield from _align_longest_axes(mesh, view)
 
 
-def _headings(folds: int, step: float) -> Float64[np.ndarray, " n"]:
-    """The headings of one of `folds` equal parts of the circle, about the mesh's own."""
+def _list_headings(folds: int, step: float) -> Float64[np.ndarray, " n"]:
+    """List the headings of one of `folds` equal parts of the circle, about the mesh's own."""
     if folds == 0:
         return np.zeros(1)
     count = max(1, round(2 * np.pi / folds / step))
@@ -71,10 +71,10 @@ def _headings(folds: int, step: float) -> Float64[np.ndarray, " n"]:
     return np.sort(np.where(part > np.pi / folds, part - 2 * np.pi / folds, part))
 
 
-def _standing(mesh: Sampled, view: PartialView, spread: _Spread, rotation: Matrix3) -> Iterator[Fit]:
-    """Size from the height and, where that says something else, from the breadth; position from what faces the camera.
+def _place_standing(mesh: SampledMesh, view: PartialView, spread: _Spread, rotation: Matrix3) -> Iterator[Fit]:
+    """Take the size from the height and, where it differs, from the breadth; the position from what faces the camera.
 
-    A sheet has next to no height to tell its size by, and of what is partly hidden the breadth is too small.
+    A sheet has hardly any height, and a partly hidden object is too narrow.
     """
     turned = rotation @ mesh.points.T
     seen = mesh.normals @ (rotation.T @ (view.eye - spread.middle)) > 0.0
@@ -95,9 +95,9 @@ def _standing(mesh: Sampled, view: PartialView, spread: _Spread, rotation: Matri
         yield Fit(rotation, np.full(3, size), shift)
 
 
-def _along(mesh: Sampled, view: PartialView) -> Iterator[Fit]:
-    """Starts with the principal axes of the mesh along those of the points, as long as these or down to the support."""
-    ours, theirs = _principal(mesh.points), _principal(view.points)
+def _align_longest_axes(mesh: SampledMesh, view: PartialView) -> Iterator[Fit]:
+    """Align the principal axes of mesh and points, as long as the points or down to the support."""
+    ours, theirs = _compute_principal_axes(mesh.points), _compute_principal_axes(view.points)
     if theirs[2, 0] < 0.0:
         theirs = theirs @ np.diag([-1.0, -1.0, 1.0])
     middle = view.points.mean(axis=0)
@@ -113,26 +113,26 @@ def _along(mesh: Sampled, view: PartialView) -> Iterator[Fit]:
             yield Fit(rotation, np.full(3, size), center - rotation @ (size * inner))
 
 
-def _principal(points: Points) -> Matrix3:
-    """Right-handed axes in columns, the longest first."""
+def _compute_principal_axes(points: Points) -> Matrix3:
+    """Compute right-handed principal axes in columns, the longest first."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].copy()
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     return axes
 
 
-def _polished(mesh: Sampled, view: PartialView, start: Fit) -> Fit:
-    """The best heading within a step of a start, by a continuous search."""
+def _refine_heading(mesh: SampledMesh, view: PartialView, start: Fit) -> Fit:
+    """Find the best heading within a step of a start, by a continuous search."""
     few = subsample(view.points, POINTS)
     pivot = few.mean(axis=0)
 
     def turned(angle: float) -> Fit:
-        turn = turn_about(2, angle)
+        turn = rotation_about_axis(2, angle)
         return Fit(turn @ start.rotation, start.size, pivot + turn @ (start.shift - pivot))
 
     reach = HEADING_STEP if start.rotation[2, 2] > UPRIGHT else TIPPED_STEP
     found = minimize_scalar(
-        lambda angle: float(chamfer_costs(mesh, view, [turned(float(angle))], few)[0]),
+        lambda angle: float(compute_chamfer_costs(mesh, view, [turned(float(angle))], few)[0]),
         bounds=(-reach, reach),
         method="bounded",
         options={"maxiter": 8},
@@ -140,8 +140,8 @@ def _polished(mesh: Sampled, view: PartialView, start: Fit) -> Fit:
     return turned(float(found.x))
 
 
-def _apart(fits: list[Fit], count: int) -> list[Fit]:
-    """The first `count` of a list, without those that are turned and as large as one before."""
+def _drop_similar(fits: list[Fit], count: int) -> list[Fit]:
+    """Select the first `count` fits, without those of about the same rotation and size as one before."""
     chosen: list[Fit] = []
     alike = 1.0 + 2.0 * np.cos(APART_RAD)
     for fit in fits:
@@ -155,8 +155,8 @@ def _apart(fits: list[Fit], count: int) -> list[Fit]:
     return chosen
 
 
-def _downs() -> list[tuple[Matrix3, int]]:
-    """Rotations that put each of the six faces of a box down, the mesh's own first; and its axis that is upright."""
+def _list_down_rotations() -> list[tuple[Matrix3, int]]:
+    """List rotations that put each of the six faces of a box down, the mesh's own first, and the axis then upright."""
     x, y = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     flip = np.diag([1.0, -1.0, -1.0])
     return [(np.eye(3), 2), (flip, 2), (x, 0), (x.T, 0), (y, 1), (y.T, 1)]

@@ -1,7 +1,7 @@
 """Registration of a mesh without pose or size to the points of one view (paper section 3.1).
 
-Coarse: `starts`, the best of all headings of each face that can be down, by what `fit_price` says. Fine: `alignment`,
-from these few to some of the points, and from the best of them to more.
+Coarse: `initial_poses`, the best of all headings of each face that can be down, by `fit_cost`. Fine: `icp`, from these
+to some of the points, and from the best of them to more.
 """
 
 from dataclasses import dataclass, replace
@@ -13,34 +13,34 @@ from schemas.objects import FitUncertainty
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix, rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import box_center
-from tableverse_factory.geometry.mesh.surface_samples import distance_to_surface, surface_area
-from tableverse_factory.geometry.registration.fit_cost import PROPORTIONS_STD, UPRIGHT, chamfer_costs
+from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area, measure_distance_to_surface
+from tableverse_factory.geometry.registration.fit_cost import PROPORTIONS_STD, UPRIGHT, compute_chamfer_costs
 from tableverse_factory.geometry.registration.icp import (
     Fit,
     PartialView,
-    Sampled,
-    pose_covariance,
+    SampledMesh,
+    estimate_pose_std,
     run_icp,
-    sampled,
+    sample_mesh,
     subsample,
 )
-from tableverse_factory.geometry.registration.initial_poses import initial_poses
-from tableverse_factory.geometry.registration.symmetry import heading_folds, nearest_alike
+from tableverse_factory.geometry.registration.initial_poses import find_initial_poses
+from tableverse_factory.geometry.registration.symmetry import count_heading_folds, find_symmetry_turn
 
-LEAST_POINTS = 10
-LEAST_BREADTH_M = 1e-4
+MIN_POINTS = 10
+MIN_BREADTH_M = 1e-4
 """Of points across the line that fits them best, root mean square."""
 SAMPLES = 3000
 MIDDLE_POINTS, FINE_POINTS, RESIDUAL_POINTS = 400, 1200, 1000
 MIDDLE_STEPS, FINE_STEPS = 15, 20
 MIDDLE_SETTLED, FINE_SETTLED = 6e-4, 2e-4
-"""A step smaller than this is the last [m, rad]."""
-REFINED = 2
-"""So many starts are aligned to more points."""
+"""ICP ends with a step smaller than this [m, rad]."""
+REFINED_STARTS = 2
+"""Starts that are aligned to more points."""
 DISTINCT = 0.03
 """Two placements are distinct where their surfaces lie this far apart, over the longest side."""
-ALIKE_PRICE = 1.05
-"""Price of a fit turned by a symmetry over that of the fit, up to which the view does not tell them apart."""
+ALIKE_COST_RATIO = 1.05
+"""Cost of a fit turned by a symmetry over that of the fit, up to which the view does not distinguish them."""
 COMPLETED_STD = 0.08
 """Error of the proportions of a completion from one view, whose far side is guessed; see `PROPORTIONS_STD`."""
 STANDS_STD_M = 0.0015
@@ -49,7 +49,7 @@ STANDS_STD_M = 0.0015
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration(Frozen):
-    """Where a mesh stands, how large, and how sure that is.
+    """Pose and size of a mesh, with uncertainty.
 
     Attributes:
         pose: The mesh's own frame in the table frame, after `size`.
@@ -63,7 +63,7 @@ class Registration(Frozen):
 
 
 def register(mesh: TriangleMesh, view: PartialView) -> Registration:
-    """Heading, position and size of a mesh from one view.
+    """Estimate pose and size of a mesh from one view.
 
     Args:
         mesh: In its own frame, z up as it usually stands; any unit.
@@ -73,21 +73,21 @@ def register(mesh: TriangleMesh, view: PartialView) -> Registration:
         GeometryError: if there are too few points or they lie on a line, if the mesh has no surface, or if either is
             not finite.
     """
-    _check(mesh, view.points)
+    _check_inputs(mesh, view.points)
     middle = box_center(mesh)
-    ours = sampled(mesh, middle)
-    folds = [heading_folds(ours.points, ours.tree, axis) for axis in range(3)]
-    fits = _refined(ours, view, initial_poses(ours, view, folds))
-    best = _nearest(ours, view, fits[0][0], folds)
+    ours = sample_mesh(mesh, middle)
+    folds = [count_heading_folds(ours.points, ours.tree, axis) for axis in range(3)]
+    fits = _refine(ours, view, find_initial_poses(ours, view, folds))
+    best = _resolve_symmetry(ours, view, fits[0][0], folds)
     return Registration(
         Pose(best.shift - best.rotation @ (best.size * middle), quaternion_from_matrix(best.rotation)),
         best.size,
-        _uncertainty(ours, view, best, _ambiguity(ours, fits), PROPORTIONS_STD),
+        _estimate_fit_uncertainty(ours, view, best, _compute_ambiguity(ours, fits), PROPORTIONS_STD),
     )
 
 
-def uncertainty_of(mesh: TriangleMesh, pose: Pose, view: PartialView) -> FitUncertainty:
-    """How sure the pose of a mesh is that was not registered but made where it stands.
+def estimate_uncertainty(mesh: TriangleMesh, pose: Pose, view: PartialView) -> FitUncertainty:
+    """Estimate the uncertainty of a mesh that was not registered but made in place.
 
     Args:
         mesh: In its own frame, metric.
@@ -97,64 +97,65 @@ def uncertainty_of(mesh: TriangleMesh, pose: Pose, view: PartialView) -> FitUnce
     middle = box_center(mesh)
     rotation = rotation_matrix(pose.quaternion_wxyz)
     fit = Fit(rotation, np.ones(3), pose.position + rotation @ middle)
-    # Its outline was carved from the same empty space, which therefore cannot vouch for it.
+    # Its outline was carved from the same free space, which is therefore no evidence.
     points_alone = replace(view, emptiness=lambda points: np.ones(len(points)))
-    return _uncertainty(sampled(mesh, middle), points_alone, fit, 0.0, COMPLETED_STD)
+    return _estimate_fit_uncertainty(sample_mesh(mesh, middle), points_alone, fit, 0.0, COMPLETED_STD)
 
 
-def median_distance(points: Points, mesh: TriangleMesh) -> float:
-    """Median distance from the points to the surface [m]."""
-    return float(np.median(distance_to_surface(subsample(points, RESIDUAL_POINTS), mesh, SAMPLES)))
+def measure_median_distance(points: Points, mesh: TriangleMesh) -> float:
+    """Measure the median distance from the points to the surface [m]."""
+    return float(np.median(measure_distance_to_surface(subsample(points, RESIDUAL_POINTS), mesh, SAMPLES)))
 
 
-def _check(mesh: TriangleMesh, points: Points) -> None:
+def _check_inputs(mesh: TriangleMesh, points: Points) -> None:
     if not (np.isfinite(points).all() and np.isfinite(mesh.vertices).all()):
         raise GeometryError("a point to register to, or a vertex of the mesh, is not finite")
-    if len(points) < LEAST_POINTS:
-        raise GeometryError(f"{len(points)} points are too few to register a mesh; at least {LEAST_POINTS} are needed")
+    if len(points) < MIN_POINTS:
+        raise GeometryError(f"{len(points)} points are too few to register a mesh; at least {MIN_POINTS} are needed")
     breadth = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(points))
-    if breadth < LEAST_BREADTH_M:
+    if breadth < MIN_BREADTH_M:
         raise GeometryError(f"the {len(points)} points to register to lie on a line")
-    if not surface_area(mesh) > 0.0:
+    if not compute_surface_area(mesh) > 0.0:
         raise GeometryError("the mesh has no surface")
 
 
-def _refined(mesh: Sampled, view: PartialView, begun: list[Fit]) -> list[tuple[Fit, float]]:
-    """The starts aligned to some of the points, the best of them to more; with their prices, the best first."""
+def _refine(mesh: SampledMesh, view: PartialView, begun: list[Fit]) -> list[tuple[Fit, float]]:
+    """Align the starts to some of the points, the best of them to more; with their costs, the best first."""
 
     def ordered(begun: list[Fit], count: int, steps: int, settled: float) -> list[tuple[Fit, float]]:
         some = replace(view, points=subsample(view.points, count))
         fits = [run_icp(mesh, some, start, steps, settled, PROPORTIONS_STD) for start in begun]
         return sorted(
-            zip(fits, chamfer_costs(mesh, view, fits, some.points).tolist(), strict=True), key=lambda fit: fit[1]
+            zip(fits, compute_chamfer_costs(mesh, view, fits, some.points).tolist(), strict=True),
+            key=lambda fit: fit[1],
         )
 
     tried = ordered(begun, MIDDLE_POINTS, MIDDLE_STEPS, MIDDLE_SETTLED)
-    return ordered([fit for fit, _ in tried[:REFINED]], FINE_POINTS, FINE_STEPS, FINE_SETTLED) + tried[REFINED:]
+    return (
+        ordered([fit for fit, _ in tried[:REFINED_STARTS]], FINE_POINTS, FINE_STEPS, FINE_SETTLED)
+        + tried[REFINED_STARTS:]
+    )
 
 
-def _nearest(mesh: Sampled, view: PartialView, fit: Fit, folds: list[int]) -> Fit:
-    """Of the fits that look like this one, and agree with the view as well, the one whose frame is turned least.
-
-    So the answer for a symmetric shape does not hang on noise.
-    """
-    axis = _upright_axis(fit)
+def _resolve_symmetry(mesh: SampledMesh, view: PartialView, fit: Fit, folds: list[int]) -> Fit:
+    """Choose the symmetric equivalent that agrees with the view and is turned least, so that noise does not decide."""
+    axis = _find_upright_axis(fit)
     if axis is None or folds[axis] == 1:
         return fit
-    turn = nearest_alike(fit.rotation, folds[axis], axis)
+    turn = find_symmetry_turn(fit.rotation, folds[axis], axis)
     other = Fit(fit.rotation @ turn, np.diag(turn.T @ np.diag(fit.size) @ turn), fit.shift)
-    its, price = chamfer_costs(mesh, view, [fit, other], subsample(view.points, FINE_POINTS))
-    return other if price <= ALIKE_PRICE * its else fit
+    its, price = compute_chamfer_costs(mesh, view, [fit, other], subsample(view.points, FINE_POINTS))
+    return other if price <= ALIKE_COST_RATIO * its else fit
 
 
-def _upright_axis(fit: Fit) -> int | None:
-    """The mesh's own axis that is upright, None where it leans."""
+def _find_upright_axis(fit: Fit) -> int | None:
+    """Find the mesh's own axis that is upright, None where it leans."""
     upright = np.abs(fit.rotation[2])
     return int(np.argmax(upright)) if upright.max() > UPRIGHT else None
 
 
-def _ambiguity(mesh: Sampled, fits: list[tuple[Fit, float]]) -> float:
-    """Price of the best over that of the best other placement that is truly another, 0 where there is none."""
+def _compute_ambiguity(mesh: SampledMesh, fits: list[tuple[Fit, float]]) -> float:
+    """Compute the cost of the best over that of the best distinct placement, 0 where there is none."""
     best, price = fits[0]
     few = subsample(mesh.points, MIDDLE_POINTS)
     for other, its in fits[1:]:
@@ -164,11 +165,11 @@ def _ambiguity(mesh: Sampled, fits: list[tuple[Fit, float]]) -> float:
     return 0.0
 
 
-def _uncertainty(
-    mesh: Sampled, view: PartialView, fit: Fit, ambiguity: float, proportions_std: float
+def _estimate_fit_uncertainty(
+    mesh: SampledMesh, view: PartialView, fit: Fit, ambiguity: float, proportions_std: float
 ) -> FitUncertainty:
     some = replace(view, points=subsample(view.points, FINE_POINTS))
-    position, heading = pose_covariance(mesh, some, fit, proportions_std)
-    axis = _upright_axis(fit)
-    folds = 1 if axis is None else heading_folds(mesh.points, mesh.tree, axis)
+    position, heading = estimate_pose_std(mesh, some, fit, proportions_std)
+    axis = _find_upright_axis(fit)
+    folds = 1 if axis is None else count_heading_folds(mesh.points, mesh.tree, axis)
     return FitUncertainty(position, heading if folds else None, folds, ambiguity)

@@ -1,4 +1,4 @@
-"""Which turns about the vertical bring a shape onto itself: a box has two, a bottle all of them."""
+"""Rotational symmetry: a box has two folds about the vertical, a bottle all."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -6,51 +6,51 @@ from scipy.spatial import cKDTree
 from schemas.geometry import Matrix3, Points
 
 FOLDS = (8, 6, 5, 4, 3, 2)
-"""How many headings may look alike, from the most to the least."""
+"""Candidates, from the most to the fewest."""
 ODD_TURNS = (0.35, 1.13, 1.87, 2.61)
-"""No fraction of a full turn by a small number: only a round shape is alike after all of them [rad]."""
-ASKED = 400
+"""No simple fractions of a full turn: only a round shape is alike after all of them [rad]."""
+MAX_QUERIES = 400
 ALIKE = 0.02
 """Root mean square distance of a surface from itself turned that still counts as alike, over its horizontal size."""
 
 
-def heading_folds(samples: Points, tree: cKDTree, axis: int = 2) -> int:
-    """How many turns about one of the mesh's own axes leave it alike: 1 none but its own place, 0 all of them.
+def count_heading_folds(samples: Points, tree: cKDTree, axis: int = 2) -> int:
+    """Count the rotational folds about one of the mesh's own axes: 1 for no symmetry, 0 for a round shape.
 
     Args:
         samples: Evenly on the surface, about the point that the axis goes through. Shape (n, 3).
         tree: Of the same samples.
         axis: 0 for x, 1 for y, 2 for z.
     """
-    asked = samples[:: max(1, len(samples) // ASKED)]
+    asked = samples[:: max(1, len(samples) // MAX_QUERIES)]
     across = np.delete(samples, axis, axis=1)
     allowed = ALIKE * float(np.ptp(across, axis=0).max()) + float(tree.query(asked, k=2)[0][:, 1].mean())
-    if all(_misfit(asked, tree, axis, turn) <= allowed for turn in ODD_TURNS):
+    if all(_measure_misfit(asked, tree, axis, turn) <= allowed for turn in ODD_TURNS):
         return 0
-    return next((n for n in FOLDS if _misfit(asked, tree, axis, 2 * np.pi / n) <= allowed), 1)
+    return next((n for n in FOLDS if _measure_misfit(asked, tree, axis, 2 * np.pi / n) <= allowed), 1)
 
 
-def _misfit(asked: Points, tree: cKDTree, axis: int, turn: float) -> float:
-    """Root mean square distance from the turned points to the samples."""
-    return float(np.sqrt((tree.query(asked @ turn_about(axis, turn).T)[0] ** 2).mean()))
+def _measure_misfit(asked: Points, tree: cKDTree, axis: int, turn: float) -> float:
+    """Root mean square distance from the rotated points to the samples."""
+    return float(np.sqrt((tree.query(asked @ rotation_about_axis(axis, turn).T)[0] ** 2).mean()))
 
 
-def nearest_alike(rotation: Matrix3, folds: int, axis: int) -> Matrix3:
-    """The turn of a mesh about its own axis that leaves it alike and brings its frame, rotated, nearest to its own.
+def find_symmetry_turn(rotation: Matrix3, folds: int, axis: int) -> Matrix3:
+    """Find the symmetry of a mesh about its own axis that brings its rotated frame nearest to the unrotated one.
 
     Args:
-        rotation: Of the mesh, applied after the turn.
-        folds: About that axis, as `heading_folds` counts them.
+        rotation: Of the mesh, applied after the symmetry.
+        folds: From `count_heading_folds`.
         axis: 0 for x, 1 for y, 2 for z.
     """
     first, second = (axis + 1) % 3, (axis + 2) % 3
     sine, cosine = rotation[first, second] - rotation[second, first], rotation[first, first] + rotation[second, second]
     angle = float(np.arctan2(sine, cosine))
-    return turn_about(axis, 2 * np.pi / folds * round(angle * folds / (2 * np.pi)) if folds else angle)
+    return rotation_about_axis(axis, 2 * np.pi / folds * round(angle * folds / (2 * np.pi)) if folds else angle)
 
 
-def turn_about(axis: int, angle: float) -> Matrix3:
-    """The rotation about a coordinate axis."""
+def rotation_about_axis(axis: int, angle: float) -> Matrix3:
+    """Rotation about a coordinate axis [rad]."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     turn = np.eye(3)
     turn[first, first] = turn[second, second] = np.cos(angle)

@@ -1,4 +1,4 @@
-"""Whether a parallel gripper can take hold of a body: antipodal pairs of surface points, and room for the fingers.
+"""Antipodal pairs of surface points, at which a parallel gripper can hold a body, with room for its fingers.
 
 A quick test, not a grasp planner: it decides which objects tasks may ask for.
 """
@@ -6,13 +6,12 @@ A quick test, not a grasp planner: it decides which objects tasks may ask for.
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Points, TriangleMesh
-from tableverse_factory.geometry.mesh.height_maps import Caster
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
-from tableverse_factory.geometry.mesh.surface_samples import surface_samples
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, pack_rays
+from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
 FRICTION = 0.5
 """Coulomb coefficient of pad on object; the contact normals lie within its cone about the closing axis."""
@@ -52,18 +51,18 @@ class Grips(Frozen):
         return np.stack([self.first - FINGER_M * axis, self.second + FINGER_M * axis], axis=1)
 
 
-def antipodal_grips(mesh: TriangleMesh, caster: Caster, max_width: float) -> Grips:
-    """Pairs between which a gripper of this opening [m] can close on a mesh that stands in the table frame.
+def find_antipodal_grips(mesh: TriangleMesh, caster: RaycastingScene, max_width: float) -> Grips:
+    """Find pairs between which a gripper can close on a mesh in the table frame.
 
     Args:
         mesh: As it stands [m].
         caster: Holds the same mesh.
         max_width: Opening of the gripper [m].
     """
-    points, inward = surface_points(mesh, _SAMPLES)
-    sign = outward_sign(mesh)
+    points, inward = sample_inward_normals(mesh, _SAMPLES)
+    sign = compute_outward_sign(mesh)
     inward = sign * inward
-    width, normals = first_hits(caster, points, inward, sign)
+    width, normals = cast_surface_rays(caster, points, inward, sign)
     cone = 1.0 / np.sqrt(1.0 + FRICTION**2)
     ends = points + np.where(np.isfinite(width), width, 0.0)[:, None] * inward
     height = np.minimum(points[:, 2], ends[:, 2]) - mesh.vertices[:, 2].min()
@@ -72,10 +71,10 @@ def antipodal_grips(mesh: TriangleMesh, caster: Caster, max_width: float) -> Gri
     return Grips(points[good], ends[good], float(good.mean()))
 
 
-def gripped_on(grips: Grips, felt: Caster, max_width: float) -> Grips:
-    """Those of the pairs that hold as well on what a simulation feels of a body: its convex pieces.
+def filter_grips(grips: Grips, felt: RaycastingScene, max_width: float) -> Grips:
+    """Select the pairs that also hold on a body's convex pieces, which is what a simulation feels.
 
-    Pieces round off what is small, and where a neck becomes a cone, pads that close on it slide off.
+    Pieces round off small features, and where a neck becomes a cone, pads that close on it slide off.
 
     Args:
         grips: Of the mesh.
@@ -87,8 +86,8 @@ def gripped_on(grips: Grips, felt: Caster, max_width: float) -> Grips:
     axis = grips.second - grips.first
     width = np.linalg.norm(axis, axis=1)
     axis = axis / width[:, None]
-    gap_first, normal_first = first_hits(felt, grips.first - FINGER_M * axis, axis, 1.0)
-    gap_second, normal_second = first_hits(felt, grips.second + FINGER_M * axis, -axis, 1.0)
+    gap_first, normal_first = cast_surface_rays(felt, grips.first - FINGER_M * axis, axis, 1.0)
+    gap_second, normal_second = cast_surface_rays(felt, grips.second + FINGER_M * axis, -axis, 1.0)
     width = width + 2 * FINGER_M - gap_first - gap_second
     cone = 1.0 / np.sqrt(1.0 + FRICTION**2)
     good = (width >= MIN_WIDTH_M) & (width <= max_width)
@@ -96,29 +95,30 @@ def gripped_on(grips: Grips, felt: Caster, max_width: float) -> Grips:
     return Grips(grips.first[good], grips.second[good], grips.share * float(good.mean()))
 
 
-def first_hits(caster: Caster, points: Points, ways: Points, sign: float) -> tuple[Float64[np.ndarray, " n"], Points]:
-    """How far each ray goes from just behind its start until it hits [m], inf where it does not; the normals there.
+def cast_surface_rays(
+    caster: RaycastingScene, points: Points, ways: Points, sign: float
+) -> tuple[Float64[np.ndarray, " n"], Points]:
+    """Cast rays from just behind their starts: the distance until each hits [m], else inf, and the normals there.
 
     Args:
         caster: Holds the mesh.
-        points: Starts; a surface that one lies on is not hit. Shape (n, 3) [m].
+        points: Starts; the surface on which one lies is not hit. Shape (n, 3) [m].
         ways: Unit directions. Shape (n, 3).
-        sign: Of `outward_sign`; the normals then point out of the body. Shape (n, 3).
+        sign: From `compute_outward_sign`; the normals then point out of the body. Shape (n, 3).
     """
-    rays = np.concatenate([points + _OFF_M * ways, ways], axis=1).astype(np.float32)
-    hits = caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+    hits = caster.cast_rays(pack_rays(points + _OFF_M * ways, ways), nthreads=1)
     distance = hits["t_hit"].numpy().astype(np.float64) + _OFF_M
     return distance, sign * hits["primitive_normals"].numpy().astype(np.float64)
 
 
-def outward_sign(mesh: TriangleMesh) -> float:
+def compute_outward_sign(mesh: TriangleMesh) -> float:
     """1 where the faces' normals point outwards, -1 where the mesh is inside out."""
-    return 1.0 if signed_volume(mesh) >= 0.0 else -1.0
+    return 1.0 if compute_signed_volume(mesh) >= 0.0 else -1.0
 
 
-def surface_points(mesh: TriangleMesh, count: int) -> tuple[Points, Points]:
-    """Points spread evenly over the surface, the same for the same mesh, and the inward unit normals there."""
-    points, triangle = surface_samples(mesh, count)
+def sample_inward_normals(mesh: TriangleMesh, count: int) -> tuple[Points, Points]:
+    """Sample points evenly over the surface, the same for the same mesh, with the inward unit normals there."""
+    points, triangle = sample_surface(mesh, count)
     a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     return points, -normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-18)

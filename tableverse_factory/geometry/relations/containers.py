@@ -1,4 +1,4 @@
-"""Whether a container holds a thing: one answer for assembly, settling and the certificate."""
+"""Whether a container holds an object: one answer for assembly, settling and the certificate."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,15 @@ from scipy import ndimage
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.geometry.mesh.height_maps import CellMask
-from tableverse_factory.geometry.relations.relations import BodyFeatures, body_of, is_inside
+from tableverse_factory.geometry.relations.relations import BodyFeatures, compute_body_features, is_inside
 
 FOOT_TOLERANCE_M = 0.003
-"""A thing that reaches further below the container's foot stands beside it."""
+"""An object that reaches further below the container's foot stands beside it."""
 INSIDE_SHARE = 0.5
-"""Share of a thing below the rim that is within the opening: things lean out of full bowls."""
+"""Share of an object below the rim that is within the opening: objects lean out of full bowls."""
 DIP_M = 0.003
 HEAP_SHARE = 2 / 3
-"""Share of a thing, seen from above, that is over the opening where the thing lies on what is in there: a pen that
-lies across a cup is not in it."""
+"""Share of an object on a heap, seen from above, that is over the opening: a pen across a cup is not in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,8 +23,8 @@ class HollowVessel(Frozen):
     """A container as it stands.
 
     Attributes:
-        body: Its mesh, measured; a dish or a vessel on its side has no cavity.
-        room: Cells of the body's map in which things can be: of the cavity, or all where there is none.
+        body: Of its mesh; a dish or a vessel on its side has no cavity.
+        room: Cells of the body's map in which contents can be: of the cavity, or all where there is none.
         floor_z: Where that room begins: the floor of the cavity, or the foot [m].
     """
 
@@ -34,12 +33,12 @@ class HollowVessel(Frozen):
     floor_z: float
 
     def holds(self, mesh: TriangleMesh) -> bool:
-        """Whether a thing that lies still, in the same frame, lies in the container or on the heap in it.
+        """Whether an object at rest, in the same frame, lies in the container or on the heap in it.
 
         It reaches into the cavity, and most of what is below the rim is within the opening (the relation `in` asks for
         nearly all). Or its middle is over the room, and it dips in or lies on a heap: most of it is over the opening.
         """
-        thing = body_of(mesh)
+        thing = compute_body_features(mesh)
         if float(thing.low[2]) < float(self.body.low[2]) - FOOT_TOLERANCE_M:
             return False
         if is_inside(thing, self.body, INSIDE_SHARE):
@@ -53,9 +52,9 @@ class HollowVessel(Frozen):
         return dips or float(over[thing.heights.filled].mean()) >= HEAP_SHARE
 
 
-def holder_of(mesh: TriangleMesh) -> HollowVessel:
-    """The container of a mesh that stands in a frame with z up."""
-    body = body_of(mesh)
+def make_hollow_vessel(mesh: TriangleMesh) -> HollowVessel:
+    """Make the container of a mesh that stands in a frame with z up."""
+    body = compute_body_features(mesh)
     if body.cavity is not None:
         return HollowVessel(body, body.cavity.cells, body.cavity.floor_z)
     covered = ndimage.binary_fill_holes(body.heights.filled)

@@ -1,23 +1,23 @@
-"""Which of the relations that truly hold between things a result keeps: what carries what, and what holds what."""
+"""Support and containment in a layout, and how much of them a result preserves."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 from schemas.geometry import ConvexPieces, Pose
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.collision.solids import place_pieces
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
-from tableverse_factory.geometry.relations.relations import body_of, is_inside
-from tableverse_factory.geometry.relations.support import Pairs, carried_by_meshes, carried_by_pieces
+from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.geometry.relations.relations import compute_body_features, is_inside
+from tableverse_factory.geometry.relations.support import Pairs, find_mesh_support, find_piece_support
 
 
 @dataclass(frozen=True, slots=True)
 class Relations:
-    """What the geometry of a layout says; indices of objects, the table is none of them.
+    """Relations in a layout, as pairs of object indices; the table is no object.
 
     Attributes:
         carried: Pairs (carried, carrier): their meshes touch, with a normal that points up (`geometry.support`).
-        carried_on_pieces: The same of their convex pieces.
+        carried_on_pieces: The same on their convex pieces.
         contained: Pairs (content, vessel): one reaches into the open room of the other (`geometry.relations`).
     """
 
@@ -26,12 +26,12 @@ class Relations:
     contained: Pairs
 
     def renumbered(self, index: Sequence[int]) -> "Relations":
-        """The same where object i is object `index[i]` of a larger layout."""
+        """Renumber object i to `index[i]` of a larger layout."""
         kinds = (self.carried, self.carried_on_pieces, self.contained)
         return Relations(*(frozenset((index[i], index[j]) for i, j in pairs) for pairs in kinds))
 
     def without(self, crossing: Pairs) -> "Relations":
-        """The same but for these pairs, in either order."""
+        """Remove pairs, in either order."""
         kinds = (self.carried, self.carried_on_pieces, self.contained)
         return Relations(*(frozenset((i, j) for i, j in pairs if not {(i, j), (j, i)} & crossing) for pairs in kinds))
 
@@ -42,9 +42,9 @@ class PreservedRelations:
 
     Attributes:
         carried: True pairs (carried, carrier) that are no containment.
-        carried_kept: Those of them in which the same object still carries the other.
+        carried_kept: Those that still hold.
         contained: True pairs (content, vessel).
-        contained_kept: Those of them in which the content is still in the vessel.
+        contained_kept: Those that still hold.
     """
 
     carried: int = 0
@@ -53,31 +53,26 @@ class PreservedRelations:
     contained_kept: int = 0
 
     def __add__(self, other: "PreservedRelations") -> "PreservedRelations":
-        return PreservedRelations(
-            self.carried + other.carried,
-            self.carried_kept + other.carried_kept,
-            self.contained + other.contained,
-            self.contained_kept + other.contained_kept,
-        )
+        return PreservedRelations(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
-def relations_of(
+def find_relations(
     objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], poses: Sequence[Pose], scales: Sequence[float]
 ) -> Relations:
-    """The relations between objects that stand at these poses and scales in the table frame."""
+    """Find the relations between objects at these poses and scales in the table frame."""
     solids = [place_pieces(its, pose, scale) for its, pose, scale in zip(pieces, poses, scales, strict=True)]
-    meshes = [placed_mesh(placed.mesh, pose, scale) for placed, pose, scale in zip(objects, poses, scales, strict=True)]
-    bodies = [body_of(mesh) for mesh in meshes]
+    meshes = [place_mesh(placed.mesh, pose, scale) for placed, pose, scale in zip(objects, poses, scales, strict=True)]
+    bodies = [compute_body_features(mesh) for mesh in meshes]
     contained = frozenset(
         (i, j) for i, x in enumerate(bodies) for j, y in enumerate(bodies) if i != j and is_inside(x, y)
     )
-    return Relations(carried_by_meshes(meshes), carried_by_pieces(solids), contained)
+    return Relations(find_mesh_support(meshes), find_piece_support(solids), contained)
 
 
 def compare_relations(truth: Relations, result: Relations) -> PreservedRelations:
-    """Compares a result with the truth. What lies in a vessel counts as contained, not as carried by it as well.
+    """Compare a result with the truth; what lies in a vessel counts as contained, not as carried by it as well.
 
-    The truth is read on the meshes. In a result a contact of the pieces will do too: it is what a simulation feels.
+    The truth is read on the meshes. In a result contacts of the pieces count too: they are what a simulation feels.
     """
     on = truth.carried - truth.contained
     still_on = on & (result.carried | result.carried_on_pieces)

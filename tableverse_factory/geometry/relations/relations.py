@@ -5,7 +5,7 @@ Directions compare boxes, so `left` is the converse of `right` exactly; containm
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,17 +17,16 @@ from schemas.geometry import Frozen, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.height_maps import (
     CELL_M,
-    Caster,
     Cavity,
     CellMask,
     HeightMap,
-    cavity_of,
-    column_caster,
-    column_center,
-    flat_cells,
-    height_map,
-    turned_quarter,
+    compute_column_center,
+    compute_height_map,
+    find_cavity,
+    find_flat_cells,
+    rotate_quarter_turn,
 )
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene
 
 Points2 = Float64[np.ndarray, "n 2"]
 
@@ -47,7 +46,7 @@ _OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyFeatures(Frozen):
-    """A body as it stands in the table frame.
+    """A body in the table frame.
 
     Attributes:
         low: Lowest corner of its box [m].
@@ -56,7 +55,7 @@ class BodyFeatures(Frozen):
         center: Centre of its volume, by columns [m].
         heights: Seen from above and below.
         cavity: Its room, where it is a vessel that stands open.
-        flat: Cells of its map on which things could stand.
+        flat: Cells of its map on which objects could stand.
     """
 
     low: Vector3
@@ -68,43 +67,47 @@ class BodyFeatures(Frozen):
     flat: CellMask
 
     def moved(self, cells: tuple[int, int], rise: float) -> "BodyFeatures":
-        """The body moved by whole cells of its map and lifted by `rise` [m]."""
+        """Move the body by whole cells of its map and lift it by `rise` [m]."""
         offset = np.array([cells[0] * self.heights.cell, cells[1] * self.heights.cell, rise])
         cavity = self.cavity
         if cavity is not None:
-            cavity = Cavity(cavity.cells, cavity.opening, cavity.rim_z + rise, cavity.floor_z + rise, cavity.volume_m3)
-        return BodyFeatures(
-            self.low + offset,
-            self.high + offset,
-            self.outline + offset[:2],
-            self.center + offset,
-            self.heights.shifted(cells, rise),
-            cavity,
-            self.flat,
+            cavity = replace(cavity, rim_z=cavity.rim_z + rise, floor_z=cavity.floor_z + rise)
+        return replace(
+            self,
+            low=self.low + offset,
+            high=self.high + offset,
+            outline=self.outline + offset[:2],
+            center=self.center + offset,
+            heights=self.heights.shifted(cells, rise),
+            cavity=cavity,
         )
 
 
-def body_of(mesh: TriangleMesh, caster: Caster | None = None, cell: float = CELL_M) -> BodyFeatures:
-    """The body of a mesh that stands in the table frame; `caster` holds the same mesh, where there is one already."""
-    heights = height_map(mesh, caster or column_caster(mesh), cell)
+def compute_body_features(
+    mesh: TriangleMesh, caster: RaycastingScene | None = None, cell: float = CELL_M
+) -> BodyFeatures:
+    """Compute the features of a mesh in the table frame; `caster` holds the same mesh, where there is one already."""
+    heights = compute_height_map(mesh, caster or make_raycasting_scene(mesh), cell)
     low, high = aabb(mesh.vertices)
-    return _measured(low, high, outline_of(mesh.vertices[:, :2]), heights)
+    return _make_features(low, high, compute_outline(mesh.vertices[:, :2]), heights)
 
 
-def turned_body(body: BodyFeatures) -> BodyFeatures:
-    """The body turned by 90° about the table frame's own z."""
+def rotate_body_quarter_turn(body: BodyFeatures) -> BodyFeatures:
+    """Rotate a body by 90° about the z axis of the table frame."""
     low = np.array([-body.high[1], body.low[0], body.low[2]])
     high = np.array([-body.low[1], body.high[0], body.high[2]])
     outline = np.stack([-body.outline[:, 1], body.outline[:, 0]], axis=1)
-    return _measured(low, high, outline, turned_quarter(body.heights))
+    return _make_features(low, high, outline, rotate_quarter_turn(body.heights))
 
 
-def _measured(low: Vector3, high: Vector3, outline: Points2, heights: HeightMap) -> BodyFeatures:
-    return BodyFeatures(low, high, outline, column_center(heights), heights, cavity_of(heights), flat_cells(heights))
+def _make_features(low: Vector3, high: Vector3, outline: Points2, heights: HeightMap) -> BodyFeatures:
+    return BodyFeatures(
+        low, high, outline, compute_column_center(heights), heights, find_cavity(heights), find_flat_cells(heights)
+    )
 
 
-def outline_of(points: Points2) -> Points2:
-    """Corners of the convex outline, counter-clockwise; of the box where the points lie on a line.
+def compute_outline(points: Points2) -> Points2:
+    """Compute the convex outline, counter-clockwise; the box where the points lie on a line.
 
     Of a finely curved outline only the extreme points in 64 directions are kept: within a tenth of a millimetre.
     """
@@ -113,34 +116,33 @@ def outline_of(points: Points2) -> Points2:
     except (QhullError, ValueError):
         (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
         return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-    corners: Points2 = hull[np.unique(np.argmax(_OUTLINE_DIRECTIONS @ hull.T, axis=1))]
-    return corners
+    return hull[np.unique(np.argmax(_OUTLINE_DIRECTIONS @ hull.T, axis=1))]
 
 
-def holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
+def relation_holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether `x` stands in this relation to `y`."""
     return _HOLDS[relation](x, y)
 
 
-def nearly_holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
-    """Whether somebody could say that the relation holds: `holds`, or on that side at all, or not quite beside."""
+def relation_nearly_holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
+    """Whether the relation could be said to hold: `relation_holds`, or on that side at all, or not quite beside."""
     if relation in _SIDES:
         axis, sign = _SIDES[relation]
         edge = y.high[axis] if sign > 0 else -y.low[axis]
-        return bool(sign * _middle(x)[axis] > edge) or holds(relation, x, y)
+        return bool(sign * _box_middle_xy(x)[axis] > edge) or relation_holds(relation, x, y)
     if relation is Relation.NEXT_TO:
-        return _box_gap(x, y) <= 2 * NEXT_TO_GAP_M and outline_gap(x, y) <= 2 * NEXT_TO_GAP_M
+        return _measure_box_gap(x, y) <= 2 * NEXT_TO_GAP_M and measure_outline_gap(x, y) <= 2 * NEXT_TO_GAP_M
     if relation is Relation.ON:
         return _touches_from_above(x, y) or is_inside(x, y)
     if relation in (Relation.IN, Relation.INTO, Relation.INSIDE):
         return is_inside(x, y) or is_on(x, y)
-    return holds(relation, x, y)
+    return relation_holds(relation, x, y)
 
 
 def is_inside(x: BodyFeatures, y: BodyFeatures, share: float = _INSIDE_SHARE) -> bool:
     """Whether `x` reaches into the cavity of `y`, with `share` of what is below the rim within its opening.
 
-    What is under the vessel, by the middle of each column, is not in it, even where a tilted rim reaches around it.
+    Columns whose middle is under the vessel are not in it, even where a tilted rim reaches around them.
     """
     if y.cavity is None:
         return False
@@ -163,32 +165,32 @@ def is_on(x: BodyFeatures, y: BodyFeatures) -> bool:
 def is_next_to(x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether the outlines are less than `NEXT_TO_GAP_M` apart at a common height, neither on nor in the other."""
     level = bool(min(x.high[2], y.high[2]) > max(x.low[2], y.low[2]))
-    return level and _box_gap(x, y) <= NEXT_TO_GAP_M and 0.0 < outline_gap(x, y) <= NEXT_TO_GAP_M
+    return level and _measure_box_gap(x, y) <= NEXT_TO_GAP_M and 0.0 < measure_outline_gap(x, y) <= NEXT_TO_GAP_M
 
 
 def is_beside(x: BodyFeatures, y: BodyFeatures, axis: int, sign: int) -> bool:
     """Whether `x` lies beyond `y` along an axis: boxes apart along it, and that axis the longer way between them."""
     gap = y.low[axis] - x.high[axis] if sign < 0 else x.low[axis] - y.high[axis]
-    between = np.abs(_middle(x) - _middle(y))
+    between = np.abs(_box_middle_xy(x) - _box_middle_xy(y))
     return bool(gap >= -SIDE_OVERLAP_M and between[axis] > 0.0 and between[1 - axis] <= between[axis])
 
 
-def _box_gap(x: BodyFeatures, y: BodyFeatures) -> float:
-    """Least horizontal distance between the boxes [m], and so at most that of the outlines, which takes far longer."""
+def _measure_box_gap(x: BodyFeatures, y: BodyFeatures) -> float:
+    """Measure the horizontal distance between the boxes [m]: a quick lower bound of that of the outlines."""
     apart = np.maximum(x.low - y.high, y.low - x.high)[:2]
     return float(np.linalg.norm(np.maximum(apart, 0.0)))
 
 
-def outline_gap(x: BodyFeatures, y: BodyFeatures) -> float:
-    """Least horizontal distance between the convex outlines [m]; 0 where they overlap."""
+def measure_outline_gap(x: BodyFeatures, y: BodyFeatures) -> float:
+    """Measure the horizontal distance between the convex outlines [m]; 0 where they overlap."""
     a, b = x.outline, y.outline
     if not _separable(a, b):
         return 0.0
-    return min(_corner_to_edge(a, b), _corner_to_edge(b, a))
+    return min(_measure_corner_to_edge(a, b), _measure_corner_to_edge(b, a))
 
 
 def rests_on(x: BodyFeatures, y: BodyFeatures) -> bool:
-    """Whether `x` touches `y` from above anywhere: to lift `y` would disturb `x`."""
+    """Whether `x` touches `y` from above anywhere, so that lifting `y` would disturb `x`."""
     clearance = x.heights.bottom - x.heights.window(y.heights, y.heights.top, -np.inf)
     return bool((np.abs(clearance) <= CONTACT_GAP_M).any()) and bool(x.center[2] > y.low[2])
 
@@ -203,9 +205,8 @@ def _touches_from_above(x: BodyFeatures, y: BodyFeatures) -> bool:
     return 0 <= i < nx and 0 <= j < ny and bool(ndimage.binary_fill_holes(y.heights.filled)[i, j])
 
 
-def _middle(body: BodyFeatures) -> Vector3:
-    middle: Vector3 = ((body.low + body.high) / 2)[:2]
-    return middle
+def _box_middle_xy(body: BodyFeatures) -> Vector3:
+    return ((body.low + body.high) / 2)[:2]
 
 
 def _separable(a: Points2, b: Points2) -> bool:
@@ -219,7 +220,7 @@ def _separable(a: Points2, b: Points2) -> bool:
     return False
 
 
-def _corner_to_edge(corners: Points2, outline: Points2) -> float:
+def _measure_corner_to_edge(corners: Points2, outline: Points2) -> float:
     start = outline[None]
     edge = np.roll(outline, -1, axis=0)[None] - start
     to_corner = corners[:, None] - start
@@ -228,12 +229,7 @@ def _corner_to_edge(corners: Points2, outline: Points2) -> float:
     return float(np.sqrt(((to_corner - share[..., None] * edge) ** 2).sum(axis=2)).min())
 
 
-_SIDES = {
-    Relation.LEFT: (0, -1),
-    Relation.RIGHT: (0, 1),
-    Relation.IN_FRONT: (1, -1),
-    Relation.BEHIND: (1, 1),
-}
+_SIDES = {Relation.LEFT: (0, -1), Relation.RIGHT: (0, 1), Relation.IN_FRONT: (1, -1), Relation.BEHIND: (1, 1)}
 
 _HOLDS: dict[Relation, Callable[[BodyFeatures, BodyFeatures], bool]] = {
     Relation.ON: is_on,

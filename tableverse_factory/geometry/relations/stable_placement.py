@@ -1,7 +1,7 @@
-"""Whether a relation is possible: a place where the body, dropped from above, would stand in it (paper appendix C.2).
+"""Stable placements: where a body, dropped from above, would stand in a relation to another (paper appendix C.2).
 
-Candidates come from the paper's placement domains; each is dropped onto the heights of the scene without the body, and
-counts if it lands where it should, stands, touches nothing beside it, and `relations.holds` says so.
+Candidates come from the paper's placement domains. Each is dropped onto the heights of the scene without the body and
+counts if it lands stably, touches nothing beside it, and `relations.relation_holds`.
 """
 
 from collections.abc import Iterator
@@ -14,24 +14,24 @@ from scipy import ndimage
 
 from schemas.curation import Relation
 from schemas.geometry import Frozen, Vector3
-from tableverse_factory.geometry.mesh.height_maps import CELL_M, FLAT_M, CellMask, HeightMap, Heights
-from tableverse_factory.geometry.relations.relations import BodyFeatures, holds
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, LEVEL_TOLERANCE_M, CellMask, HeightMap, Heights
+from tableverse_factory.geometry.relations.relations import BodyFeatures, relation_holds
 
 REACH_M = 0.4
 """How far around the bodies the table is considered."""
 
 CLEARANCE_M = 0.012
-"""Free space that a body put down on the table has around it: a finger's thickness."""
+"""Free space around a body put down on the table: a finger's thickness."""
 
 _DISTANCES_M = (0.02, 0.035, 0.05, 0.09, 0.15)
 _SIDESTEPS = (0.0, -0.5, 0.5)
 CONTACT_M = 0.002
 _STAND_MARGIN_M = 0.002
 _SUPPORT_SHARE = 0.7
-"""Share of the area that a body stands on that must be carried: a box on a lemon has less."""
+"""Share of the base area that must be carried: a box on a lemon has less."""
 
 _FLAT_SHARE = 0.6
-"""Share of the area under a body at which a thing carries it flat: scissors and balls carry nothing."""
+"""Share of the area under a body that must be flat: scissors and balls carry nothing."""
 
 _FITS_SHARE = 0.95
 _SUBMERGED_SHARE = 0.25
@@ -67,14 +67,14 @@ class SupportSurface(Frozen):
         return heights
 
     def window_of(self, heights: HeightMap) -> tuple[slice, slice]:
-        """Where a map lies in `free`."""
+        """Slices of `free` that a map covers."""
         i, j = heights.corner[0] - self.corner[0], heights.corner[1] - self.corner[1]
         return slice(i, i + heights.top.shape[0]), slice(j, j + heights.top.shape[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StablePose(Frozen):
-    """A possible place.
+    """A possible placement.
 
     Attributes:
         body: The body as it would stand there.
@@ -85,12 +85,12 @@ class StablePose(Frozen):
     offset: Vector3
 
 
-class Top(Protocol):
+class TableRectangle(Protocol):
     """A rectangle on z = 0: a table as it was seen, or a slab as it is exported."""
 
     @property
     def center_xy(self) -> Float64[np.ndarray, "2"]:
-        """Its middle [m]."""
+        """Its centre [m]."""
 
     @property
     def half_size_xy(self) -> Float64[np.ndarray, "2"]:
@@ -101,10 +101,10 @@ class Top(Protocol):
         """Rotation of its own axes about z [rad]."""
 
 
-def tabletop(
-    bodies: tuple[BodyFeatures, ...], table: Top, cell: float = CELL_M, reach_m: float = REACH_M
+def make_support_surface(
+    bodies: tuple[BodyFeatures, ...], table: TableRectangle, cell: float = CELL_M, reach_m: float = REACH_M
 ) -> SupportSurface:
-    """The bodies, the table's rectangle, and `reach_m` around the bodies."""
+    """Make the surface of a table with its bodies, `reach_m` around them."""
     low = np.min([body.low[:2] for body in bodies], axis=0) - reach_m
     high = np.max([body.high[:2] for body in bodies], axis=0) + reach_m
     first, last = np.floor(low / cell).astype(int), np.ceil(high / cell).astype(int)
@@ -123,7 +123,7 @@ def find_placement(
     heights: Heights,
     poses: tuple[BodyFeatures, ...] = (),
 ) -> StablePose | None:
-    """The first place where `x` would stand in this relation to `y`, or None.
+    """Find the first place where `x` would stand in this relation to `y`, or None.
 
     Args:
         relation: Which one.
@@ -134,30 +134,30 @@ def find_placement(
         poses: `x` in other orientations to try after its own.
     """
     for body in (x, *poses):
-        for cells in _candidates(relation, body, y):
-            moved = dropped(relation, body, cells, y, scene, heights)
-            if moved is not None and holds(relation, moved, y):
+        for cells in _list_candidates(relation, body, y):
+            moved = drop_body(relation, body, cells, y, scene, heights)
+            if moved is not None and relation_holds(relation, moved, y):
                 return StablePose(moved, moved.low - body.low)
     return None
 
 
-def _candidates(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[tuple[int, int]]:
+def _list_candidates(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[tuple[int, int]]:
     cell = x.heights.cell
-    for target in _targets(relation, x, y):
+    for target in _list_targets(relation, x, y):
         shift = np.rint((target - (x.low + x.high)[:2] / 2) / cell).astype(int)
         yield int(shift[0]), int(shift[1])
 
 
-def _targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[np.ndarray]:
-    """Where the middle of `x` would come to lie [m]."""
+def _list_targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[np.ndarray]:
+    """Generate targets for the middle of `x` [m]."""
     middle = (y.low + y.high)[:2] / 2
     if relation in _INTO:
         if y.cavity is not None:
-            yield from _spread(y.cavity.cells, y.heights)
+            yield from _spread_candidates(y.cavity.cells, y.heights)
         return
     if relation is Relation.ON:
         if y.flat.any():
-            yield from _spread(y.flat, y.heights)
+            yield from _spread_candidates(y.flat, y.heights)
         return
     half_x, half_y = ((body.high - body.low)[:2] / 2 for body in (x, y))
     for distance in _DISTANCES_M:
@@ -169,8 +169,8 @@ def _targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[n
                 yield target
 
 
-def _spread(cells: CellMask, heights: HeightMap) -> Iterator[np.ndarray]:
-    """At most `_MAX_CANDIDATES` cell centres, those deepest within the cells first."""
+def _spread_candidates(cells: CellMask, heights: HeightMap) -> Iterator[np.ndarray]:
+    """Generate at most `_MAX_CANDIDATES` cell centres, those deepest within the cells first."""
     depth = ndimage.distance_transform_edt(np.pad(cells, 1))[1:-1, 1:-1]
     stride = max(1, int(np.ceil(np.sqrt(cells.sum() / _MAX_CANDIDATES))))
     i, j = np.nonzero(cells)
@@ -181,7 +181,7 @@ def _spread(cells: CellMask, heights: HeightMap) -> Iterator[np.ndarray]:
         yield (np.array(heights.corner) + [i[k], j[k]] + 0.5) * heights.cell
 
 
-def dropped(
+def drop_body(
     relation: Relation,
     x: BodyFeatures,
     cells: tuple[int, int],
@@ -189,15 +189,9 @@ def dropped(
     scene: SupportSurface,
     heights: Heights,
 ) -> BodyFeatures | None:
-    """The body let down over a place until it touches, if it may stand there.
+    """Lower a body, moved by whole cells, until it touches; None where it may not stand in the relation to `y`.
 
-    Args:
-        relation: For which.
-        x: The body.
-        cells: By how many cells it is moved first.
-        y: The reference.
-        scene: Where both are.
-        heights: Of all but `x`.
+    `heights` are those of the scene without the body.
     """
     here = x.heights.shifted(cells, 0.0)
     window = scene.window_of(here)
@@ -212,24 +206,19 @@ def dropped(
     if not np.isfinite(least):
         return None
     if relation in _INTO:
-        return x.moved(cells, -least) if _fits(x, here, -least, y) else None
+        return x.moved(cells, -least) if _fits_cavity(x, here, -least, y) else None
     touching = clearance <= least + CONTACT_M
-    if not stands(x, touching):
+    if not is_stable(x, touching):
         return None
     if relation is Relation.ON:
-        allowed = _carries(y, here, x.low[2] - least, ground, touching)
+        allowed = _carries_flat(y, here, x.low[2] - least, ground, touching)
     else:
         allowed = _is_clear(window, filled, heights, scene)
     return x.moved(cells, -least) if allowed else None
 
 
-def stands(x: BodyFeatures, touching: CellMask) -> bool:
-    """Whether the centre is over what it touches, with a margin, and most of its base is carried.
-
-    Args:
-        x: The body in its orientation; where it is does not matter.
-        touching: Cells of its map that touch something below.
-    """
+def is_stable(x: BodyFeatures, touching: CellMask) -> bool:
+    """Whether the centre is over the `touching` cells of the map, with a margin, and most of the base is carried."""
     i, j = np.nonzero(touching)
     contacts = (np.stack([i, j], axis=1) + np.array(x.heights.corner) + 0.5) * x.heights.cell
     reach = (contacts @ _DIRECTIONS).max(axis=0) + x.heights.cell / 2
@@ -238,7 +227,7 @@ def stands(x: BodyFeatures, touching: CellMask) -> bool:
     return carried and bool((x.center[:2] @ _DIRECTIONS + _STAND_MARGIN_M <= reach).all())
 
 
-def _fits(x: BodyFeatures, here: HeightMap, rise: float, y: BodyFeatures) -> bool:
+def _fits_cavity(x: BodyFeatures, here: HeightMap, rise: float, y: BodyFeatures) -> bool:
     """Whether the whole body is over the opening, and enough of it below the rim."""
     if y.cavity is None:
         return False
@@ -247,16 +236,16 @@ def _fits(x: BodyFeatures, here: HeightMap, rise: float, y: BodyFeatures) -> boo
     return bool(deep) and int((here.filled & room).sum()) >= _FITS_SHARE * int(here.filled.sum())
 
 
-def _carries(y: BodyFeatures, here: HeightMap, level: float, ground: Heights, touching: CellMask) -> bool:
-    """Whether all that the body touches belongs to `y`, and `y` is flat below it."""
+def _carries_flat(y: BodyFeatures, here: HeightMap, level: float, ground: Heights, touching: CellMask) -> bool:
+    """Whether the body touches `y` alone, and `y` is flat below it."""
     of_y = here.window(y.heights, y.heights.top, -np.inf)
-    flat = here.filled & (np.abs(of_y - level) <= FLAT_M)
+    flat = here.filled & (np.abs(of_y - level) <= LEVEL_TOLERANCE_M)
     belongs = bool((of_y[touching] >= ground[touching] - CONTACT_M).all())
     return belongs and int(flat.sum()) >= _FLAT_SHARE * int(here.filled.sum())
 
 
 def _is_clear(window: tuple[slice, slice], filled: CellMask, heights: Heights, scene: SupportSurface) -> bool:
-    """Whether it stands on the bare table with `CLEARANCE_M` around it."""
+    """Whether there is only bare table within `CLEARANCE_M`."""
     spare = int(np.ceil(CLEARANCE_M / scene.cell))
     (i0, i1), (j0, j1) = ((part.start, part.stop) for part in window)
     if min(i0, j0) < spare or i1 + spare > heights.shape[0] or j1 + spare > heights.shape[1]:

@@ -1,4 +1,4 @@
-"""Long things stood on their end: pens go into cups that way."""
+"""Long objects turned upright, as pens stand in cups."""
 
 from dataclasses import replace
 
@@ -7,22 +7,21 @@ import numpy as np
 from schemas.geometry import Matrix3, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import box_center
 
-_LONG = 2.0
+_MIN_ELONGATION = 2.0
 
 
-def end_rotation(mesh: TriangleMesh) -> Matrix3 | None:
-    """The rotation that makes the longest axis of a mesh vertical, either end up; None where no axis stands out."""
+def find_upright_rotation(mesh: TriangleMesh) -> Matrix3 | None:
+    """Find a rotation that makes the longest axis of a mesh vertical; None where no axis stands out."""
     centered = mesh.vertices - box_center(mesh)
     values, axes = np.linalg.eigh(centered.T @ centered)
-    if values[2] <= _LONG**2 * values[1]:
+    if values[2] <= _MIN_ELONGATION**2 * values[1]:
         return None
-    rotation: Matrix3 = (axes * np.sign(np.linalg.det(axes))).T
-    return rotation
+    return (axes * np.sign(np.linalg.det(axes))).T
 
 
-def stood_on_end(mesh: TriangleMesh) -> TriangleMesh | None:
-    """The mesh turned so that its longest axis is vertical, standing at z = 0; None where no axis stands out."""
-    rotation, middle = end_rotation(mesh), box_center(mesh)
+def stand_upright(mesh: TriangleMesh) -> TriangleMesh | None:
+    """Turn a mesh so that its longest axis is vertical and it stands at z = 0; None where no axis stands out."""
+    rotation, middle = find_upright_rotation(mesh), box_center(mesh)
     if rotation is None:
         return None
     vertices = (mesh.vertices - middle) @ rotation.T

@@ -1,15 +1,15 @@
-"""Who carries whom: contacts whose normals point mostly upwards, on meshes and on convex pieces."""
+"""Which body supports which: contacts whose normals point mostly upwards, on meshes and on convex pieces."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
-import open3d as o3d
 
 from schemas.geometry import Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.collision.solids import Solids, meetings
-from tableverse_factory.geometry.mesh.height_maps import Caster, column_caster
-from tableverse_factory.geometry.mesh.meshes import bounds
-from tableverse_factory.geometry.mesh.surface_samples import surface_samples
+from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, to_tensor
+from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
 Pairs = frozenset[tuple[int, int]]
 """(carried, carrier), indices of bodies."""
@@ -17,78 +17,62 @@ Pairs = frozenset[tuple[int, int]]
 REACH_M = 0.002
 """Surfaces this near touch: a layout that was never simulated keeps gaps of this order."""
 UPWARD = 0.5
-"""Least vertical part of the unit normal of a contact that carries: 30° above the horizontal.
-
-What leans on another thing at a steeper angle is held by it, but not carried.
-"""
+"""Least vertical part of the unit normal of a supporting contact, 30° above the horizontal; steeper ones only lean."""
 SAMPLES = 4000
-"""Points on each surface: 1 to 3 mm apart on household things."""
+"""Points on each surface: 1 to 3 mm apart on household objects."""
 TOUCHING_M = 0.0002
-"""Below this the way between two surfaces has no direction to speak of; their normals decide alone."""
+"""Nearer surfaces have no meaningful direction between them; their normals decide alone."""
 
 
-def carried_by_meshes(meshes: Sequence[TriangleMesh]) -> Pairs:
-    """Pairs of meshes that touch, the contact's normal pointing up from one into the other.
+def find_mesh_support(meshes: Sequence[TriangleMesh]) -> Pairs:
+    """Find pairs of meshes that touch, the contact's normal pointing up from one into the other.
 
     The normal is the mean over all points of either surface within `REACH_M` of the other, the nearest counting most.
 
     Args:
         meshes: As they stand in the table frame, z up, faces counter-clockwise from outside.
     """
-    boxes = [bounds(mesh) for mesh in meshes]
-    samples = [surface_samples(mesh, SAMPLES)[0] for mesh in meshes]
-    casters = [column_caster(mesh) for mesh in meshes]
+    boxes = [aabb(mesh.vertices) for mesh in meshes]
+    samples = [sample_surface(mesh, SAMPLES)[0] for mesh in meshes]
+    casters = [make_raycasting_scene(mesh) for mesh in meshes]
     pairs = set()
-    for i in range(len(meshes)):
-        for j in range(i + 1, len(meshes)):
-            if any((boxes[i][0] > boxes[j][1] + REACH_M) | (boxes[j][0] > boxes[i][1] + REACH_M)):
-                continue
-            into_j = _push(_within(samples[j], boxes[i]), casters[i]) - _push(_within(samples[i], boxes[j]), casters[j])
-            pairs |= _carried(i, j, float(into_j[2]) / max(float(np.linalg.norm(into_j)), 1e-12))
+    for i, j in combinations(range(len(meshes)), 2):
+        if any((boxes[i][0] > boxes[j][1] + REACH_M) | (boxes[j][0] > boxes[i][1] + REACH_M)):
+            continue
+        out_of_i = _sum_contact_normals(_select_near_box(samples[j], boxes[i]), casters[i])
+        out_of_j = _sum_contact_normals(_select_near_box(samples[i], boxes[j]), casters[j])
+        normal = out_of_i - out_of_j
+        pairs |= _classify_pair(i, j, float(normal[2]) / max(float(np.linalg.norm(normal)), 1e-12))
     return frozenset(pairs)
 
 
-def carried_by_pieces(solids: Sequence[Solids]) -> Pairs:
-    """The same on convex pieces, which is what a simulation feels: the way between two pieces or out of one another.
-
-    Args:
-        solids: The pieces of each body as they stand in the table frame, z up.
-    """
+def find_piece_support(solids: Sequence[Solids]) -> Pairs:
+    """Find supports on convex pieces in the table frame, which is what a simulation feels."""
     pairs = set()
-    for i in range(len(solids)):
-        for j in range(i + 1, len(solids)):
-            for up in _ways_up(solids[i], solids[j]):
-                pairs |= _carried(i, j, up)
+    for i, j in combinations(range(len(solids)), 2):
+        for _, result in find_near_pieces(solids[i], solids[j], REACH_M):
+            pairs |= _classify_pair(i, j, float(result.normal[2]))
     return frozenset(pairs)
 
 
-def _carried(i: int, j: int, up: float) -> set[tuple[int, int]]:
-    """What a unit normal from i to j with this vertical part says."""
+def _classify_pair(i: int, j: int, up: float) -> set[tuple[int, int]]:
+    """The (carried, carrier) pair that a unit normal from i to j with this vertical part implies, if any."""
     return {(j, i)} if up >= UPWARD else {(i, j)} if up <= -UPWARD else set()
 
 
-def _within(points: Points, box: tuple[Vector3, Vector3]) -> Points:
-    """Those of the points that come within `REACH_M` of a box."""
-    near: Points = points[((points >= box[0] - REACH_M) & (points <= box[1] + REACH_M)).all(axis=1)]
-    return near
+def _select_near_box(points: Points, box: tuple[Vector3, Vector3]) -> Points:
+    return points[((points >= box[0] - REACH_M) & (points <= box[1] + REACH_M)).all(axis=1)]
 
 
-def _push(points: Points, caster: Caster) -> Vector3:
-    """Sum of the outward normals of a surface where points come near it, the nearest weighing most."""
+def _sum_contact_normals(points: Points, caster: RaycastingScene) -> Vector3:
+    """Sum the outward normals of a surface where points come near it, the nearest weighing most."""
     if not len(points):
         return np.zeros(3)
-    query = o3d.core.Tensor.from_numpy(points.astype(np.float32))
-    found = caster.compute_closest_points(query, nthreads=1)
+    found = caster.compute_closest_points(to_tensor(points), nthreads=1)
     way = points - found["points"].numpy().astype(np.float64)
     gap = np.linalg.norm(way, axis=1)
     normals = found["primitive_normals"].numpy().astype(np.float64)
     # On an edge either face may be the nearest: only one that looks along the way counts.
     along = np.einsum("ij,ij->i", way, normals)
     near = (gap <= REACH_M) & ((gap < TOUCHING_M) | (np.abs(along) > 0.8 * gap))
-    total: Vector3 = (1.0 - gap[near] / REACH_M) @ normals[near]
-    return total
-
-
-def _ways_up(a: Solids, b: Solids) -> Iterator[float]:
-    """Of each pair of pieces in contact, the vertical part of the unit normal from `a` to `b`."""
-    return (float(result.normal[2]) for _, result in meetings(a, b, REACH_M))
+    return (1.0 - gap[near] / REACH_M) @ normals[near]

@@ -1,6 +1,6 @@
-"""What things are made of, guessed from their label: density, friction, and how much of the volume is matter.
+"""Material priors from labels: density, friction, and the share of the volume that is matter.
 
-A prior, not a measurement: the judge may know better, and `mass_bounds_kg` says what is possible at all.
+A prior, not a measurement: the judge may correct it within `compute_mass_bounds_kg`.
 Densities are handbook values; fill and wall are typical of household goods.
 """
 
@@ -15,21 +15,21 @@ MIN_MASS_KG = 0.002
 MAX_MASS_KG = 30.0
 
 _SURFACE_SHARE = 0.8
-"""Surface of a rounded thing over that of its box: pi/4 for an upright cylinder, 0.52 to 1 for ball and box."""
+"""Surface of a rounded object over that of its box: pi/4 for an upright cylinder, 0.52 to 1 for ball and box."""
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Matter and how it fills a thing.
+    """A substance and how it fills an object.
 
     Attributes:
         name: Of the matter: `ceramic`, `food`, …
         density_kg_m3: Of the matter itself [kg/m³].
         friction: Sliding friction against another everyday surface.
         fill: Share of the mesh's volume that is matter, 0 to 1.
-        rolling: Slope, as a tangent, from which on a round thing of it rolls down by itself.
-        wall_m: Wall of an open vessel or a case [m]: a mesh that is solid where the thing is hollow does not make it
-            heavy. None for what is full.
+        rolling: Tangent of the slope on which a round object of it starts to roll.
+        wall_m: Wall of an open vessel or a case [m], which bounds the mass where the mesh is solid but the object
+            hollow; None for solid objects.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Material:
     rolling: float = 0.2
 
 
-PLAIN = Material("plastic", 1050.0, 0.8, fill=0.35)
+DEFAULT_MATERIAL = Material("plastic", 1050.0, 0.8, fill=0.35)
 
 _CERAMIC = Material("ceramic", 2300.0, 0.7, wall_m=0.004)
 _GLASS = Material("glass", 2500.0, 0.7, wall_m=0.003)
@@ -48,7 +48,7 @@ _SHEET_METAL = Material("metal", 7800.0, 0.7, wall_m=0.0012)
 _METAL = Material("metal", 7800.0, 0.7)
 _TOOL = Material("metal", 7800.0, 0.7, fill=0.45)
 _CUTLERY = Material("metal", 7800.0, 0.7, wall_m=0.0004)
-"""A sheet of 2 mm that covers a fifth of its box: thin things come out of one view far too thick."""
+"""A sheet of 2 mm that covers a fifth of its box: thin objects are reconstructed far too thick."""
 _FILLED = Material("filled container", 1000.0, 0.8, fill=0.9)
 _CARTON = Material("carton", 700.0, 0.8, fill=0.5)
 _PAPER = Material("paper", 750.0, 0.8)
@@ -91,41 +91,41 @@ LEXICON: tuple[tuple[frozenset[str], Material], ...] = tuple(
 )
 
 
-def material_for(label: str) -> Material:
-    """The material that the label's words suggest; `PLAIN` where they say nothing. The label is untrusted text."""
+def guess_material(label: str) -> Material:
+    """Guess the material from the words of a label (untrusted text); `DEFAULT_MATERIAL` where none is known."""
     words = set(re.findall(r"[a-z]+", label.lower()[:500]))
     words |= {word[:-1] for word in words if word.endswith("s")}
     for keywords, material in LEXICON:
         if words & keywords:
             return material
-    return PLAIN
+    return DEFAULT_MATERIAL
 
 
-def rolling_friction_m(label: str, size: Vector3) -> float:
-    """MuJoCo's rolling friction of a thing of this label and box size [m]: a length, the slope times its radius.
+def estimate_rolling_friction_m(label: str, size: Vector3) -> float:
+    """Estimate MuJoCo's rolling friction for a label and box size [m]: a length, the slope times the radius.
 
-    Real marbles roll down far gentler slopes; but a simulated one rocks for ever on the facets of its hull.
+    Real marbles roll down far gentler slopes, but a simulated one rocks forever on the facets of its hull.
     """
-    return material_for(label).rolling * float(np.min(size)) / 2
+    return guess_material(label).rolling * float(np.min(size)) / 2
 
 
 def estimate_mass_kg(label: str, volume_m3: float, size: Vector3) -> float:
-    """Mass that a thing of this label, mesh volume and box size [m] has, within sensible bounds [kg]."""
-    material = material_for(label)
+    """Estimate the mass for a label, mesh volume and box size [m], within sensible bounds [kg]."""
+    material = guess_material(label)
     matter = max(volume_m3, 0.0) * material.fill
     if material.wall_m is not None:
-        matter = min(matter, material.wall_m * _surface_m2(size))
+        matter = min(matter, material.wall_m * _estimate_surface_m2(size))
     return min(max(matter * material.density_kg_m3, MIN_MASS_KG), MAX_MASS_KG)
 
 
-def mass_bounds_kg(volume_m3: float, size: Vector3) -> tuple[float, float]:
-    """Lightest and heaviest that a thing of this volume can be: a paper skin, and solid steel [kg]."""
-    lightest = 0.0002 * _surface_m2(size) * 300.0
+def compute_mass_bounds_kg(volume_m3: float, size: Vector3) -> tuple[float, float]:
+    """Compute the lightest and heaviest possible mass [kg]: a paper skin, and solid steel."""
+    lightest = 0.0002 * _estimate_surface_m2(size) * 300.0
     heaviest = max(volume_m3, 0.0) * 8000.0
     low = min(max(lightest, MIN_MASS_KG / 2), MAX_MASS_KG)
     return low, min(max(heaviest, 2 * low), 2 * MAX_MASS_KG)
 
 
-def _surface_m2(size: Vector3) -> float:
+def _estimate_surface_m2(size: Vector3) -> float:
     a, b, c = (float(side) for side in size)
     return 2 * _SURFACE_SHARE * (a * b + b * c + c * a)

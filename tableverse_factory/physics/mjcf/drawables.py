@@ -1,4 +1,4 @@
-"""What there is to draw of a scene: its meshes and its table as they stand, from records or from a MuJoCo model."""
+"""Visual geometry of a scene: its meshes and its table in place, from records or from a MuJoCo model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,17 +27,17 @@ class Scenery(Frozen):
     colors: tuple[Rgb | None, ...]
 
 
-def scenery_of(names: Sequence[str], meshes: Sequence[TriangleMesh], slab: Slab) -> Scenery:
-    """Of meshes that stand in the table frame, on their slab."""
-    table = box_mesh(np.array([*slab.half_size_xy, THICKNESS_M / 2]))
+def make_scenery(names: Sequence[str], meshes: Sequence[TriangleMesh], slab: Slab) -> Scenery:
+    """Make the scenery of meshes in the table frame, on their slab."""
+    table = make_box_mesh(np.array([*slab.half_size_xy, THICKNESS_M / 2]))
     c, s = np.cos(slab.yaw), np.sin(slab.yaw)
     turned = table.vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     board = TriangleMesh(turned + np.array([*slab.center_xy, -THICKNESS_M / 2]), table.faces)
     return Scenery(tuple(names), (*meshes, board), (*(None for _ in meshes), slab.color))
 
 
-def scenery_of_model(model: mujoco.MjModel, table: str = "table", visual_group: int = 2) -> Scenery:
-    """Of a model in its initial state, as the simulator has it: the visual meshes, and the box that is the table.
+def load_scenery(model: mujoco.MjModel, table: str = "table", visual_group: int = 2) -> Scenery:
+    """Load the visual meshes and the table's box of a model in its initial state.
 
     Args:
         model: Compiled.
@@ -54,21 +54,21 @@ def scenery_of_model(model: mujoco.MjModel, table: str = "table", visual_group: 
         body = model.body(int(model.geom_bodyid[geom])).name
         kind = int(model.geom_type[geom])
         if kind == mujoco.mjtGeom.mjGEOM_BOX and body == table:
-            board = _placed(geom_box(model, geom), data, geom)
-            boards.append((board, None if board.texture is not None else geom_color(model, geom)))
+            board = _place_geom(make_geom_box(model, geom), data, geom)
+            boards.append((board, None if board.texture is not None else read_geom_color(model, geom)))
         elif kind == mujoco.mjtGeom.mjGEOM_MESH and int(model.geom_group[geom]) == visual_group:
-            mesh = geom_mesh(model, geom)
+            mesh = read_geom_mesh(model, geom)
             names.append(body)
-            parts.append(_placed(mesh, data, geom))
-            colors.append(None if mesh.texture is not None else geom_color(model, geom))
+            parts.append(_place_geom(mesh, data, geom))
+            colors.append(None if mesh.texture is not None else read_geom_color(model, geom))
     for board, color in boards[:1]:
         parts.append(board)
         colors.append(color)
     return Scenery(tuple(names), tuple(parts), tuple(colors))
 
 
-def box_mesh(half_size: np.ndarray) -> TriangleMesh:
-    """An axis-aligned box around the origin [m]; its faces share no vertices, so that edges stay sharp."""
+def make_box_mesh(half_size: np.ndarray) -> TriangleMesh:
+    """Make an axis-aligned box around the origin [m]; its faces share no vertices, so that edges stay sharp."""
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     for axis in range(3):
@@ -84,15 +84,15 @@ def box_mesh(half_size: np.ndarray) -> TriangleMesh:
     return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _placed(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
+def _place_geom(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
     rotation = data.geom_xmat[geom].reshape(3, 3)
     return replace(mesh, vertices=mesh.vertices @ rotation.T + data.geom_xpos[geom])
 
 
-def geom_box(model: mujoco.MjModel, geom: int) -> TriangleMesh:
-    """The geom's box in its own frame; its texture repeats as MuJoCo has it, from the left edge and the far one."""
+def make_geom_box(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """Make the geom's box in its own frame; its texture repeats as in MuJoCo, from the left edge and the far one."""
     half = np.array(model.geom_size[geom])
-    box, picture = box_mesh(half), _texture(model, geom)
+    box, picture = make_box_mesh(half), _read_texture(model, geom)
     if picture is None:
         return box
     material = int(model.geom_matid[geom])
@@ -102,25 +102,29 @@ def geom_box(model: mujoco.MjModel, geom: int) -> TriangleMesh:
     return replace(box, texture=Texture(picture, uv[box.faces]))
 
 
-def geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
-    """The geom's mesh in its own frame, with its texture where it has one."""
-    mesh = int(model.geom_dataid[geom])
-    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-    start, faces_count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-    vertices = model.mesh_vert[first : first + count].astype(np.float64)
-    faces = model.mesh_face[start : start + faces_count].astype(np.int32)
-    picture = _texture(model, geom)
-    uv_first, uv_count = int(model.mesh_texcoordadr[mesh]), int(model.mesh_texcoordnum[mesh])
-    if picture is None or uv_first < 0:
-        return TriangleMesh(vertices, faces)
-    uv = model.mesh_texcoord[uv_first : uv_first + uv_count].astype(np.float64)
-    corners = model.mesh_facetexcoord[start : start + faces_count]
-    # MuJoCo turns v over when it reads an OBJ: row 0 of the picture is v = 0 there.
-    return TriangleMesh(vertices, faces, texture=Texture(picture, uv[corners] * [1.0, -1.0] + [0.0, 1.0]))
+def read_geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """Read the geom's mesh in its own frame, with its texture where it has one."""
+    index = int(model.geom_dataid[geom])
+    mesh, picture = read_mesh(model, index), _read_texture(model, geom)
+    first, count = int(model.mesh_texcoordadr[index]), int(model.mesh_texcoordnum[index])
+    if picture is None or first < 0:
+        return mesh
+    uv = model.mesh_texcoord[first : first + count].astype(np.float64)
+    start = int(model.mesh_faceadr[index])
+    corners = model.mesh_facetexcoord[start : start + len(mesh.faces)]
+    # MuJoCo flips v when it reads an OBJ: row 0 of the picture is v = 0 there.
+    return replace(mesh, texture=Texture(picture, uv[corners] * [1.0, -1.0] + [0.0, 1.0]))
 
 
-def _texture(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
-    """Pixels in sRGB of the geom's colour map. Shape (h, w, 3)."""
+def read_mesh(model: mujoco.MjModel, index: int) -> TriangleMesh:
+    """Read a mesh of a model by its index, without colours."""
+    vertex, face = int(model.mesh_vertadr[index]), int(model.mesh_faceadr[index])
+    vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[index])].astype(np.float64)
+    return TriangleMesh(vertices, model.mesh_face[face : face + int(model.mesh_facenum[index])].astype(np.int32))
+
+
+def _read_texture(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
+    """Read the geom's colour map. Shape (h, w, 3) sRGB."""
     material = int(model.geom_matid[geom])
     if material < 0:
         return None
@@ -133,8 +137,8 @@ def _texture(model: mujoco.MjModel, geom: int) -> np.ndarray | None:
     return np.repeat(pixels, 3, axis=2) if channels == 1 else np.array(pixels[..., :3])
 
 
-def geom_color(model: mujoco.MjModel, geom: int) -> Rgb:
-    """The one colour that the geom or its material has, sRGB."""
+def read_geom_color(model: mujoco.MjModel, geom: int) -> Rgb:
+    """Read the uniform colour of the geom or its material, sRGB."""
     material = int(model.geom_matid[geom])
     rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
     red, green, blue = (int(np.clip(np.rint(255 * value), 0, 255)) for value in rgba[:3])

@@ -1,9 +1,8 @@
-"""What an MJCF document reads besides itself, found before MuJoCo opens anything: within one folder, within bounds.
+"""Check of the files that an untrusted MJCF document reads, before MuJoCo opens any: one folder, bounded size.
 
-MuJoCo follows every path that a document names, devices and pipes included. Which folder a path counts from depends on
-settings that may stand in another document, so each path is looked for in all folders that come into question; and
-MuJoCo takes `..` away from the text of a path before it opens it, so each is looked for with and without: what MuJoCo
-opens is always among what is checked here.
+MuJoCo follows every path that a document names, devices and pipes included. The base folder of a path depends on
+settings that may be in another document, so each path is tried in all possible folders. MuJoCo removes `..` from the
+text of a path before it opens it, so each is tried with and without: all files that MuJoCo opens are checked here.
 """
 
 import mmap
@@ -26,25 +25,25 @@ MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 MAX_DOCUMENTS = 64
 MAX_REFERENCES = 20_000
 MAX_SETTINGS = 64
-MAX_LOOKS = 1_000_000
-"""Paths that are looked for, in all folders that come into question."""
+MAX_LOOKUPS = 1_000_000
+"""Of paths, in all possible folders."""
 
 MAX_TOTAL_BYTES = 2 * 1024**3
 
 _ATTRIBUTE = re.compile(rb"\b(file\w*|meshdir|texturedir|assetdir)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
 _ENTITY = re.compile(r"&(?:#x([0-9a-fA-F]{1,20})|#([0-9]{1,20})|(quot|amp|apos|lt|gt));")
-"""As the XML reader in MuJoCo knows them: HTML knows more."""
-_NAMED = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
+"""As known to the XML reader of MuJoCo."""
+_NAMED_ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
 _UNREADABLE = re.compile(r"[\x00-\x1f\x7f]|&#|^\s*[A-Za-z]:[\\/]")
-"""Characters that may end a name early, entities that are none, and drives, which Linux takes for folders."""
+"""Characters that may end a name early, invalid entities, and drives, which Linux takes for folders."""
 
 
 def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
-    """The model of a file on disk.
+    """Load the model of a file on disk.
 
     Args:
         path: The MJCF file.
-        root: All that it names must lie below this folder; its own folder where none is given.
+        root: All files that it names must lie below this folder; its own folder by default.
 
     Raises:
         InputError: `bad_mjcf` if it names a file elsewhere or too many bytes, MuJoCo does not load it, or it holds
@@ -63,46 +62,46 @@ def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
 
 
 def check_files(path: Path, root: Path) -> tuple[Path, ...]:
-    """The files that a document may read, itself first.
+    """List the files that a document may read, itself first.
 
     Raises:
         InputError: `bad_mjcf` for one outside `root`, one that is no regular file, or too much of anything.
     """
     if path.is_file() and path.stat().st_size > MAX_DOCUMENT_BYTES:
         raise InputError(f"give a file of at most {MAX_DOCUMENT_BYTES} bytes", "bad_mjcf")
-    search = _Search(root.resolve())
+    search = _FileSearch(root.resolve())
     search.add(path, sanitize_line(path.name))
     search.check_absent()
     return tuple(search.files)
 
 
 def check_references(document: bytes, files: Collection[str]) -> None:
-    """Nothing, where a document in memory names only these files: MuJoCo looks for all others on the disk.
+    """Check that a document in memory names only these files: MuJoCo would open all others on the disk.
 
     Args:
-        document: As our exports are written, files in `assets/`.
+        document: An exported scene, its files in `assets/`.
         files: Their paths beside the document.
 
     Raises:
         InputError: `bad_mjcf` for any other.
     """
-    for name, value in _attributes(document):
-        # in every reading, as written too: a name that it does not know MuJoCo looks for on the disk
+    for name, value in _find_attributes(document):
+        # in every reading, as written too: MuJoCo opens unknown names on the disk
         known = f"assets/{value}" in files or value in files if name.startswith("file") else value in ("", "assets")
         if not known:
             raise InputError(f"scene.xml names {sanitize_line(value, 80)!r}, which is none of its files", "bad_mjcf")
 
 
 @dataclass(slots=True)
-class _Search:
-    """Documents that name documents: every path is looked for in every folder known so far.
+class _FileSearch:
+    """Search through documents that name documents: every path is tried in every folder known so far.
 
     Attributes:
-        root: What everything must lie below.
-        files: Found so far, each once, in the order in which they were found.
+        root: Folder that must hold all files.
+        files: Found so far, in order.
         homes: Folders of the documents.
         settings: Folders that the documents name for their meshes and textures.
-        references: Paths as the documents name them, in every reading.
+        references: Paths that the documents name, in every reading.
     """
 
     root: Path
@@ -114,7 +113,7 @@ class _Search:
     size: int = 0
 
     def add(self, path: Path, called: str) -> None:
-        """A file that is there, and all that it names if it is a document."""
+        """Add an existing file, and all that it names if it is a document."""
         if path in self.files:
             return
         if not path.resolve().is_relative_to(self.root):
@@ -127,12 +126,12 @@ class _Search:
             raise InputError(f"with {called!r} more than {MAX_TOTAL_BYTES} bytes would be read", "bad_mjcf")
         if path.stat().st_size:  # nothing cannot be mapped
             with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                _check_picture(data, called)
-                attributes = list(islice(_attributes(data), MAX_REFERENCES + 1))
+                _check_picture_size(data, called)
+                attributes = list(islice(_find_attributes(data), MAX_REFERENCES + 1))
             self._follow(path, called, attributes)
 
     def _follow(self, path: Path, called: str, attributes: Collection[tuple[str, str]]) -> None:
-        """What the file names; MuJoCo includes whatever it is told to, so none is left out for its ending."""
+        """Follow the paths that a file names; MuJoCo includes files of any ending."""
         if not attributes:
             return
         self.documents += 1
@@ -146,20 +145,20 @@ class _Search:
         for name, value in attributes:
             (self.references if name.startswith("file") else self.settings)[value] = None
         looks = len(self.homes) * len(self.settings) * len(self.references)
-        if len(self.references) > MAX_REFERENCES or len(self.settings) > MAX_SETTINGS or looks > MAX_LOOKS:
+        if len(self.references) > MAX_REFERENCES or len(self.settings) > MAX_SETTINGS or looks > MAX_LOOKUPS:
             raise InputError(f"{called!r} names too many files or folders", "bad_mjcf")
         bases, references = self._bases(), tuple(self.references)
         self._find(references[len(known_references) :], bases)
         self._find(known_references, [base for base in bases if base not in known_bases])
 
     def check_absent(self) -> None:
-        """Nothing, unless a path leaves the folder wherever it counts from, be there anything or not.
+        """Refuse paths that leave the folder from every base, whether they exist or not.
 
         Raises:
             InputError: `bad_mjcf`.
         """
         bases = self._bases()
-        known = {path.name for path in self.files}  # `strippath` may leave no more than this
+        known = {path.name for path in self.files}  # `strippath` may leave only the name
         for value in self.references:
             if PurePosixPath(value).name not in known and not any(self._holds(base / value) for base in bases):
                 raise self._outside(sanitize_line(value, 80))
@@ -175,47 +174,47 @@ class _Search:
         )
 
     def _bases(self) -> dict[Path, None]:
-        """Folders that paths may count from."""
+        """Possible base folders of paths."""
         return dict.fromkeys(home / setting for home in self.homes for setting in self.settings)
 
     def _find(self, references: Collection[str], bases: Collection[Path]) -> None:
         for value in references:
-            for name in dict.fromkeys((value, PurePosixPath(value).name)):  # `strippath` leaves the last part alone
+            for name in dict.fromkeys((value, PurePosixPath(value).name)):  # `strippath` leaves the name alone
                 for path in (base / name for base in bases if name):
                     self._look(path, sanitize_line(value, 80))
 
     def _look(self, path: Path, called: str) -> None:
-        """The file at this path, if there is one: where MuJoCo looks, and where the system would."""
+        """Add the file at this path, if there is one: where MuJoCo looks, and where the system would."""
         reduced = Path(os.path.normpath(path))
-        if _is_there(reduced):
+        if _is_file_like(reduced):
             self.add(reduced, called)
-        if reduced != path and _is_there(path) and os.path.realpath(path) != os.path.realpath(reduced):
+        if reduced != path and _is_file_like(path) and os.path.realpath(path) != os.path.realpath(reduced):
             self.add(path, called)
 
 
-def _is_there(path: Path) -> bool:
+def _is_file_like(path: Path) -> bool:
     try:
         return path.exists() and not path.is_dir()
     except OSError:  # a name too long: MuJoCo cannot open it either
         return False
 
 
-def _check_picture(data: mmap.mmap, called: str) -> None:
+def _check_picture_size(data: mmap.mmap, called: str) -> None:
     if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
         if width * height > MAX_PIXELS:
             raise InputError(f"{called!r}: {width} x {height} pixels; at most {MAX_PIXELS} are decoded", "bad_mjcf")
 
 
-def _attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
-    """Every attribute that names a file or folder, in every reading; also in comments, which nothing has to recognise.
+def _find_attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
+    """Find every attribute that names a file or folder, in every reading, also in comments.
 
     Raises:
-        InputError: `bad_mjcf` for a name that may be read in more ways than these.
+        InputError: `bad_mjcf` for a name with further readings.
     """
     for match in _ATTRIBUTE.finditer(document):
         written = os.fsdecode(match[2] if match[2] is not None else match[3])
-        meant = _ENTITY.sub(_character, written)
+        meant = _ENTITY.sub(_decode_entity, written)
         if _UNREADABLE.search(meant):
             raise InputError(f"it names {sanitize_line(written, 80)!r}, which is no plain path", "bad_mjcf")
         values = (written, meant, written.strip(), meant.strip())
@@ -223,9 +222,9 @@ def _attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
             yield match[1].decode(), value
 
 
-def _character(entity: re.Match[str]) -> str:
-    """What an entity stands for; the NUL character for what is no character."""
+def _decode_entity(entity: re.Match[str]) -> str:
+    """Decode an entity; NUL for invalid characters."""
     if entity[3] is not None:
-        return _NAMED[entity[3]]
+        return _NAMED_ENTITIES[entity[3]]
     code = int(entity[1], 16) if entity[1] is not None else int(entity[2])
     return chr(code) if code < 0xD800 or 0xE000 <= code <= 0x10FFFF else "\0"

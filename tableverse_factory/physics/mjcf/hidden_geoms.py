@@ -1,4 +1,4 @@
-"""Whether what is drawn of a body shows what it is: a sticker on a box is not the box."""
+"""Collision geoms that no drawn geom represents: a sticker on a box is not the box."""
 
 from collections.abc import Sequence
 
@@ -6,42 +6,49 @@ import mujoco
 import numpy as np
 from jaxtyping import Float64
 
-SHOWN_SHARE = 0.05
-"""A shape that collides counts as drawn if what is drawn reaches into this share of its box, all in all.
+MIN_DRAWN_SHARE = 0.05
+"""A collision geom counts as drawn if drawn geoms reach into this share of its box, in all.
 
-The emptiest convex piece around 33 scanned meshes is filled to 0.93; a sticker fills next to nothing.
+The emptiest convex piece around 33 scanned meshes is filled to 0.93; a sticker fills almost nothing.
 """
 
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def geoms_without_visual(
+def find_geoms_without_visual(
     model: mujoco.MjModel, data: mujoco.MjData, drawn: Sequence[int], solid: Sequence[int]
 ) -> list[int]:
-    """The geoms among `solid` that nothing of `drawn` stands for: they are part of the shape though nobody sees them.
+    """Find the geoms among `solid` that no geom of `drawn` represents: they belong to the shape, though unseen.
 
     Args:
         model: Any model.
         data: With the positions of its geoms.
-        drawn: Geoms of one body that are taken for its shape.
+        drawn: Geoms of one body that make up its visible shape.
         solid: Geoms of the same body that collide.
     """
-    corners = _corners(model, data, drawn)
-    return [geom for geom in solid if geom not in drawn and _filled(model, data, geom, corners) < SHOWN_SHARE]
+    corners = _compute_box_corners(model, data, drawn)
+    return [
+        geom
+        for geom in solid
+        if geom not in drawn and _measure_filled_share(model, data, geom, corners) < MIN_DRAWN_SHARE
+    ]
 
 
-def _corners(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int]) -> Float64[np.ndarray, "n 8 3"]:
-    """Corners of the geoms' own boxes in the world [m]."""
+def _compute_box_corners(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int]
+) -> Float64[np.ndarray, "n 8 3"]:
+    """Compute the corners of the geoms' own boxes in the world [m]."""
     index = np.array(geoms, dtype=int)
     middle, half = np.split(model.geom_aabb[index], 2, axis=1)
     local = middle[:, None] + half[:, None] * _CORNERS
     turn = data.geom_xmat[index].reshape(-1, 3, 3)
-    corners: Float64[np.ndarray, "n 8 3"] = np.einsum("nij,nkj->nki", turn, local) + data.geom_xpos[index][:, None]
-    return corners
+    return np.einsum("nij,nkj->nki", turn, local) + data.geom_xpos[index][:, None]
 
 
-def _filled(model: mujoco.MjModel, data: mujoco.MjData, geom: int, corners: Float64[np.ndarray, "n 8 3"]) -> float:
-    """Share of a geom's own box that boxes reach into, each counted for itself; 0 for a plane, which has no end."""
+def _measure_filled_share(
+    model: mujoco.MjModel, data: mujoco.MjData, geom: int, corners: Float64[np.ndarray, "n 8 3"]
+) -> float:
+    """Measure the share of a geom's own box that other boxes fill, summed; 0 for a plane, which is infinite."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
         return 0.0
     local = (corners - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)

@@ -2,30 +2,30 @@
 
 from dataclasses import dataclass, replace
 
-import manifold3d
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from schemas.geometry import Faces, Frozen, Matrix3, TriangleMesh, Vector3
 from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.geometry.math.aabb import aabb
-from tableverse_factory.geometry.mesh.hulls import outward_faces
-from tableverse_factory.geometry.mesh.mass_integrals import volume_integrals
-from tableverse_factory.geometry.mesh.shells import bounded_by_shells, is_one_shell
+from tableverse_factory.geometry.mesh.hulls import orient_faces_outward, unite_hulls
+from tableverse_factory.geometry.mesh.mass_integrals import integrate_volume
+from tableverse_factory.geometry.mesh.repair import solid_to_mesh
+from tableverse_factory.geometry.mesh.shells import is_one_shell, unite_shells
 
 MIN_GYRATION_M = 5e-4
 """Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
 
 REMEMBERED_BYTES = 4 * 1024
-"""Yes or no for the meshes of some scenes."""
+"""One flag for each mesh of some scenes."""
 
 MIN_COMPACTNESS = 1e-3
-"""Least volume over the volume of the box at which the volume of a closed mesh is believed."""
+"""Least volume over that of the box for which a closed mesh counts as a solid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MassProperties(Frozen):
-    """Of a body of uniform density, in the mesh's own frame.
+    """Mass properties of a body of uniform density, in the mesh's own frame.
 
     Attributes:
         volume_m3: Volume that the mass was spread over.
@@ -41,13 +41,13 @@ class MassProperties(Frozen):
     source: str
 
     def with_mass(self, mass_kg: float) -> "MassProperties":
-        """The same shape of another density."""
+        """Set the mass by the density."""
         return replace(self, mass_kg=mass_kg, inertia=self.inertia * (mass_kg / self.mass_kg))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VolumeMoments(Frozen):
-    """Of the volume that a body's mass is spread over, in the mesh's own frame.
+    """Moments of the volume that a body's mass is spread over, in the mesh's own frame.
 
     Attributes:
         center: Its centre [m].
@@ -61,28 +61,28 @@ class VolumeMoments(Frozen):
     source: str
 
     def of_mass(self, mass_kg: float) -> MassProperties:
-        """The body of this mass."""
-        inertia = _inertia(self.second * (mass_kg / self.volume_m3), mass_kg)
+        """Compute the mass properties for a mass."""
+        inertia = _compute_inertia(self.second * (mass_kg / self.volume_m3), mass_kg)
         return MassProperties(mass_kg, self.volume_m3, self.center, inertia, self.source)
 
 
-def mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg: float) -> MassProperties:
-    """Mass properties of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume."""
-    return volume_moments(mesh, hulls).of_mass(mass_kg)
+def compute_mass_properties(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], mass_kg: float) -> MassProperties:
+    """Compute mass properties of the scaled mesh, in the way of `compute_volume_moments`."""
+    return compute_volume_moments(mesh, hulls).of_mass(mass_kg)
 
 
-def volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> VolumeMoments:
-    """Moments of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume.
+def compute_volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> VolumeMoments:
+    """Compute moments of the scaled mesh; of its pieces' union, then of its hull, where it is not a closed volume.
 
-    What several shells of a mesh enclose counts once (`bounded_by_shells`).
+    Volume that several shells enclose counts once (`unite_shells`).
     """
     if is_closed(mesh):
-        found = _of_closed(mesh if is_one_shell(mesh) else bounded_by_shells(mesh), "mesh")
+        found = _integrate_closed(mesh if is_one_shell(mesh) else unite_shells(mesh), "mesh")
         if found is not None:
             return found
-    union = _union(hulls)
-    found = _of_closed(union, "pieces") if len(union.faces) else None
-    return found or _of_hull(np.concatenate([hull.vertices for hull in hulls]))
+    union = _unite_hulls(hulls)
+    found = _integrate_closed(union, "pieces") if len(union.faces) else None
+    return found or _integrate_hull(np.concatenate([hull.vertices for hull in hulls]))
 
 
 def is_closed(mesh: TriangleMesh) -> bool:
@@ -92,7 +92,7 @@ def is_closed(mesh: TriangleMesh) -> bool:
 
 @memoize_by_content(REMEMBERED_BYTES)
 def _is_closed(faces: Faces) -> bool:
-    """Asked of the same triangles by three stages, wherever their corners are."""
+    """Cached by the triangles alone: three stages need it for the same ones."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
     n = int(faces.max(initial=0)) + 1
     forward = np.sort(edges[:, 0] * n + edges[:, 1])
@@ -100,8 +100,8 @@ def _is_closed(faces: Faces) -> bool:
     return bool((np.diff(forward) > 0).all() and np.array_equal(forward, backward))
 
 
-def _of_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
-    volume, center, moments = volume_integrals(mesh)
+def _integrate_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
+    volume, center, moments = integrate_volume(mesh)
     low, high = aabb(mesh.vertices)
     if volume <= MIN_COMPACTNESS * float(np.prod(high - low)) or not ((low <= center) & (center <= high)).all():
         return None
@@ -110,8 +110,8 @@ def _of_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
     return VolumeMoments(volume, center, moments, source)
 
 
-def _inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
-    """Inertia from second moments of mass, with the least radius of gyration added where the body is too small.
+def _compute_inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
+    """Compute the inertia from second moments of mass, at least that of the least radius of gyration.
 
     Adding the same to all three second moments keeps the triangle inequality that MuJoCo checks.
     """
@@ -120,16 +120,12 @@ def _inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
     return inertia + max(lacking, 0.0) * np.eye(3)
 
 
-def _union(hulls: tuple[TriangleMesh, ...]) -> TriangleMesh:
-    solids = [manifold3d.Manifold.hull_points(np.ascontiguousarray(hull.vertices, dtype=np.float64)) for hull in hulls]
-    merged = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).to_mesh64()
-    return TriangleMesh(
-        np.array(merged.vert_properties[:, :3], dtype=np.float64), np.array(merged.tri_verts, dtype=np.int32)
-    )
+def _unite_hulls(hulls: tuple[TriangleMesh, ...]) -> TriangleMesh:
+    return solid_to_mesh(unite_hulls(hulls))
 
 
-def _of_hull(points: np.ndarray) -> VolumeMoments:
+def _integrate_hull(points: np.ndarray) -> VolumeMoments:
     hull = ConvexHull(points)
-    corners, faces = outward_faces(hull)
-    volume, center, moments = volume_integrals(TriangleMesh(corners, faces))
+    corners, faces = orient_faces_outward(hull)
+    volume, center, moments = integrate_volume(TriangleMesh(corners, faces))
     return VolumeMoments(volume, center, moments, "hull")

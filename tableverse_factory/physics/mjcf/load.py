@@ -1,4 +1,4 @@
-"""A scene's files as a model, from memory: the one place where exported MJCF is loaded."""
+"""Load an exported scene from files in memory."""
 
 from collections.abc import Mapping
 
@@ -11,41 +11,41 @@ from tableverse_factory.physics.mjcf.validate_model import check_finite, raise_o
 
 
 def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
-    """The model of a scene's files: `scene.xml` and whatever lies in `assets/`.
+    """Load the model of a scene's files: `scene.xml` and those in `assets/`.
 
     Raises:
         InputError: `bad_mjcf` if there is no `scene.xml`, it names a file that is not here, MuJoCo refuses it, or it
             holds numbers that are not finite.
     """
-    assets = _assets(files)
+    assets = _select_assets(files)
     try:
         with raise_on_nan():
             model = mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
     except (ValueError, UnicodeDecodeError) as error:
-        raise _refused(error) from error
+        raise _make_load_error(error) from error
     check_finite(model)
     return model
 
 
-def spec_of(files: Mapping[str, bytes]) -> mujoco.MjSpec:
-    """The same as a specification, to edit, attach and compile.
+def load_spec(files: Mapping[str, bytes]) -> mujoco.MjSpec:
+    """Load a scene's files as a specification, to edit, attach and compile.
 
     Raises:
-        InputError: as `load_model`; what only the compiler sees is found when it is compiled.
+        InputError: as `load_model`; compiling it may raise further errors.
     """
-    assets = _assets(files)
+    assets = _select_assets(files)
     try:
         return mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)
     except (ValueError, UnicodeDecodeError) as error:
-        raise _refused(error) from error
+        raise _make_load_error(error) from error
 
 
-def _assets(files: Mapping[str, bytes]) -> dict[str, bytes]:
+def _select_assets(files: Mapping[str, bytes]) -> dict[str, bytes]:
     if "scene.xml" not in files:
         raise InputError("there is no scene.xml", "bad_mjcf")
     check_references(files["scene.xml"], files.keys())
     return {name: data for name, data in files.items() if name.startswith("assets/")}
 
 
-def _refused(error: Exception) -> InputError:
+def _make_load_error(error: Exception) -> InputError:
     return InputError(f"scene.xml does not load: {sanitize_line(str(error), 500)}", "bad_mjcf")

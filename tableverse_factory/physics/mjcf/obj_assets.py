@@ -1,4 +1,4 @@
-"""Mesh files of a scene: OBJ text with fixed decimals, so that equal meshes give equal bytes everywhere."""
+"""Mesh files of a scene: OBJ with fixed decimals, so that equal meshes give equal bytes everywhere."""
 
 from dataclasses import dataclass, replace
 
@@ -7,20 +7,19 @@ from jaxtyping import Float64, Int64
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.aabb import size_around
-from tableverse_factory.geometry.mesh.hulls import face_heights, hull_mesh
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
-from tableverse_factory.geometry.mesh.surface_samples import surface_area
-from tableverse_factory.physics.mjcf.fast_text import lines_of_decimals, lines_of_integers
+from tableverse_factory.geometry.math.aabb import aabb_size
+from tableverse_factory.geometry.mesh.hulls import compute_face_heights, make_hull_mesh
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
+from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
+from tableverse_factory.physics.mjcf.fast_text import format_decimal_lines, format_integer_lines
 
 MAX_PIECE_VERTICES = 64
 MIN_MESH_VERTICES = 4
 MIN_PIECE_THICKNESS_M = 5e-5
 """Thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail."""
 
-LAST_DIGITS = 4
-"""Units of the last digit: how far rounding may move a corner over the plane of a face that is not much longer than
-wide."""
+ROUNDING_UNITS = 4
+"""Units of the last digit by which rounding may lift a corner over the plane of a compact face."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,8 +28,8 @@ class Appearance(Frozen):
 
     Attributes:
         texture_png: The file.
-        points: Points of the texture, each once. Shape (k, 2), v upwards.
-        corners: Which of them each face's corners have. Shape (m, 3).
+        points: Distinct uv coordinates, v upwards. Shape (k, 2).
+        corners: Indices of them at each face's corners. Shape (m, 3).
     """
 
     texture_png: bytes
@@ -39,69 +38,67 @@ class Appearance(Frozen):
 
     @classmethod
     def at_corners(cls, texture_png: bytes, corner_uv: Float64[np.ndarray, "m 3 2"]) -> "Appearance":
-        """The same from the point at each face's corners."""
-        points, index = _distinct(corner_uv.reshape(-1, 2))
+        """Make it from the uv coordinates at each face's corners."""
+        points, index = _find_distinct(corner_uv.reshape(-1, 2))
         return cls(texture_png, points, index.reshape(-1, 3))
 
     @property
     def corner_uv(self) -> Float64[np.ndarray, "m 3 2"]:
-        """The point of the texture at each face's corners."""
-        uv: Float64[np.ndarray, "m 3 2"] = self.points[self.corners]
-        return uv
+        """The uv coordinates at each face's corners."""
+        return self.points[self.corners]
 
 
 def scale_and_quantize(mesh: TriangleMesh, scale: float) -> TriangleMesh:
-    """The mesh in metres, rounded to what its file will say; the certificate then measures what is in the file.
+    """Scale a mesh to metres and round it as its file is written, so that the certificate measures the file.
 
-    A lone triangle gets a fourth vertex in its middle, which no face uses: MuJoCo reads no mesh of three.
+    A lone triangle gets a fourth, unused vertex in its middle, as MuJoCo refuses meshes of three.
     """
     vertices = mesh.vertices * scale
     colors = mesh.vertex_colors
     if len(vertices) < MIN_MESH_VERTICES:
         vertices = np.concatenate([vertices, vertices.mean(axis=0, keepdims=True)])
         colors = None if colors is None else np.concatenate([colors, colors[:1]])
-    return replace(mesh, vertices=np.round(vertices, decimals(vertices)) + 0.0, vertex_colors=colors)
+    return replace(mesh, vertices=np.round(vertices, count_decimals(vertices)) + 0.0, vertex_colors=colors)
 
 
-def decimals(vertices: np.ndarray) -> int:
-    """Digits after the point: a tenth of a micrometre, and finer for things under a centimetre."""
-    extent = float(size_around(vertices).max())
+def count_decimals(vertices: np.ndarray) -> int:
+    """Count the decimals to write: a tenth of a micrometre, and finer for objects under a centimetre."""
+    extent = float(aabb_size(vertices).max())
     return 7 + max(0, int(np.ceil(-2 - np.log10(max(extent, 1e-9)))))
 
 
-def obj_bytes(mesh: TriangleMesh, appearance: Appearance | None = None) -> bytes:
-    """An OBJ file of a mesh that `scaled` made."""
-    text = lines_of_decimals(b"v ", mesh.vertices, decimals(mesh.vertices), b"  \n")
+def encode_obj(mesh: TriangleMesh, appearance: Appearance | None = None) -> bytes:
+    """Encode a mesh of `scale_and_quantize` as OBJ."""
+    text = format_decimal_lines(b"v ", mesh.vertices, count_decimals(mesh.vertices), b"  \n")
     corners = mesh.faces.astype(np.int64) + 1
     if appearance is None:
-        return text + lines_of_integers(b"f ", corners, b"  \n")
+        return text + format_integer_lines(b"f ", corners, b"  \n")
     table = np.stack([corners, appearance.corners + 1], axis=2).reshape(-1, 6)
-    points = lines_of_decimals(b"vt ", appearance.points, 6, b" \n")
-    return text + points + lines_of_integers(b"f ", table, b"/ / /\n")
+    points = format_decimal_lines(b"vt ", appearance.points, 6, b" \n")
+    return text + points + format_integer_lines(b"f ", table, b"/ / /\n")
 
 
-def _distinct(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, "k 2"], Int64[np.ndarray, " n"]]:
-    """The points in order, each once, and the index of each; coordinate by coordinate, which sorts numbers only."""
+def _find_distinct(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, "k 2"], Int64[np.ndarray, " n"]]:
+    """Distinct points in order, and the index of each; by coordinates, which sorts numbers only."""
     (u, column), (v, row) = (np.unique(points[:, axis], return_inverse=True) for axis in (0, 1))
     pair, index = np.unique(column * len(v) + row, return_inverse=True)
     return np.stack([u[pair // len(v)], v[pair % len(v)]], axis=1), index
 
 
-def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[TriangleMesh, ...]:
-    """Scaled convex pieces, rounded to what their files will say, without those too thin to simulate.
-
-    A piece that rounding has dented by more than its last digits is made convex again.
+def prepare_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[TriangleMesh, ...]:
+    """Scale and round convex pieces, without those too thin to simulate; dented ones are made convex again.
 
     Raises:
         GeometryError: if nothing is left, or a piece has more vertices than MuJoCo's fast path takes.
     """
     kept = []
     for hull in hulls:
-        piece = _thick(scale_and_quantize(hull, scale)) if len(hull.vertices) >= 4 else None
-        if piece is not None and len(piece.vertices) > MAX_PIECE_VERTICES:
+        piece = _make_thick_piece(scale_and_quantize(hull, scale)) if len(hull.vertices) >= 4 else None
+        if piece is None:
+            continue
+        if len(piece.vertices) > MAX_PIECE_VERTICES:
             raise GeometryError(f"a convex piece has {len(piece.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
-        if piece is not None:
-            kept.append(piece)
+        kept.append(piece)
     if not kept:
         raise GeometryError(
             f"none of {len(hulls)} convex pieces is {MIN_PIECE_THICKNESS_M * 1e3:g} mm thick: too small or too flat"
@@ -109,22 +106,19 @@ def usable_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triangl
     return tuple(kept)
 
 
-def _thick(piece: TriangleMesh) -> TriangleMesh | None:
-    """The piece, convex; None where it is flatter than `MIN_PIECE_THICKNESS_M`."""
+def _make_thick_piece(piece: TriangleMesh) -> TriangleMesh | None:
+    """Make a piece convex; None where it is flatter than `MIN_PIECE_THICKNESS_M`."""
     if not _is_convex(piece):
         try:
-            piece = hull_mesh(piece.vertices)
+            piece = make_hull_mesh(piece.vertices)
         except ValueError:
             return None
-    return None if 2 * signed_volume(piece) < MIN_PIECE_THICKNESS_M * surface_area(piece) else piece
+    return None if 2 * compute_signed_volume(piece) < MIN_PIECE_THICKNESS_M * compute_surface_area(piece) else piece
 
 
 def _is_convex(piece: TriangleMesh) -> bool:
-    """Whether a hull, closed as hulls are, is still one: no corner stands out by more than rounding explains.
-
-    One of too many corners may have some that its hull does without.
-    """
+    """Whether a closed hull is still convex up to rounding; one of too many vertices is hulled again in any case."""
     if len(piece.faces) != 2 * len(piece.vertices) - 4 or len(piece.vertices) > MAX_PIECE_VERTICES:
         return False
-    allowed = LAST_DIGITS * 10.0 ** -decimals(piece.vertices)
-    return float(face_heights(piece, piece.vertices).max()) <= allowed
+    allowed = ROUNDING_UNITS * 10.0 ** -count_decimals(piece.vertices)
+    return float(compute_face_heights(piece, piece.vertices).max()) <= allowed

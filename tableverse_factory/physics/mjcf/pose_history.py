@@ -1,4 +1,4 @@
-"""Where the objects of one of our scenes were before their XML was written."""
+"""Earlier poses of the objects of an exported scene."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,11 +7,11 @@ from schemas.geometry import Pose
 
 
 @dataclass(frozen=True, slots=True)
-class History:
-    """What is known about the objects of one of our scenes beyond its XML, by object id.
+class PoseHistory:
+    """Facts about the objects of an exported scene that its XML does not hold, by object id.
 
     Attributes:
-        placed: Poses as the picture or the layout file put them; copies of a content have none.
+        placed: Poses from the picture or the layout file; copies of a content have none.
         rectified: Poses after rectification, before settling.
         contained_in: Container of each object that was placed in one.
     """

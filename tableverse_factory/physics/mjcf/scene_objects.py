@@ -1,7 +1,7 @@
-"""An exported scene's files as things on a table: what grasps, placements and motions are computed from.
+"""Objects of an exported scene, the input of grasps, placements and motions.
 
-Nothing is compiled: meshes and convex pieces are read from `assets/`, poses from the rows of objects/, and the table
-from `scene.xml`, where it is wider than in `meta.json` if things stood at its edge.
+Meshes and convex pieces are read from `assets/`, poses from the rows of objects/, and the table from `scene.xml`, where
+it is wider than in `meta.json` if objects stood at its edge. Nothing is compiled.
 """
 
 import re
@@ -13,19 +13,19 @@ import mujoco
 import numpy as np
 
 from schemas.geometry import Frozen, Pose, TriangleMesh
-from schemas.identity import file_stem
+from schemas.identity import make_file_stem
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
-from tableverse_factory.geometry.mesh.meshes import placed_mesh, read_mesh
-from tableverse_factory.geometry.relations.relations import BodyFeatures, body_of
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.geometry.mesh.meshes import place_mesh, read_mesh
+from tableverse_factory.geometry.relations.relations import BodyFeatures, compute_body_features
 from tableverse_factory.physics.mjcf.file_check import check_references
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
 
 MAX_PIECES = 1000
 _POSITION, _QUATERNION = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
-_PICTURE = re.compile(rb"^v[tn] [^\n]*\n|/[0-9]*", re.MULTILINE)
-"""What an OBJ says of textures and normals: without it, it is read in a tenth of the time."""
+_TEXTURE_AND_NORMALS = re.compile(rb"^v[tn] [^\n]*\n|/[0-9]*", re.MULTILINE)
+"""Texture and normal data of an OBJ: without it, it is read in a tenth of the time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,11 +34,11 @@ class SceneObject(Frozen):
 
     Attributes:
         mesh: In its own frame, without colours [m].
-        hulls: Its convex pieces in the same frame: what collides.
+        hulls: Its convex pieces in the same frame, for collision.
         pose: Its own frame in the table frame.
         mass_kg: As exported.
-        standing: The mesh in the table frame, as it stands.
-        body: The same, measured: box, outline, heights, cavity, flat top.
+        standing: The mesh in the table frame.
+        body: Its features.
     """
 
     object_id: str
@@ -51,24 +51,24 @@ class SceneObject(Frozen):
 
 
 def load_scene_objects(files: Mapping[str, bytes], object_rows: Iterable[Mapping[str, Any]]) -> dict[str, SceneObject]:
-    """The objects of a scene by their id, in the order of the rows.
+    """Load the objects of a scene by id, in the order of the rows.
 
     Args:
-        files: The scene's files by name; `assets/…` are read.
+        files: The scene's files by name.
         object_rows: Its rows of objects/.
 
     Raises:
         InputError: `bad_scene` if a row names no file, or its pose or mass is no number.
         GeometryError: if a mesh does not decode.
     """
-    return {str(row["object_id"]): _thing(files, row) for row in object_rows}
+    return {str(row["object_id"]): _load_object(files, row) for row in object_rows}
 
 
-def slab_of(files: Mapping[str, bytes]) -> Slab:
-    """The table-top of `scene.xml`: its rectangle on z = 0.
+def read_slab(files: Mapping[str, bytes]) -> Slab:
+    """Read the table-top of `scene.xml`: its rectangle on z = 0.
 
     Raises:
-        InputError: `bad_mjcf` if there is no scene.xml with our table in it, or it names what is none of its files.
+        InputError: `bad_mjcf` if there is no scene.xml with a table box, or it names unknown files.
     """
     check_references(files.get("scene.xml", b""), files.keys())
     try:
@@ -78,45 +78,47 @@ def slab_of(files: Mapping[str, bytes]) -> Slab:
     body, geom = spec.body(TABLE), spec.geom(TABLE)
     if body is None or geom is None or geom.type != mujoco.mjtGeom.mjGEOM_BOX:
         raise InputError(f"scene.xml has no box named {TABLE!r} to put things on", "bad_mjcf")
-    w, _, _, z = normalized_quaternion(np.array(body.quat, dtype=np.float64))
+    w, _, _, z = normalize_quaternion(np.array(body.quat, dtype=np.float64))
     red, green, blue = (int(np.clip(np.rint(255 * value), 0, 255)) for value in geom.rgba[:3])
     center, half = np.array(body.pos[:2], dtype=np.float64), np.array(geom.size[:2], dtype=np.float64)
     return Slab(center, half, float(2 * np.arctan2(z, w)), (red, green, blue))
 
 
-def mesh_of(files: Mapping[str, bytes], object_id: str) -> TriangleMesh:
-    """The true mesh of one object in its own frame, without colours.
+def load_mesh(files: Mapping[str, bytes], object_id: str) -> TriangleMesh:
+    """Load the mesh of one object in its own frame, without colours.
 
     Raises:
         InputError: `bad_scene` if there is no such object.
         GeometryError: if it does not decode.
     """
-    return _mesh(files, f"{ASSETS}/{file_stem(object_id)}.obj")
+    return _read_asset_mesh(files, f"{ASSETS}/{make_file_stem(object_id)}.obj")
 
 
-def thing(
+def make_scene_object(
     object_id: str, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], pose: Pose, mass_kg: float
 ) -> SceneObject:
-    """A thing of its mesh and pieces as it stands at `pose`."""
-    standing = placed_mesh(mesh, pose)
-    return SceneObject(object_id, mesh, hulls, pose, mass_kg, standing, body_of(standing))
+    """Make an object of its mesh and pieces at `pose`."""
+    standing = place_mesh(mesh, pose)
+    return SceneObject(object_id, mesh, hulls, pose, mass_kg, standing, compute_body_features(standing))
 
 
-def _thing(files: Mapping[str, bytes], row: Mapping[str, Any]) -> SceneObject:
-    object_id, stem = str(row["object_id"]), file_stem(str(row["object_id"]))
+def _load_object(files: Mapping[str, bytes], row: Mapping[str, Any]) -> SceneObject:
+    object_id, stem = str(row["object_id"]), make_file_stem(str(row["object_id"]))
     try:
         numbers = np.array([row[key] for key in (*_POSITION, *_QUATERNION, "mass_kg")], dtype=np.float64)
-        pose = Pose(numbers[:3], normalized_quaternion(numbers[3:7]))
+        pose = Pose(numbers[:3], normalize_quaternion(numbers[3:7]))
         count = int(row["n_pieces"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{object_id}: its row has no pose: {error}"[:300], "bad_scene") from error
     if not np.isfinite(numbers).all() or not 0 < count <= MAX_PIECES:
         raise InputError(f"{object_id}: its row holds what is no pose, mass or number of pieces", "bad_scene")
-    pieces = tuple(_mesh(files, f"{ASSETS}/{stem}_piece_{index:02d}.obj") for index in range(count))
-    return thing(object_id, _mesh(files, f"{ASSETS}/{stem}.obj"), pieces, pose, float(numbers[7]))
+    pieces = tuple(_read_asset_mesh(files, f"{ASSETS}/{stem}_piece_{index:02d}.obj") for index in range(count))
+    return make_scene_object(
+        object_id, _read_asset_mesh(files, f"{ASSETS}/{stem}.obj"), pieces, pose, float(numbers[7])
+    )
 
 
-def _mesh(files: Mapping[str, bytes], name: str) -> TriangleMesh:
+def _read_asset_mesh(files: Mapping[str, bytes], name: str) -> TriangleMesh:
     if name not in files:
         raise InputError(f"there is no {name}", "bad_scene")
-    return read_mesh(_PICTURE.sub(b"", files[name]), name)
+    return read_mesh(_TEXTURE_AND_NORMALS.sub(b"", files[name]), name)

@@ -1,22 +1,22 @@
-"""An object's shape as the simulator has it, without its mass and its place: settle, curate and export share it."""
+"""An object's shape for the simulator, without mass and pose: settle, curate and export share it."""
 
 from dataclasses import dataclass, replace
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.core.memoize import memoize_by_content
-from tableverse_factory.physics.mjcf.inertia import VolumeMoments, volume_moments
-from tableverse_factory.physics.mjcf.obj_assets import scale_and_quantize, usable_hulls
+from tableverse_factory.physics.mjcf.inertia import VolumeMoments, compute_volume_moments
+from tableverse_factory.physics.mjcf.obj_assets import prepare_hulls, scale_and_quantize
 
 REMEMBERED_BYTES = 64 * 1024 * 1024
-"""The objects of many scenes: what one stage has measured, the next finds again where both run in one process."""
+"""The objects of many scenes: stages in one process share the results."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shape(Frozen):
-    """In metres, in the mesh's own frame.
+class BodyShape(Frozen):
+    """Mesh and convex pieces in metres, in the mesh's own frame.
 
     Attributes:
-        mesh: Scaled, rounded to what its file will say.
+        mesh: Scaled and rounded as its file is written.
         hulls: Convex pieces, likewise, without those too thin to simulate.
         moments: Of the volume that the object's mass is spread over.
     """
@@ -26,20 +26,20 @@ class Shape(Frozen):
     moments: VolumeMoments
 
 
-def shape_of(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float) -> Shape:
-    """The mesh and its pieces at `scale`.
+def make_body_shape(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float) -> BodyShape:
+    """Make the shape of a mesh and its pieces at `scale`.
 
     Raises:
         GeometryError: if no piece is thick enough to simulate.
     """
-    pieces, moments = _solid(replace(mesh, vertex_colors=None, texture=None), hulls, scale)
-    return Shape(scale_and_quantize(mesh, scale), pieces, moments)
+    pieces, moments = _make_collision_shape(replace(mesh, vertex_colors=None, texture=None), hulls, scale)
+    return BodyShape(scale_and_quantize(mesh, scale), pieces, moments)
 
 
 @memoize_by_content(REMEMBERED_BYTES)
-def _solid(
+def _make_collision_shape(
     mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float
 ) -> tuple[tuple[TriangleMesh, ...], VolumeMoments]:
-    """What takes time: the pieces and the moments. The mesh itself and its pictures are large, and soon scaled."""
-    pieces = usable_hulls(hulls, scale)
-    return pieces, volume_moments(scale_and_quantize(mesh, scale), pieces)
+    """Compute the pieces and the moments, which take time; the large mesh and its pictures are not cached."""
+    pieces = prepare_hulls(hulls, scale)
+    return pieces, compute_volume_moments(scale_and_quantize(mesh, scale), pieces)

@@ -1,4 +1,4 @@
-"""The table as the simulation has it: a slab whose top is z = 0, wide enough for all that stands on it."""
+"""The simulated table: a slab whose top is z = 0, wide enough for all objects on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from tableverse_factory.geometry.math.transforms import transform_points
 
 THICKNESS_M = 0.04
 OBJECT_MARGIN_M = 0.10
-"""A picture shows part of a table: the slab reaches this far beyond every object, whatever part was seen."""
+"""The slab reaches this far beyond every object, as a picture may show only part of a table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,29 +33,27 @@ class Slab(Frozen):
     color: tuple[int, int, int]
 
     def holds(self, points: Points) -> np.ndarray:
-        """Which points lie above the rectangle, however high or low. Shape (n,)."""
-        inside: np.ndarray = (np.abs(_along(points[:, :2] - self.center_xy, self.yaw)) <= self.half_size_xy).all(axis=1)
-        return inside
+        """Whether each point lies over or under the rectangle. Shape (n,)."""
+        return (np.abs(_rotate_to_slab(points[:, :2] - self.center_xy, self.yaw)) <= self.half_size_xy).all(axis=1)
 
 
-def slab_under(table: Table, meshes: Sequence[TriangleMesh], poses: Sequence[Pose], scales: Sequence[float]) -> Slab:
-    """The table's rectangle, widened until every object stands `OBJECT_MARGIN_M` inside its edges."""
+def fit_slab(table: Table, meshes: Sequence[TriangleMesh], poses: Sequence[Pose], scales: Sequence[float]) -> Slab:
+    """Widen the table's rectangle until every object stands `OBJECT_MARGIN_M` inside its edges."""
     low, high = -table.half_size_xy, np.array(table.half_size_xy)
     for mesh, pose, scale in zip(meshes, poses, scales, strict=True):
-        corners = transform_points(pose, _box_corners(mesh), scale)[:, :2]
-        along = _along(corners - table.center_xy, table.yaw)
+        corners = transform_points(pose, _list_box_corners(mesh), scale)[:, :2]
+        along = _rotate_to_slab(corners - table.center_xy, table.yaw)
         low = np.minimum(low, along.min(axis=0) - OBJECT_MARGIN_M)
         high = np.maximum(high, along.max(axis=0) + OBJECT_MARGIN_M)
-    middle = _along(((low + high) / 2)[None], -table.yaw)[0]
+    middle = _rotate_to_slab(((low + high) / 2)[None], -table.yaw)[0]
     return Slab(table.center_xy + middle, (high - low) / 2, table.yaw, table.color)
 
 
-def _along(points_xy: Float64[np.ndarray, "n 2"], yaw: float) -> Float64[np.ndarray, "n 2"]:
+def _rotate_to_slab(points_xy: Float64[np.ndarray, "n 2"], yaw: float) -> Float64[np.ndarray, "n 2"]:
     c, s = np.cos(yaw), np.sin(yaw)
-    turned: Float64[np.ndarray, "n 2"] = points_xy @ np.array([[c, -s], [s, c]])
-    return turned
+    return points_xy @ np.array([[c, -s], [s, c]])
 
 
-def _box_corners(mesh: TriangleMesh) -> Points:
+def _list_box_corners(mesh: TriangleMesh) -> Points:
     low, high = aabb(mesh.vertices)
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

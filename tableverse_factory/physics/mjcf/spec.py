@@ -1,6 +1,6 @@
 """A scene as an MjSpec: bodies named by their object ids, on a slab. The only place where MJCF is made.
 
-Settings that make rest real, all in the XML: implicitfast; elliptic cones with impratio 100 (a leaning thing creeps
+Settings for stable rest, all in the XML: implicitfast; elliptic cones with impratio 100 (a leaning object creeps
 twelve times slower than at 10, at no cost); five no-slip iterations; condim 6 with torsional and rolling friction;
 contacts so stiff that a stack sinks in by hundredths of a millimetre instead of MuJoCo's default tenths.
 """
@@ -11,15 +11,17 @@ from dataclasses import dataclass, field, replace
 import mujoco
 import numpy as np
 
-from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
-from schemas.identity import file_stem
-from tableverse_factory.core.png import png_bytes
+from schemas.geometry import Frozen, Pose, TriangleMesh
+from schemas.identity import make_file_stem
+from tableverse_factory.core.png import encode_png
+from tableverse_factory.geometry.math.axes import OPENCV_TO_OPENGL
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.mjcf.inertia import MassProperties
-from tableverse_factory.physics.mjcf.obj_assets import Appearance, obj_bytes
-from tableverse_factory.physics.mjcf.shape import shape_of
+from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
+from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import THICKNESS_M, Slab
-from tableverse_factory.physics.mjcf.xml_compat import portable_xml
+from tableverse_factory.physics.mjcf.xml_compat import make_portable_xml
 
 ASSETS = "assets"
 TABLE = "table"
@@ -27,7 +29,7 @@ VISUAL_GROUP, COLLISION_GROUP, TABLE_GROUP = 2, 3, 1
 TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
 TABLE_FRICTION = 0.8
 TABLE_ROLLING_FRICTION = 1e-4
-"""Next to nothing: a contact takes the larger of two frictions, and what rolls is the thing and not the table."""
+"""Almost none: a contact takes the larger of two frictions, and the object decides how it rolls."""
 CONTACT_TIME_S = 0.005
 """Time constant of a contact [s]; MuJoCo is stable down to two steps.
 
@@ -40,19 +42,19 @@ IMPEDANCE = (0.95, 0.99, 0.001)
 _TETRAHEDRON_OBJ = (
     b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"
 )
-_PIXEL_PNG = png_bytes(np.zeros((1, 1, 3), dtype=np.uint8))
+_PIXEL_PNG = encode_png(np.zeros((1, 1, 3), dtype=np.uint8))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneBody(Frozen):
-    """One object, in metres and kilograms, ready to be written.
+    """One object in metres and kilograms, ready for export.
 
     Attributes:
         mesh: In its own frame, already scaled [m].
         hulls: Convex pieces in the same frame and scale.
         properties: Mass, centre and inertia in the same frame.
         pose: The mesh's own frame in the table frame.
-        appearance: Its texture, or None: then `color` is all it has.
+        appearance: Its texture; None for the uniform `color`.
         dropped_pieces: How many convex pieces were too thin to simulate.
     """
 
@@ -68,21 +70,13 @@ class SceneBody(Frozen):
     dropped_pieces: int = 0
 
     def with_mass(self, mass_kg: float) -> "SceneBody":
-        """The same body of another density."""
+        """Set the mass by the density."""
         return replace(self, properties=self.properties.with_mass(mass_kg))
 
 
 @dataclass(frozen=True, slots=True)
-class PhotoCamera:
-    """The picture's camera, for renders from where it was taken."""
-
-    camera: Camera
-    camera_to_table: Pose
-
-
-@dataclass(frozen=True, slots=True)
-class Tabletop:
-    """What lies on the table: a picture, repeated.
+class TableTexture:
+    """A picture repeated over the table.
 
     Attributes:
         texture_png: The file; it has no seam.
@@ -101,57 +95,52 @@ class SceneFiles:
     assets: dict[str, bytes] = field(default_factory=dict)
 
     def model(self) -> mujoco.MjModel:
-        """The model, compiled from nothing but these files."""
+        """Compile the model from these files alone."""
         return mujoco.MjModel.from_xml_string(self.xml, self.assets)
 
 
-def scene_body(
-    object_id: str,
-    mesh: TriangleMesh,
-    hulls: tuple[TriangleMesh, ...],
-    scale: float,
-    mass_kg: float,
-    pose: Pose,
+def make_scene_body(
+    object_id: str, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float, mass_kg: float, pose: Pose
 ) -> SceneBody:
-    """A body of the mesh and pieces at `scale`.
+    """Make a body of a mesh and its pieces at `scale`.
 
     Raises:
         GeometryError: if no piece is thick enough to simulate.
     """
-    shape = shape_of(mesh, hulls, scale)
+    shape = make_body_shape(mesh, hulls, scale)
     properties, thin = shape.moments.of_mass(mass_kg), len(hulls) - len(shape.hulls)
     return SceneBody(object_id, shape.mesh, shape.hulls, properties, pose, dropped_pieces=thin)
 
 
 def quantize_pose(pose: Pose) -> Pose:
-    """The pose to 12 decimals, as it is written."""
+    """Round a pose to 12 decimals, as it is written."""
     return Pose(np.round(pose.position, 12) + 0.0, np.round(pose.quaternion_wxyz, 12) + 0.0)
 
 
-def scene_files(
+def make_scene_files(
     bodies: Sequence[SceneBody],
     slab: Slab,
     *,
     model_name: str = "scene",
     timestep_s: float = 0.002,
-    view: PhotoCamera | None = None,
-    tabletop: Tabletop | None = None,
+    view: PosedCamera | None = None,
+    tabletop: TableTexture | None = None,
 ) -> SceneFiles:
-    """MJCF text with its assets, visual meshes and textures included."""
-    spec, assets = scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
+    """Make MJCF text with its assets, visual meshes and textures included."""
+    spec, assets = make_scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
     if tabletop is not None:
         _cover_table(spec, slab, tabletop, assets)
     if view is not None:
         _add_camera(spec, view)
-    # MuJoCo writes the XML of compiled models only, and of a file no more than its name: what stands in for the files
-    # compiles at once. They themselves are compiled by `SceneFiles.model`, from the XML, as anybody would.
+    # MuJoCo writes the XML of compiled models only, and only the names of files: placeholders compile at once.
+    # `SceneFiles.model` compiles the real files, from the XML.
     spec.assets = {name: _TETRAHEDRON_OBJ if name.endswith(".obj") else _PIXEL_PNG for name in assets}
     spec.compile()
     exact = {body.object_id: (quantize_pose(body.pose), body.properties) for body in bodies}
-    return SceneFiles(portable_xml(spec.to_xml(), exact), assets)
+    return SceneFiles(make_portable_xml(spec.to_xml(), exact), assets)
 
 
-def scene_spec(
+def make_scene_spec(
     bodies: Sequence[SceneBody],
     slab: Slab,
     *,
@@ -159,7 +148,7 @@ def scene_spec(
     timestep_s: float = 0.002,
     visuals: bool = True,
 ) -> tuple[mujoco.MjSpec, dict[str, bytes]]:
-    """The scene as an MjSpec, and its asset files by their path beside the XML.
+    """Make the scene as an MjSpec, and its asset files by their path beside the XML.
 
     Args:
         bodies: The objects.
@@ -212,14 +201,14 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     top.group = TABLE_GROUP
     top.friction = [TABLE_FRICTION, TORSIONAL_FRICTION, TABLE_ROLLING_FRICTION]
     top.rgba = [*(np.array(slab.color) / 255.0), 1.0]
-    # A spot, because MuJoCo 3.3 and 4 have no word in common for a directional light.
+    # A spot: MuJoCo 3.3 and 4 name directional lights differently.
     light = spec.worldbody.add_light(name="key")
     to_light = np.array([-0.6, -0.8, 1.7]) * max(1.0, float(np.linalg.norm(slab.half_size_xy)))
     light.pos, light.dir = np.array([*slab.center_xy, 0.0]) + to_light, -to_light
     light.diffuse, light.specular, light.cutoff, light.exponent = [0.45, 0.45, 0.43], [0.1, 0.1, 0.1], 60.0, 1.0
 
 
-def _cover_table(spec: mujoco.MjSpec, slab: Slab, tabletop: Tabletop, assets: dict[str, bytes]) -> None:
+def _cover_table(spec: mujoco.MjSpec, slab: Slab, tabletop: TableTexture, assets: dict[str, bytes]) -> None:
     assets[f"{ASSETS}/{TABLE}.png"] = tabletop.texture_png
     spec.add_texture(name=TABLE, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{TABLE}.png")
     material = spec.add_material(name=TABLE, specular=0.15, shininess=0.3)
@@ -230,11 +219,10 @@ def _cover_table(spec: mujoco.MjSpec, slab: Slab, tabletop: Tabletop, assets: di
     top.material, top.rgba = TABLE, [1.0, 1.0, 1.0, 1.0]
 
 
-def _add_camera(spec: mujoco.MjSpec, view: PhotoCamera) -> None:
+def _add_camera(spec: mujoco.MjSpec, view: PosedCamera) -> None:
     camera, pose = view.camera, view.camera_to_table
     eye = spec.worldbody.add_camera(name="observation")
-    # MuJoCo's cameras look along -z with y up, the picture's along z with y down: half a turn about x.
-    eye.pos, eye.quat = pose.position, multiply_quaternions(pose.quaternion_wxyz, np.array([0.0, 1.0, 0.0, 0.0]))
+    eye.pos, eye.quat = pose.position, multiply_quaternions(pose.quaternion_wxyz, OPENCV_TO_OPENGL)
     eye.fovy = float(np.degrees(2 * np.arctan(camera.height / (2 * camera.fy))))
     eye.resolution = [camera.width, camera.height]
 
@@ -248,15 +236,15 @@ def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) ->
     part.fullinertia = [inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2]]
     part.explicitinertial = True
     for index, hull in enumerate(body.hulls):
-        name = f"{file_stem(body.object_id)}_piece_{index:02d}"
-        geom = _add_mesh_geom(spec, part, name, "collision", obj_bytes(hull), assets)
+        name = f"{make_file_stem(body.object_id)}_piece_{index:02d}"
+        geom = _add_mesh_geom(spec, part, name, "collision", encode_obj(hull), assets)
         geom.friction = [body.friction, TORSIONAL_FRICTION, body.rolling_friction]
     return part
 
 
 def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, assets: dict[str, bytes]) -> None:
-    name = file_stem(body.object_id)
-    geom = _add_mesh_geom(spec, part, name, "visual", obj_bytes(body.mesh, body.appearance), assets)
+    name = make_file_stem(body.object_id)
+    geom = _add_mesh_geom(spec, part, name, "visual", encode_obj(body.mesh, body.appearance), assets)
     if body.appearance is None:
         geom.rgba = [*(np.array(body.color) / 255.0), 1.0]
         return
@@ -271,6 +259,6 @@ def _add_mesh_geom(
     spec: mujoco.MjSpec, part: mujoco.MjsBody, name: str, kind: str, data: bytes, assets: dict[str, bytes]
 ) -> mujoco.MjsGeom:
     assets[f"{ASSETS}/{name}.obj"] = data
-    # Inertia stands in the body: `shell` only keeps MuJoCo from refusing open or thin meshes.
+    # The body has explicit inertia; `shell` keeps MuJoCo from refusing open or thin meshes.
     spec.add_mesh(name=name, file=f"{name}.obj", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     return part.add_geom(spec.find_default(kind), name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)

@@ -1,4 +1,4 @@
-"""MuJoCo's own XML, made exact and readable by older releases: edited as a document, never as text."""
+"""MuJoCo's own XML, made exact and readable by older releases."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -9,35 +9,35 @@ from schemas.geometry import Pose
 from tableverse_factory.physics.mjcf.inertia import MassProperties
 
 
-def portable_xml(xml: str, bodies: Mapping[str, tuple[Pose, MassProperties]]) -> str:
-    """The document with what `MjSpec.to_xml` loses put back and what only the newest MuJoCo reads taken out.
+def make_portable_xml(xml: str, bodies: Mapping[str, tuple[Pose, MassProperties]]) -> str:
+    """Restore what `MjSpec.to_xml` loses and remove what only the newest MuJoCo reads.
 
     Poses and inertias are written in full: MuJoCo writes six digits, which moves far poses by micrometres, and leaves
     its compiler's rounding noise as the pose of every mesh geom, whose frame is the body's own. The colour space of a
-    texture is always `auto`, a word that MuJoCo 3.3 does not know; several contacts per pair of pieces are the default
-    of MuJoCo 4 alone, and what rests here needs them.
+    texture is always `auto`, which MuJoCo 3.3 does not know; several contacts per pair of pieces, which stable rest
+    needs, are the default of MuJoCo 4 alone.
 
     Args:
         xml: As MuJoCo wrote it.
         bodies: Pose and mass properties of each body by its name.
     """
     root = ET.fromstring(xml)  # noqa: S314 - written by MuJoCo a moment ago
-    _child(_child(root, "option"), "flag").set("multiccd", "enable")
+    find_or_add_child(find_or_add_child(root, "option"), "flag").set("multiccd", "enable")
     for texture in root.iter("texture"):
         texture.attrib.pop("colorspace", None)
     for element in root.iter("body"):
         name = element.get("name", "")
         if name in bodies:
-            _place(element, *bodies[name])
+            _write_body(element, *bodies[name])
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _place(element: ET.Element, pose: Pose, properties: MassProperties) -> None:
+def _write_body(element: ET.Element, pose: Pose, properties: MassProperties) -> None:
     element.set("pos", _numbers(pose.position))
     element.set("quat", _numbers(pose.quaternion_wxyz))
     i = properties.inertia
-    inertial = _child(element, "inertial")
+    inertial = find_or_add_child(element, "inertial")
     inertial.attrib.clear()
     inertial.set("pos", _numbers(properties.center))
     inertial.set("mass", _numbers([properties.mass_kg]))
@@ -47,8 +47,8 @@ def _place(element: ET.Element, pose: Pose, properties: MassProperties) -> None:
         geom.attrib.pop("quat", None)
 
 
-def _child(parent: ET.Element, tag: str) -> ET.Element:
-    """The element's child of this tag, made where there is none."""
+def find_or_add_child(parent: ET.Element, tag: str) -> ET.Element:
+    """Find the element's child of this tag, or add one."""
     found = parent.find(tag)
     return ET.SubElement(parent, tag) if found is None else found
 

@@ -1,6 +1,6 @@
-"""The same scene in another light: its table's texture, its lamps and its camera, changed in memory.
+"""Domain randomization of a scene in memory: the table's texture, the lights and the camera.
 
-Bodies, geoms, masses and contacts are not touched: what the certificate says of the scene stays true.
+Bodies, geoms, masses and contacts stay, so that the certificate stays valid.
 """
 
 import posixpath
@@ -11,21 +11,22 @@ from contextlib import suppress
 import numpy as np
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.geometry.math.transforms import multiply_quaternions, normalized_quaternion
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.math.transforms import multiply_quaternions, normalize_quaternion
 from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
+from tableverse_factory.physics.mjcf.xml_compat import find_or_add_child
 
 MAX_XML_BYTES = 64 * 1024 * 1024
 CAMERA = "observation"
 CAMERA_SHIFT_M = 0.03
 CAMERA_TURN_RAD = float(np.deg2rad(2.0))
 CAMERA_ZOOM = 0.04
-"""How far a camera is moved along each axis, turned about each, and its field of view changed in proportion."""
+"""Bounds of the camera's shift along each axis, rotation about each, and change of the field of view in proportion."""
 
 LIGHT_ELEVATION_RAD = (float(np.deg2rad(35.0)), float(np.deg2rad(80.0)))
 LIGHT_STRENGTH = (0.55, 1.1)
 LIGHT_WARMTH = 0.12
-"""Bounds of a lamp: its height over the table, its strength in proportion, red more and blue less by so much."""
+"""Bounds of a light: elevation over the table, relative strength, and how much more red and less blue."""
 
 _OTHER_ORIENTATIONS = ("euler", "axisangle", "xyaxes", "zaxis", "target")
 
@@ -38,39 +39,39 @@ def randomize_appearance(
     lights: int | None = None,
     camera: int | None = None,
 ) -> dict[str, bytes]:
-    """The files of the scene as it looks then; those given stay as they are.
+    """Randomize the appearance of a scene; returns new files and leaves the given ones.
 
     Args:
         files: `scene.xml` and its assets.
-        table_png: What lies on the table, repeated; None leaves it as it is.
+        table_png: Texture repeated over the table; None keeps the present one.
         tile_m: Length of table that the picture covers [m].
-        lights: Seed for the place, strength and warmth of every lamp, or None.
-        camera: Seed for where the camera `observation` stands; a scene without one gets one. Or None.
+        lights: Seed for position, strength and warmth of every light, or None.
+        camera: Seed for the pose of the camera `observation`, which is added where it is missing, or None.
 
     Raises:
         InputError: `bad_mjcf` if `scene.xml` is absent or no MJCF, or has no table to change.
     """
-    root = _document(files)
-    staged = dict(files)
+    root = _parse_document(files)
+    randomized = dict(files)
     if table_png is not None:
-        staged[f"{ASSETS}/{TABLE}.png"] = table_png
+        randomized[f"{ASSETS}/{TABLE}.png"] = table_png
         _cover_table(root, tile_m)
     if lights is not None:
-        _relight(root, rng_for(lights, "staging", "lights"))
+        _relight(root, make_rng(lights, "staging", "lights"))
     if camera is not None:
-        _move_camera(root, rng_for(camera, "staging", "camera"))
+        _move_camera(root, make_rng(camera, "staging", "camera"))
     ET.indent(root)
-    staged["scene.xml"] = (ET.tostring(root, encoding="unicode") + "\n").encode()
-    return staged
+    randomized["scene.xml"] = (ET.tostring(root, encoding="unicode") + "\n").encode()
+    return randomized
 
 
-def _document(files: Mapping[str, bytes]) -> ET.Element:
+def _parse_document(files: Mapping[str, bytes]) -> ET.Element:
     data = files.get("scene.xml")
     if data is None:
         raise InputError("there is no scene.xml", "bad_mjcf")
     if len(data) > MAX_XML_BYTES:
         raise InputError("scene.xml: longer than 64 MiB", "bad_mjcf")
-    text = _decoded(data)
+    text = _decode_text(data)
     if "<!" in text.replace("<!--", ""):
         raise InputError("scene.xml declares entities, which MJCF never does", "bad_mjcf")
     try:
@@ -82,8 +83,8 @@ def _document(files: Mapping[str, bytes]) -> ET.Element:
     return root
 
 
-def _decoded(data: bytes) -> str:
-    """UTF-8 and nothing else: a parser guesses UTF-16 by its zeros, and a search for `<!` would see none there."""
+def _decode_text(data: bytes) -> str:
+    """Decode UTF-8 only: a parser would detect UTF-16, where a search for `<!` finds none."""
     if b"\0" not in data:
         with suppress(UnicodeDecodeError):
             return data.decode("utf-8-sig")
@@ -91,13 +92,13 @@ def _decoded(data: bytes) -> str:
 
 
 def _cover_table(root: ET.Element, tile_m: float) -> None:
-    """The table's geom in a material of its own, with the texture as often as it fits."""
-    _, geom = _table(root)
+    """Give the table's geom a material of its own, the texture repeated as often as it fits."""
+    _, geom = _find_table(root)
     half = _numbers(geom.get("size", ""))
-    asset = _child(root, "asset")
+    asset = find_or_add_child(root, "asset")
     for element in [e for e in asset if e.tag in ("texture", "material") and e.get("name") == TABLE]:
         asset.remove(element)
-    compiler = _child(root, "compiler")
+    compiler = find_or_add_child(root, "compiler")
     folder = compiler.get("texturedir", compiler.get("assetdir", "."))
     file = posixpath.relpath(f"{ASSETS}/{TABLE}.png", folder)
     ET.SubElement(asset, "texture", name=TABLE, type="2d", file=file)
@@ -108,11 +109,11 @@ def _cover_table(root: ET.Element, tile_m: float) -> None:
 
 
 def _relight(root: ET.Element, rng: np.random.Generator) -> None:
-    head = _child(_child(root, "visual"), "headlight")
+    head = find_or_add_child(find_or_add_child(root, "visual"), "headlight")
     for key, default in (("ambient", 0.1), ("diffuse", 0.4)):
         strength = rng.uniform(*LIGHT_STRENGTH)
         head.set(key, _text(strength * np.array(_numbers(head.get(key, "")) or [default] * 3)))
-    world = _child(root, "worldbody")
+    world = find_or_add_child(root, "worldbody")
     lamps = list(world.iter("light")) or [ET.SubElement(world, "light", pos="0 0 2", dir="0 0 -1")]
     for lamp in lamps:
         strength, warmth = rng.uniform(*LIGHT_STRENGTH), rng.uniform(-LIGHT_WARMTH, LIGHT_WARMTH)
@@ -122,11 +123,11 @@ def _relight(root: ET.Element, rng: np.random.Generator) -> None:
 
 
 def _turn_lamp(lamp: ET.Element, azimuth: float, elevation: float) -> None:
-    """To another side of what it shines on, as far away as before."""
+    """Turn a light about its target, at the same distance."""
     place = np.array(_numbers(lamp.get("pos", "")) or [0.0, 0.0, 0.0])
     direction = np.array(_numbers(lamp.get("dir", "")) or [0.0, 0.0, -1.0])
     if len(place) != 3 or len(direction) != 3 or place[2] <= 0.0 or direction[2] >= 0.0:
-        return  # it does not shine down on the table: its colour was all there is to change
+        return  # it does not shine down on the table: only its colour changes
     target = place + direction * (place[2] / -direction[2])
     distance = np.linalg.norm(place - target)
     c, s = np.cos(elevation), np.sin(elevation)
@@ -136,7 +137,7 @@ def _turn_lamp(lamp: ET.Element, azimuth: float, elevation: float) -> None:
 
 
 def _move_camera(root: ET.Element, rng: np.random.Generator) -> None:
-    world = _child(root, "worldbody")
+    world = find_or_add_child(root, "worldbody")
     eye = next((c for c in world.findall("camera") if c.get("name") == CAMERA), None)
     if eye is None:
         _add_camera(root, world, rng)
@@ -146,15 +147,15 @@ def _move_camera(root: ET.Element, rng: np.random.Generator) -> None:
     eye.set("pos", _text(np.array(_numbers(eye.get("pos", "")) or [0.0] * 3) + shift))
     if not any(name in eye.attrib for name in _OTHER_ORIENTATIONS):
         before = np.array(_numbers(eye.get("quat", "")) or [1.0, 0.0, 0.0, 0.0])
-        small = normalized_quaternion(np.array([1.0, *(turn / 2)]))
-        eye.set("quat", _text(multiply_quaternions(normalized_quaternion(before), small)))
+        small = normalize_quaternion(np.array([1.0, *(turn / 2)]))
+        eye.set("quat", _text(multiply_quaternions(normalize_quaternion(before), small)))
     if "fovy" in eye.attrib:
         eye.set("fovy", _text(zoom * np.array(_numbers(eye.get("fovy", "")))))
 
 
 def _add_camera(root: ET.Element, world: ET.Element, rng: np.random.Generator) -> None:
-    """From the front, raised, the whole table in view."""
-    body, geom = _table(root)
+    """Add a camera in front, raised, with the whole table in view."""
+    body, geom = _find_table(root)
     center = np.array(_numbers(body.get("pos", "")) or [0.0] * 3)
     half_x, half_y, _ = _numbers(geom.get("size", ""))
     distance = 2.2 * float(np.hypot(half_x, half_y))
@@ -165,18 +166,13 @@ def _add_camera(root: ET.Element, world: ET.Element, rng: np.random.Generator) -
     ET.SubElement(world, "camera", name=CAMERA, pos=_text(place), xyaxes=axes, fovy="40")
 
 
-def _table(root: ET.Element) -> tuple[ET.Element, ET.Element]:
-    """The body that is the table, and its box."""
+def _find_table(root: ET.Element) -> tuple[ET.Element, ET.Element]:
+    """Find the table's body and its box."""
     for body in root.iter("body"):
         geom = next((g for g in body.findall("geom") if g.get("type") == "box"), None)
         if body.get("name") == TABLE and geom is not None and len(_numbers(geom.get("size", ""))) == 3:
             return body, geom
     raise InputError(f"scene.xml has no body {TABLE!r} with a box: there is no table to change", "bad_mjcf")
-
-
-def _child(parent: ET.Element, tag: str) -> ET.Element:
-    found = parent.find(tag)
-    return ET.SubElement(parent, tag) if found is None else found
 
 
 def _numbers(text: str) -> list[float]:

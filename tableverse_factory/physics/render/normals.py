@@ -10,27 +10,24 @@ MAX_VALENCE = 256
 WELD_DECIMALS = 6
 
 
-def corner_normals(mesh: TriangleMesh) -> Float32[np.ndarray, "m 3 3"]:
-    """Unit normals of each face's corners: the mean over the faces at that position within the crease angle."""
+def compute_corner_normals(mesh: TriangleMesh) -> Float32[np.ndarray, "m 3 3"]:
+    """Compute unit normals at each face's corners: the mean over the faces at that position within the crease angle."""
     corners = mesh.vertices[mesh.faces]
     scaled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    flat = _unit(scaled)
-    here, there = _neighbours(mesh)
+    flat = _normalize(scaled)
+    here, there = _pair_corners(mesh)
     face_here, face_there = here // 3, there // 3
     agree = np.einsum("ij,ij->i", flat[face_here], flat[face_there]) > CREASE_COS
-    # A sliver's own normal is noise: it weighs by its area, like every face.
+    # Weighted by area: the normal of a sliver is noise.
     weight = scaled[face_there] * agree[:, None]
     count = 3 * len(mesh.faces)
     total = np.stack([np.bincount(here, weight[:, k], minlength=count) for k in range(3)], axis=1)
     lost = np.linalg.norm(total, axis=1, keepdims=True) < 1e-18
-    return _unit(np.where(lost, np.repeat(flat, 3, axis=0), total)).reshape(-1, 3, 3).astype(np.float32)
+    return _normalize(np.where(lost, np.repeat(flat, 3, axis=0), total)).reshape(-1, 3, 3).astype(np.float32)
 
 
-def _neighbours(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Every pair of corners (3 * face + k) that share a position, each corner with itself too.
-
-    A fan of hundreds of faces would cost its square: its corners keep to themselves, and so stay flat.
-    """
+def _pair_corners(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
+    """List pairs of corners (3 * face + k) at one position, each with itself too, but not those of large fans."""
     _, welded = np.unique(np.round(mesh.vertices, WELD_DECIMALS), axis=0, return_inverse=True)
     position = welded.reshape(-1)[mesh.faces].reshape(-1)
     order = np.argsort(position, kind="stable")
@@ -45,7 +42,6 @@ def _neighbours(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     return order[first], order[second]
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _normalize(vectors: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    unit: np.ndarray = vectors / np.where(length > 0.0, length, 1.0)
-    return unit
+    return vectors / np.where(length > 0.0, length, 1.0)

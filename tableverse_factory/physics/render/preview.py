@@ -1,6 +1,6 @@
-"""Quick pictures for machines that look at many scenes: hard light, flat faces, single precision.
+"""Fast preview renderer for models that judge many scenes: hard light, flat faces, single precision.
 
-About a quarter of the cost of `physics.render`, which draws for people. Same conventions, same bytes every time.
+About a quarter of the cost of `physics.render`; deterministic, with the same conventions.
 """
 
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from jaxtyping import Float32
 
 from schemas.geometry import Camera, IdImage, Picture, Pose, Texture, TriangleMesh
 from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
 
 Rgb = tuple[int, int, int]
 
@@ -20,24 +21,21 @@ _TOWARDS_LIGHT = np.array([-0.36, -0.44, 0.82], dtype=np.float32)
 _AMBIENT, _KEY, _SHADE = 0.52, 0.52, 0.72
 _OFFSET_M = 2e-4
 _COARSE = 2
-"""Shadows are looked for in every second pixel of every second row."""
+"""Shadow rays are cast for every second pixel of every second row."""
 
 
-class Sketcher:
-    """Meshes in the world frame, ready to be drawn from anywhere; a mesh without faces is never seen."""
+class PreviewRenderer:
+    """Meshes in the world frame, to be drawn from any camera; a mesh without faces is never seen."""
 
     def __init__(self, parts: Sequence[TriangleMesh], colors: Sequence[Rgb | None]) -> None:
         self._parts, self._colors = parts, colors
-        self._caster = o3d.t.geometry.RaycastingScene(nthreads=1)
         filled = [index for index, mesh in enumerate(parts) if len(mesh.faces)]
-        for index in filled:
-            vertices = o3d.core.Tensor.from_numpy(parts[index].vertices.astype(np.float32))
-            self._caster.add_triangles(vertices, o3d.core.Tensor.from_numpy(parts[index].faces.astype(np.uint32)))
+        self._caster = make_raycasting_scene(*(parts[index] for index in filled))
         self._part_of = np.array([*filled, -1], dtype=np.int32)
 
     def draw(self, camera: Camera, camera_to_world: Pose) -> tuple[Picture, IdImage]:
-        """The picture, and which part is seen in each pixel: -1 for none."""
-        rays = _camera_rays(camera, camera_to_world)
+        """Draw the picture, and the index of the part seen in each pixel: -1 for none."""
+        rays = _make_camera_rays(camera, camera_to_world)
         answer = self._caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
         geometry = answer["geometry_ids"].numpy()
         ids = self._part_of[np.minimum(geometry, len(self._part_of) - 1)]
@@ -52,7 +50,7 @@ class Sketcher:
         return np.clip(picture, 0.0, 255.0).astype(np.uint8), ids
 
     def _lit(self, rays: Float32[np.ndarray, "h w 6"], depth: np.ndarray, ids: IdImage) -> np.ndarray:
-        """1 where the light reaches the surface, less where something stands in its way. Shape (h, w)."""
+        """Compute the share of light that reaches the surface, less in shadow. Shape (h, w)."""
         coarse = (slice(None, None, _COARSE), slice(None, None, _COARSE))
         seen = ids[coarse] >= 0
         start = rays[coarse][seen]
@@ -63,8 +61,7 @@ class Sketcher:
         blocked = self._caster.test_occlusions(o3d.core.Tensor.from_numpy(out), nthreads=1).numpy()
         lit = np.ones(seen.shape, dtype=np.float32)
         lit[seen] = np.where(blocked, np.float32(1.0 - _SHADE), np.float32(1.0))
-        fine: np.ndarray = lit.repeat(_COARSE, axis=0).repeat(_COARSE, axis=1)[: ids.shape[0], : ids.shape[1]]
-        return fine
+        return lit.repeat(_COARSE, axis=0).repeat(_COARSE, axis=1)[: ids.shape[0], : ids.shape[1]]
 
     def _colored(self, ids: IdImage, answer: dict[str, o3d.core.Tensor]) -> Float32[np.ndarray, "h w 3"]:
         """Colour of each pixel's surface, sRGB in 0–255."""
@@ -80,24 +77,23 @@ class Sketcher:
             faces, inside = triangles[here], uv[here]
             weights = np.stack([1.0 - inside.sum(axis=1), inside[:, 0], inside[:, 1]], axis=1)
             if mesh.texture is not None:
-                colors[here] = _looked_up(mesh.texture, faces, weights)
+                colors[here] = _sample_texture(mesh.texture, faces, weights)
             elif mesh.vertex_colors is not None:
                 corners = mesh.vertex_colors[mesh.faces[faces]].astype(np.float32)
                 colors[here] = np.einsum("nk,nkd->nd", weights, corners)
         return colors
 
 
-def _looked_up(texture: Texture, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Nearest texel of points on faces. Shape (n, 3)."""
+def _sample_texture(texture: Texture, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sample the nearest texel of points on faces. Shape (n, 3)."""
     height, width = texture.picture.shape[:2]
     uv = np.einsum("nk,nkd->nd", weights, texture.corner_uv[faces])
     columns = np.clip((uv[:, 0] * width).astype(np.int64), 0, width - 1)
     rows = np.clip(((1.0 - uv[:, 1]) * height).astype(np.int64), 0, height - 1)
-    found: np.ndarray = texture.picture[rows, columns]
-    return found
+    return texture.picture[rows, columns]
 
 
-def _camera_rays(camera: Camera, camera_to_world: Pose) -> Float32[np.ndarray, "h w 6"]:
+def _make_camera_rays(camera: Camera, camera_to_world: Pose) -> Float32[np.ndarray, "h w 6"]:
     """Origin and direction per pixel, of length 1 along the optical axis."""
     right, down, forward = rotation_matrix(camera_to_world.quaternion_wxyz).T.astype(np.float32)
     x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)

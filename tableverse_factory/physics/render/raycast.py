@@ -1,14 +1,13 @@
-"""Rays against meshes: Embree through Open3D's `RaycastingScene`, on one thread, without GL."""
+"""Camera and shadow rays against meshes, on the CPU."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
-from jaxtyping import Float32
 
 from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 
 SURFACE_OFFSET_M = 1e-4
 """Rays that leave a surface start this far off it: less than any wall, more than float32's error at a metre."""
@@ -16,7 +15,7 @@ SURFACE_OFFSET_M = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits(Frozen):
-    """Where a camera's rays end: only those that hit, in pixel order (row by row).
+    """Hits of a camera's rays, in pixel order (row by row).
 
     Attributes:
         pixels: Index of the pixel in the flattened picture. Shape (n,).
@@ -38,20 +37,17 @@ class Hits(Frozen):
 
 
 class Raycaster:
-    """Meshes in the world frame, ready for rays; a mesh without faces is allowed and never hit."""
+    """Meshes in the world frame; one without faces is allowed and never hit."""
 
     def __init__(self, parts: Sequence[TriangleMesh]) -> None:
-        self._caster = o3d.t.geometry.RaycastingScene(nthreads=1)
         filled = [index for index, mesh in enumerate(parts) if len(mesh.faces)]
-        for index in filled:
-            vertices = o3d.core.Tensor.from_numpy(parts[index].vertices.astype(np.float32))
-            self._caster.add_triangles(vertices, o3d.core.Tensor.from_numpy(parts[index].faces.astype(np.uint32)))
+        self._caster = make_raycasting_scene(*(parts[index] for index in filled))
         self._part_of = np.array(filled, dtype=np.int32)
 
     def cast(self, camera: Camera, camera_to_world: Pose, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
-        """One ray per pixel, `offset` from its centre [px]."""
-        directions = camera_rays(camera, camera_to_world, offset)
-        answer = self._caster.cast_rays(_rays(camera_to_world.position, directions), nthreads=1)
+        """Cast one ray per pixel, `offset` from its centre [px]."""
+        directions = compute_camera_rays(camera, camera_to_world, offset)
+        answer = self._caster.cast_rays(pack_rays(camera_to_world.position, directions), nthreads=1)
         depth = answer["t_hit"].numpy()
         pixels = np.flatnonzero(np.isfinite(depth))
         depth, directions = depth[pixels], directions[pixels]
@@ -69,20 +65,19 @@ class Raycaster:
         )
 
     def blocked(self, hits: Hits, directions: np.ndarray) -> np.ndarray:
-        """Whether anything lies beyond each hit in its direction. Shape (n,), bool.
+        """Test whether a mesh blocks each hit in its direction. Shape (n,), bool.
 
         Args:
             hits: Where the rays start.
             directions: One for all, shape (3,), or one each, shape (n, 3), in the world frame.
         """
-        rays = _rays(hits.points + hits.normals * np.float32(SURFACE_OFFSET_M), directions)
-        answer: np.ndarray = self._caster.test_occlusions(rays, nthreads=1).numpy()
-        return answer
+        rays = pack_rays(hits.points + hits.normals * np.float32(SURFACE_OFFSET_M), directions)
+        return self._caster.test_occlusions(rays, nthreads=1).numpy()
 
     def covered(self, camera: Camera, camera_to_world: Pose) -> tuple[np.ndarray, np.ndarray]:
-        """Every pair of a pixel and a mesh on its ray, hidden or not, once each and sorted: pixels, parts."""
-        directions = camera_rays(camera, camera_to_world, (0.0, 0.0))
-        hits = self._caster.list_intersections(_rays(camera_to_world.position, directions), nthreads=1)
+        """List every pair of a pixel and a mesh on its ray, hidden or not, sorted: pixels, parts."""
+        directions = compute_camera_rays(camera, camera_to_world, (0.0, 0.0))
+        hits = self._caster.list_intersections(pack_rays(camera_to_world.position, directions), nthreads=1)
         if not len(self._part_of):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         count = int(self._part_of[-1]) + 1
@@ -91,18 +86,9 @@ class Raycaster:
         return pairs // count, pairs % count
 
 
-def camera_rays(camera: Camera, camera_to_world: Pose, offset: tuple[float, float]) -> Points:
-    """World directions through the pixels, of length 1 along the optical axis. Shape (h * w, 3)."""
+def compute_camera_rays(camera: Camera, camera_to_world: Pose, offset: tuple[float, float]) -> Points:
+    """Compute world directions through the pixels, of length 1 along the optical axis. Shape (h * w, 3)."""
     x = (np.arange(camera.width) + offset[0] - camera.cx) / camera.fx
     y = (np.arange(camera.height) + offset[1] - camera.cy) / camera.fy
     right, down, forward = rotation_matrix(camera_to_world.quaternion_wxyz).T
-    directions: Points = (x[None, :, None] * right + (y[:, None, None] * down + forward)).reshape(-1, 3)
-    return directions
-
-
-def _rays(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
-    rays: Float32[np.ndarray, "n 6"] = np.empty(
-        (max(len(np.atleast_2d(a)) for a in (origins, directions)), 6), np.float32
-    )
-    rays[:, :3], rays[:, 3:] = origins, directions
-    return o3d.core.Tensor.from_numpy(rays)
+    return (x[None, :, None] * right + (y[:, None, None] * down + forward)).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Pictures of meshes by ray casting on the CPU: no GL, no display, the same bytes on every machine of a kind.
+"""Ray-cast rendering of meshes on the CPU: no GL, no display, the same bytes on every machine of a kind.
 
 Rays are cast by Embree, shading is numpy: a soft key light with shadow rays, a hemispheric sky with occlusion rays,
 both smoothed over neighbouring pixels of the same surface, and smooth normals where neighbouring faces agree.
@@ -12,14 +12,14 @@ from jaxtyping import Float32, Float64
 
 from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, Texture, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
-from tableverse_factory.physics.render.normals import corner_normals
+from tableverse_factory.physics.render.normals import compute_corner_normals
 from tableverse_factory.physics.render.raycast import Hits, Raycaster
 
 Rgb = tuple[float, float, float]
 Pattern = Callable[[Points], Float64[np.ndarray, "n 3"]]
 """World positions [m] to sRGB in 0–255, point by point."""
 Paint = Rgb | Pattern | None
-"""One sRGB colour in 0–255, a texture, or None: the mesh's own texture or vertex colours, grey where it has none."""
+"""One sRGB colour in 0–255, a pattern, or None: the mesh's own texture or vertex colours, else grey."""
 
 _GREY: Rgb = (178.0, 178.0, 184.0)
 GAMMA = 2.2
@@ -52,7 +52,7 @@ class Lighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering(Frozen):
-    """What a pinhole camera sees; all images have the camera's size.
+    """Images of a pinhole camera.
 
     Attributes:
         color: Shape (h, w, 3) sRGB.
@@ -103,7 +103,7 @@ def render(
     sky_rays: int = 0,
     samples: int = 1,
 ) -> Rendering:
-    """Renders meshes as they stand in the world frame (z up).
+    """Render meshes in the world frame (z up).
 
     Depth, ids and normals are taken at pixel centres; colour is the mean of `samples` x `samples` rays per pixel.
 
@@ -111,11 +111,11 @@ def render(
         parts: Meshes in the world frame [m]; a part without faces is allowed and never seen.
         camera: Intrinsics and size of the picture.
         camera_to_world: Pose of the camera, OpenCV axes.
-        paints: One per part; by default every mesh wears its own colours.
+        paints: One per part; by default every mesh has its own colours.
         lighting: Key light and sky; soft daylight by default.
         shadows: Whether shadow rays are cast to the key light.
-        sky_rays: Occlusion rays per pixel that darken corners and contacts; 0 for none, 6 to 12 look good.
-        samples: Side of the grid of samples in a pixel; 2 for pictures that people look at.
+        sky_rays: Ambient occlusion rays per pixel; 0 for none, 6 to 12 look good.
+        samples: Side of the grid of samples in a pixel; 2 antialiases.
 
     Raises:
         ValueError: if `paints` is not as long as `parts`, or `samples` is not positive.
@@ -136,7 +136,7 @@ def render_views(
     sky_rays: int = 0,
     samples: int = 1,
 ) -> tuple[Rendering, ...]:
-    """One picture per camera and its pose in the world; what the views share is prepared once (see `render`)."""
+    """Render one picture per camera and its pose in the world; shared data is prepared once (see `render`)."""
     paints = [None] * len(parts) if paints is None else paints
     if len(paints) != len(parts):
         raise ValueError(f"{len(paints)} paints for {len(parts)} parts: give one each")
@@ -162,12 +162,12 @@ def _render_view(
 ) -> Rendering:
     center = caster.cast(camera, camera_to_world)
     shape = (camera.height, camera.width)
-    key_light, sky_light = light_maps(caster, center, shape, lighting, shadows, sky_rays)
+    key_light, sky_light = compute_light_maps(caster, center, shape, lighting, shadows, sky_rays)
     linear = np.zeros((camera.height * camera.width, 3))
     for index in range(samples * samples):
         offset = ((index % samples + 0.5) / samples - 0.5, (index // samples + 0.5) / samples - 0.5)
         hits = center if samples == 1 else caster.cast(camera, camera_to_world, offset)
-        seen = np.broadcast_to(linear_light(np.array(lighting.background)), linear.shape).copy()
+        seen = np.broadcast_to(srgb_to_linear(np.array(lighting.background)), linear.shape).copy()
         seen[hits.pixels] = _shade(surfaces, hits, camera_to_world.position, lighting, key_light, sky_light)
         linear += seen
     color = np.rint(255.0 * np.clip(linear / samples**2, 0.0, 1.0) ** (1 / GAMMA)).astype(np.uint8)
@@ -178,7 +178,7 @@ def _render_view(
 
 
 class Surfaces:
-    """What meshes look like at a hit: smooth normals and colours."""
+    """Smooth normals and colours of meshes at hits."""
 
     def __init__(self, parts: Sequence[TriangleMesh], paints: Sequence[Paint]) -> None:
         self._parts = parts
@@ -186,7 +186,7 @@ class Surfaces:
         self._corner_normals: dict[int, Float32[np.ndarray, "m 3 3"]] = {}
 
     def at(self, hits: Hits) -> tuple[np.ndarray, np.ndarray]:
-        """Unit normals towards the eye, and linear colours. Both of shape (n, 3)."""
+        """Compute unit normals towards the eye, and linear colours. Both of shape (n, 3)."""
         normals, albedo = np.empty_like(hits.normals), np.empty_like(hits.points)
         for index in np.flatnonzero(np.bincount(hits.part, minlength=len(self._parts))):
             here = np.flatnonzero(hits.part == index)
@@ -194,27 +194,27 @@ class Surfaces:
             normals[here] = np.einsum("nk,nkd->nd", weights, self._corners(int(index))[triangles])
             albedo[here] = self._albedo(int(index), triangles, weights, hits.points[here])
         normals = np.where(_dot(normals, hits.normals)[:, None] < 0.0, -normals, normals)
-        return _unit(normals), albedo
+        return _normalize(normals), albedo
 
     def _corners(self, index: int) -> Float32[np.ndarray, "m 3 3"]:
         if index not in self._corner_normals:
-            self._corner_normals[index] = corner_normals(self._parts[index])
+            self._corner_normals[index] = compute_corner_normals(self._parts[index])
         return self._corner_normals[index]
 
     def _albedo(self, index: int, triangles: np.ndarray, weights: np.ndarray, points: Points) -> np.ndarray:
         mesh, paint = self._parts[index], self._paints[index]
         if callable(paint):
-            return linear_light(paint(points))
+            return srgb_to_linear(paint(points))
         if paint is None and mesh.texture is not None:
-            return _looked_up(mesh.texture, triangles, weights)
+            return _sample_texture(mesh.texture, triangles, weights)
         if paint is None and mesh.vertex_colors is not None:
             corners = mesh.vertex_colors[mesh.faces[triangles]].astype(np.float64)
-            return linear_light(np.einsum("nk,nkd->nd", weights, corners))
-        return np.broadcast_to(linear_light(np.array(paint or _GREY)), points.shape)
+            return srgb_to_linear(np.einsum("nk,nkd->nd", weights, corners))
+        return np.broadcast_to(srgb_to_linear(np.array(paint or _GREY)), points.shape)
 
 
-def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Linear colours of points on faces, bilinear between texels; beyond its edges it repeats. Shape (n, 3)."""
+def _sample_texture(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sample linear colours of points on faces, bilinearly; the texture repeats. Shape (n, 3)."""
     height, width = texture.picture.shape[:2]
     uv = np.einsum("nk,nkd->nd", weights, texture.corner_uv[triangles])
     uv = np.where((uv < 0.0) | (uv > 1.0), uv - np.floor(uv), uv)
@@ -223,27 +223,24 @@ def _looked_up(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> 
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
     along, down = (x - left)[:, None], (y - top)[:, None]
-    texels = texture.picture  # only those that are looked up become light: a picture has many more
+    texels = texture.picture  # linearised after the look-up: a picture has many more
     upper = (1.0 - along) * _LINEAR[texels[top, left]] + along * _LINEAR[texels[top, right]]
     lower = (1.0 - along) * _LINEAR[texels[bottom, left]] + along * _LINEAR[texels[bottom, right]]
-    mixed: np.ndarray = (1.0 - down) * upper + down * lower
-    return mixed
+    return (1.0 - down) * upper + down * lower
 
 
 def _shade(
     surfaces: Surfaces, hits: Hits, eye: Vector3, lighting: Lighting, key_light: np.ndarray, sky_light: np.ndarray
 ) -> np.ndarray:
-    """Linear colour of every hit under the light that its pixel receives. Shape (n, 3)."""
     normals, albedo = surfaces.at(hits)
-    ambient, direct = lit(hits.points, normals, albedo, eye, lighting)
-    shaded: np.ndarray = ambient * sky_light[hits.pixels, None] + direct * key_light[hits.pixels, None]
-    return shaded
+    ambient, direct = compute_light(hits.points, normals, albedo, eye, lighting)
+    return ambient * sky_light[hits.pixels, None] + direct * key_light[hits.pixels, None]
 
 
-def lit(
+def compute_light(
     points: Points, normals: np.ndarray, albedo: np.ndarray, eye: Vector3, lighting: Lighting
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear colours that an open sky, and an unhidden key light, give to points of a surface.
+    """Compute linear colours of surface points under an open sky and an unoccluded key light.
 
     Args:
         points: In the world frame [m]. Shape (n, 3).
@@ -253,26 +250,25 @@ def lit(
         lighting: Key light and sky.
 
     Returns:
-        The share of the sky and that of the key light, to be weighted by how much of each arrives. Both (n, 3).
+        The contributions of the sky and of the key light, before occlusion. Both (n, 3).
     """
-    to_light = _unit(np.array(lighting.key_direction))
+    to_light = _normalize(np.array(lighting.key_direction))
     facing = np.maximum(normals @ to_light, 0.0)[:, None]
     up, down = 0.5 + 0.5 * normals[:, 2:3], 0.5 - 0.5 * normals[:, 2:3]
     key = np.array(lighting.key)
-    half = _unit(_unit(eye - points) + to_light)
+    half = _normalize(_normalize(eye - points) + to_light)
     shine = lighting.gloss * np.maximum(_dot(normals, half), 0.0)[:, None] ** 48 * (facing > 0.0)
     ambient: np.ndarray = albedo * (up * np.array(lighting.sky) + down * np.array(lighting.ground))
     direct: np.ndarray = albedo * (facing * key) + shine * key
     return ambient, direct
 
 
-def light_maps(
+def compute_light_maps(
     caster: Raycaster, center: Hits, shape: tuple[int, int], lighting: Lighting, shadows: bool, sky_rays: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The share of the key light and of the sky that reaches each pixel's surface, 0–1. Both of shape (h * w,).
+    """Compute the share of the key light and of the sky that reaches each pixel, 0–1. Both of shape (h * w,).
 
-    Neighbouring pixels send their rays in different directions; the mean over the neighbourhood is then soft without
-    steps and without grain, at a handful of rays per pixel.
+    Neighbouring pixels cast rays in different directions; the mean over the neighbourhood is smooth at few rays each.
     """
     maps = np.ones((2, shape[0] * shape[1]), dtype=np.float32)
     turn = _pixel_turns(center.pixels, shape[1])
@@ -280,19 +276,19 @@ def light_maps(
         open_rays = np.zeros(len(center.pixels), dtype=np.float32)
         for k in range(_KEY_RAYS):
             radius = lighting.key_radius * np.sqrt((k + 0.5) / _KEY_RAYS)
-            toward = _around(np.array(lighting.key_direction), radius, turn + k * _GOLDEN_ANGLE)
+            toward = _cone_directions(np.array(lighting.key_direction), radius, turn + k * _GOLDEN_ANGLE)
             open_rays += ~caster.blocked(center, toward)
         maps[0, center.pixels] = open_rays / _KEY_RAYS
     if sky_rays > 0 and len(center.pixels):
         # Light bounces: no corner is darker than a quarter.
-        maps[1, center.pixels] = 0.25 + 0.75 * _openness(caster, center, turn, sky_rays)
+        maps[1, center.pixels] = 0.25 + 0.75 * _measure_openness(caster, center, turn, sky_rays)
     if shadows or sky_rays > 0:
-        maps = _smoothed(maps, center, shape)
+        maps = _smooth_maps(maps, center, shape)
     return maps[0], maps[1]
 
 
-def _openness(caster: Raycaster, center: Hits, turn: np.ndarray, sky_rays: int) -> np.ndarray:
-    """The cosine-weighted share of the upper hemisphere that each hit sees. Shape (n,)."""
+def _measure_openness(caster: Raycaster, center: Hits, turn: np.ndarray, sky_rays: int) -> np.ndarray:
+    """Measure the cosine-weighted share of the upper hemisphere that each hit sees. Shape (n,)."""
     seen, total = (np.full(len(turn), 1e-6, dtype=np.float32) for _ in range(2))
     for k in range(sky_rays):
         height = (k + 0.5) / sky_rays
@@ -301,19 +297,18 @@ def _openness(caster: Raycaster, center: Hits, turn: np.ndarray, sky_rays: int) 
         weight = np.maximum(_dot(center.normals, toward), 0.0)
         seen += weight * ~caster.blocked(center, toward)
         total += weight
-    share: np.ndarray = seen / total
-    return share
+    return seen / total
 
 
-def _smoothed(maps: np.ndarray, center: Hits, shape: tuple[int, int]) -> np.ndarray:
-    """Means over neighbouring pixels of the same part that face alike: 3 x 3, then 3 x 3 of every second pixel."""
+def _smooth_maps(maps: np.ndarray, center: Hits, shape: tuple[int, int]) -> np.ndarray:
+    """Average over neighbouring pixels of the same part and orientation: 3 x 3, then 3 x 3 of every second pixel."""
     ids, normals = np.full(shape, -1, dtype=np.int32), np.zeros((*shape, 3), dtype=np.float32)
     ids.reshape(-1)[center.pixels], normals.reshape(-1, 3)[center.pixels] = center.part, center.normals
     images = maps.reshape(len(maps), *shape)
     for step in (1, 2):
         total, weight = images.copy(), np.ones(shape, dtype=np.float32)
         for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            here, there = _overlap(shape, dy * step, dx * step)
+            here, there = _neighbour_slices(shape, dy * step, dx * step)
             alike = (ids[here] == ids[there]) & (_dot(normals[here], normals[there]) > 0.9)
             total[:, *here] += alike * images[:, *there]
             total[:, *there] += alike * images[:, *here]
@@ -323,7 +318,7 @@ def _smoothed(maps: np.ndarray, center: Hits, shape: tuple[int, int]) -> np.ndar
     return images.reshape(len(maps), -1)
 
 
-def _overlap(shape: tuple[int, int], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def _neighbour_slices(shape: tuple[int, int], dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Slices of the pixels that have a neighbour at (dy, dx), dy >= 0, and of those neighbours."""
     height, width = shape
     rows = slice(0, height - dy), slice(dy, height)
@@ -331,37 +326,33 @@ def _overlap(shape: tuple[int, int], dy: int, dx: int) -> tuple[tuple[slice, sli
     return (rows[0], columns[0]), (rows[1], columns[1])
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _normalize(vectors: np.ndarray) -> np.ndarray:
     length = np.sqrt(_dot(vectors, vectors))[..., None]
-    unit: np.ndarray = vectors / np.where(length > 0.0, length, 1.0)
-    return unit
+    return vectors / np.where(length > 0.0, length, 1.0)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    product: np.ndarray = np.einsum("...i,...i->...", a, b)
-    return product
+    return np.einsum("...i,...i->...", a, b)
 
 
-def linear_light(srgb: np.ndarray) -> np.ndarray:
-    """Linear RGB in 0–1 of sRGB in 0–255."""
-    linear: np.ndarray = np.clip(srgb / 255.0, 0.0, 1.0) ** GAMMA
-    return linear
+def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Convert sRGB in 0–255 to linear RGB in 0–1."""
+    return np.clip(srgb / 255.0, 0.0, 1.0) ** GAMMA
 
 
-_LINEAR = linear_light(np.arange(256))
-"""Of every value that a byte has."""
+_LINEAR = srgb_to_linear(np.arange(256))
+"""Look-up table of linear light for a byte."""
 
 
 def _pixel_turns(pixels: np.ndarray, width: int) -> np.ndarray:
     """An angle per pixel [rad], well spread over a neighbourhood: interleaved gradient noise (Jimenez, 2014)."""
     v, u = np.divmod(pixels, width)
-    turns: np.ndarray = 2 * np.pi * ((52.9829189 * ((0.06711056 * u + 0.00583715 * v) % 1.0)) % 1.0)
-    return turns
+    return 2 * np.pi * ((52.9829189 * ((0.06711056 * u + 0.00583715 * v) % 1.0)) % 1.0)
 
 
-def _around(direction: Vector3, radius: float, turn: np.ndarray) -> Points:
+def _cone_directions(direction: Vector3, radius: float, turn: np.ndarray) -> Points:
     """Unit directions on a cone of `radius` [rad] about an axis, one per turn. Shape (n, 3)."""
-    axis = _unit(direction)
-    side = _unit(np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]))
+    axis = _normalize(direction)
+    side = _normalize(np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]))
     across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
-    return _unit(axis + radius * across)
+    return _normalize(axis + radius * across)

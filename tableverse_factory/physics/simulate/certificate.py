@@ -1,7 +1,8 @@
-"""The certificate: what is true of a scene's files, measured on those files and nothing else (design section 5)."""
+"""Certificate of a scene: penetration, drift and rest, measured on its files alone (design section 5)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import mujoco
 import numpy as np
@@ -9,36 +10,36 @@ import numpy as np
 from schemas.geometry import Pose, TriangleMesh
 from schemas.scene import Certificate
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import box_center, placed_mesh
-from tableverse_factory.geometry.relations.containers import holder_of
-from tableverse_factory.physics.mjcf.pose_history import History
-from tableverse_factory.physics.simulate.at_rest import body_poses, free_bodies, measure_drift, set_poses
-from tableverse_factory.physics.simulate.model_solids import ModelBody, bodies_of_model, body_name, deepest_overlaps
+from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh
+from tableverse_factory.geometry.relations.containers import make_hollow_vessel
+from tableverse_factory.physics.mjcf.pose_history import PoseHistory
+from tableverse_factory.physics.simulate.at_rest import find_free_bodies, measure_drift, read_body_poses, set_poses
+from tableverse_factory.physics.simulate.model_solids import ModelBody, body_name, find_deepest_overlaps, load_bodies
 
 DRIFT_TIME_S = 5.0
 DRIFT_LIMIT_M = 0.001
 DRIFT_LIMIT_RAD = float(np.deg2rad(1.0))
 FALL_M = 0.05
-"""An object whose centre of mass sinks this far within the drift time has fallen off whatever held it."""
+"""An object whose centre of mass sinks this far within the drift time has fallen off its support."""
 
 Depth = tuple[float, str]
-"""Depth of the deepest pair [m], and the pair's names joined by ` & `; (0.0, "") where nothing touches."""
+"""Depth of the deepest pair [m], and its names joined by ` & `; (0.0, "") where none touch."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What MuJoCo files alone say.
+    """Measurements of a MuJoCo model.
 
     Attributes:
         bodies: Names of the free bodies.
-        pieces: Deepest contact in the initial state, between whatever geoms collide.
-        meshes: Deepest shared volume in the initial state, between what is seen.
+        pieces: Deepest contact between geoms in the initial state.
+        meshes: Deepest shared volume between visible meshes in the initial state.
         drift_m: Largest displacement of a centre of mass over `DRIFT_TIME_S` [m].
         drift_rad: Largest rotation over the same time [rad].
         moved: Names of the bodies beyond the limits of drift.
         fell: Names of the bodies that sank by more than `FALL_M`.
-        warnings: MuJoCo's warnings on the way.
-        repaired: Geoms whose mesh had to be closed before it could be measured, and how.
+        warnings: MuJoCo's warnings during the simulation.
+        repaired: Geoms whose mesh had to be closed for the measurement, and how.
         end_poses: Where the bodies are after the drift time.
     """
 
@@ -55,7 +56,7 @@ class Measurement:
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing moved beyond the limits, fell, or upset the simulation."""
+        """Whether no body moved beyond the limits or fell, and the simulation was stable."""
         return not (self.moved or self.fell or self.warnings)
 
     def colliding(self, epsilon_m: float) -> bool:
@@ -63,39 +64,39 @@ class Measurement:
         return max(self.pieces[0], self.meshes[0]) > epsilon_m
 
 
-def measure(model: mujoco.MjModel) -> Measurement:
-    """Measures the initial state of any model: its free bodies against one another and against what stands still."""
-    return _measure(model, *bodies_of_model(model))
+def measure_model(model: mujoco.MjModel) -> Measurement:
+    """Measure the initial state of any model: its free bodies against one another and the static geometry."""
+    return _measure(model, *load_bodies(model))
 
 
-def certify(model: mujoco.MjModel, history: History, epsilon_m: float) -> tuple[Certificate, Measurement]:
-    """The certificate of one of our scenes, from its compiled files.
+def certify(model: mujoco.MjModel, history: PoseHistory, epsilon_m: float) -> tuple[Certificate, Measurement]:
+    """Certify an exported scene from its compiled files.
 
     Args:
         model: Compiled from `scene.xml` and its assets.
-        history: Its poses before, which the XML does not hold.
+        history: Its earlier poses, which the XML does not hold.
         epsilon_m: Depth below which a touch is no collision [m].
     """
-    moving, still = bodies_of_model(model)
+    moving, still = load_bodies(model)
     now = _measure(model, moving, still)
-    poses = body_poses(model, mujoco.MjData(model), free_bodies(model))
+    poses = read_body_poses(model, mujoco.MjData(model), find_free_bodies(model))
     before = [history.rectified.get(thing.name, pose) for thing, pose in zip(moving, poses, strict=True)]
     shift = {
-        thing.name: _displacement(thing.mesh, history.placed[thing.name], pose)
+        thing.name: _measure_displacement(thing.mesh, history.placed[thing.name], pose)
         for thing, pose in zip(moving, poses, strict=True)
         if thing.name in history.placed
     }
     certificate = Certificate(
         epsilon_m=epsilon_m,
-        piece_penetration_before_m=deepest_contact(model, before)[0],
-        mesh_penetration_before_m=_deepest(deepest_overlaps(moving, before, still))[0],
+        piece_penetration_before_m=find_deepest_contact(model, before)[0],
+        mesh_penetration_before_m=_find_deepest_overlap(find_deepest_overlaps(moving, before, still))[0],
         piece_penetration_m=now.pieces[0],
         mesh_penetration_m=now.meshes[0],
         drift_m=now.drift_m,
         drift_rad=now.drift_rad,
         displacement_m=tuple(sorted(shift.items())),
         fell=now.fell,
-        left_container=_left_container(moving, poses, history.contained_in),
+        left_container=_find_spilled(moving, poses, history.contained_in),
         at_rest=now.at_rest,
         colliding=now.colliding(epsilon_m),
     )
@@ -104,27 +105,27 @@ def certify(model: mujoco.MjModel, history: History, epsilon_m: float) -> tuple[
 
 def _measure(model: mujoco.MjModel, moving: Sequence[ModelBody], still: ModelBody) -> Measurement:
     names = tuple(thing.name for thing in moving)
-    poses = body_poses(model, mujoco.MjData(model), free_bodies(model))
+    poses = read_body_poses(model, mujoco.MjData(model), find_free_bodies(model))
     drift = measure_drift(model, DRIFT_TIME_S)
     too_far = (drift.distance_m > DRIFT_LIMIT_M) | (drift.angle_rad > DRIFT_LIMIT_RAD)
     return Measurement(
         bodies=names,
-        pieces=deepest_contact(model, poses),
-        meshes=_deepest(deepest_overlaps(moving, poses, still)),
+        pieces=find_deepest_contact(model, poses),
+        meshes=_find_deepest_overlap(find_deepest_overlaps(moving, poses, still)),
         drift_m=float(drift.distance_m.max(initial=0.0)),
         drift_rad=float(drift.angle_rad.max(initial=0.0)),
-        moved=_pick(names, too_far),
-        fell=_pick(names, drift.sunk_m > FALL_M),
+        moved=tuple(compress(names, too_far)),
+        fell=tuple(compress(names, drift.sunk_m > FALL_M)),
         warnings=drift.warnings,
         repaired=tuple(note for thing in (*moving, still) for note in thing.repaired),
         end_poses=drift.poses,
     )
 
 
-def deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
-    """The deepest contact that MuJoCo finds with the free bodies at these poses, what stands still included."""
+def find_deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
+    """Find MuJoCo's deepest contact with the free bodies at these poses, static geometry included."""
     data = mujoco.MjData(model)
-    set_poses(model, data, free_bodies(model), poses)
+    set_poses(model, data, find_free_bodies(model), poses)
     mujoco.mj_fwdPosition(model, data)
     roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
     depths = np.where(roots[:, 0] != roots[:, 1], -data.contact.dist, 0.0)
@@ -134,28 +135,24 @@ def deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
     return float(depths[worst]), " & ".join(body_name(model, int(root)) for root in roots[worst])
 
 
-def _deepest(overlaps: Sequence[tuple[str, str, float]]) -> Depth:
+def _find_deepest_overlap(overlaps: Sequence[tuple[str, str, float]]) -> Depth:
     if not overlaps:
         return 0.0, ""
     a, b, depth = max(overlaps, key=lambda overlap: overlap[2])
     return depth, f"{a} & {b}"
 
 
-def _pick(names: Sequence[str], chosen: np.ndarray) -> tuple[str, ...]:
-    return tuple(name for name, take in zip(names, chosen, strict=True) if take)
-
-
-def _displacement(mesh: TriangleMesh, before: Pose, after: Pose) -> float:
+def _measure_displacement(mesh: TriangleMesh, before: Pose, after: Pose) -> float:
     center = box_center(mesh)[None]
     return float(np.linalg.norm(transform_points(after, center) - transform_points(before, center)))
 
 
-def _left_container(
+def _find_spilled(
     moving: Sequence[ModelBody], poses: Sequence[Pose], contained_in: Mapping[str, str]
 ) -> tuple[str, ...]:
-    """Names of the contents that do not lie in their container any more; each lay in it after rectification."""
-    placed = {thing.name: placed_mesh(thing.mesh, pose) for thing, pose in zip(moving, poses, strict=True)}
-    holders = {name: holder_of(placed[name]) for name in sorted(set(contained_in.values()) & placed.keys())}
+    """Find the contents that no longer lie in their container, as all did after rectification."""
+    placed = {thing.name: place_mesh(thing.mesh, pose) for thing, pose in zip(moving, poses, strict=True)}
+    holders = {name: make_hollow_vessel(placed[name]) for name in sorted(set(contained_in.values()) & placed.keys())}
     return tuple(
         name
         for name, container in sorted(contained_in.items())

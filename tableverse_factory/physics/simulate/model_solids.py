@@ -1,4 +1,4 @@
-"""What a compiled MuJoCo model holds, as solids: its free bodies and what they stand on. Works on anybody's MJCF."""
+"""Bodies of a compiled MuJoCo model as solids: the free bodies and the static geometry. Works on any MJCF."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,41 +11,42 @@ import trimesh
 
 from schemas.geometry import Frozen, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.collision.broad_phase import overlapping_regions, slab_between
-from tableverse_factory.geometry.collision.penetration import region_thickness
-from tableverse_factory.geometry.math.aabb import aabb, size_around
+from tableverse_factory.geometry.collision.broad_phase import crop_to_half_space, find_separating_slab
+from tableverse_factory.geometry.collision.penetration import measure_thickness
+from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 from tableverse_factory.geometry.math.transforms import (
-    compose,
+    compose_poses,
     identity_pose,
-    inverse,
+    invert_pose,
     matrix_from_pose,
-    pose_from_matrix,
+    pose_from_rotation,
     transform_points,
 )
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.mesh.repair import LEAST_FILL, as_solid, closed_solid
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, from_trimesh, place_mesh
+from tableverse_factory.geometry.mesh.repair import MIN_FILL_SHARE, make_closed_solid, mesh_to_solid
 from tableverse_factory.geometry.mesh.shells import is_one_shell
-from tableverse_factory.physics.mjcf.hidden_geoms import geoms_without_visual
+from tableverse_factory.physics.mjcf.drawables import read_mesh
+from tableverse_factory.physics.mjcf.hidden_geoms import find_geoms_without_visual
 from tableverse_factory.physics.mjcf.inertia import is_closed
-from tableverse_factory.physics.simulate.at_rest import free_bodies
+from tableverse_factory.physics.simulate.at_rest import find_free_bodies
 
-_FEW_FACES = 500
-"""Of so few the whole solid is made."""
+_MIN_CROPPED_FACES = 500
+"""Of fewer the whole solid is made."""
 
 _SEGMENTS = 48
 _PLANE_REACH_M = 50.0
 
 
 class GeomSolid:
-    """One geom in the frame of its thing.
+    """One geom in the frame of its body.
 
-    A closed mesh is made a solid only when its box meets another's, and then as little of it as that other can reach:
-    solids cost more than all other measures of it.
+    A closed mesh is made a solid only when its box meets another's, and only as far as that other can reach, as making
+    solids is the most expensive step.
 
     Attributes:
-        mesh: As it is seen.
-        repaired: What was done to a mesh that is no closed solid as it stands, e.g. `obj_003: filled`, or empty.
+        mesh: Visible shape.
+        repaired: How a mesh that is no closed solid was repaired, e.g. `obj_003: filled`, or empty.
     """
 
     def __init__(self, name: str, mesh: TriangleMesh) -> None:
@@ -55,42 +56,41 @@ class GeomSolid:
             self._closed()
 
     def points_at(self, pose: Pose) -> Points:
-        """Points whose hull the solid fills no more than, where its thing is at this pose."""
+        """Points whose hull holds the solid, with its body at this pose."""
         if self.repaired:
-            points: Points = self.solid_at(pose).to_mesh64().vert_properties[:, :3].astype(np.float64)
-            return points
+            return self.solid_at(pose).to_mesh64().vert_properties[:, :3].astype(np.float64)
         return transform_points(pose, self.mesh.vertices)
 
     def solid_at(self, pose: Pose) -> manifold3d.Manifold:
-        """The solid where its thing is at this pose."""
+        """The solid with its body at this pose."""
         return self._closed().transform(matrix_from_pose(pose)[:3])
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether the mesh bounds a solid as it stands, by one surface."""
+        """Whether the mesh bounds a solid by one surface, without repair."""
         if self._solid is not None or not is_one_shell(self.mesh):
             return False
-        return signed_volume(self.mesh) > 0.0
+        return compute_signed_volume(self.mesh) > 0.0
 
     @property
     def _is_flat(self) -> bool:
-        """Whether it is closed around nothing: what gives it body changes where it is."""
-        return abs(signed_volume(self.mesh)) <= LEAST_FILL * float(size_around(self.mesh.vertices).max()) ** 3
+        """Whether it encloses almost nothing: repair then changes its extent."""
+        return abs(compute_signed_volume(self.mesh)) <= MIN_FILL_SHARE * float(aabb_size(self.mesh.vertices).max()) ** 3
 
     def _closed(self) -> manifold3d.Manifold:
         if self._solid is None:
-            self._solid, note = _solid(self.mesh)
+            self._solid, note = _close_mesh(self.mesh)
             self.repaired = f"{self._name}: {note}" if note else ""
         return self._solid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelBody(Frozen):
-    """Geometry that moves as one: a free body with all below it, or everything that stands still.
+    """Geometry that moves as one: a free body with its children, or all static geometry.
 
     Attributes:
-        name: Of the free body, `#7` where body 7 has none; `world` for what stands still.
-        parts: What it is seen as, a part per geom, in the frame of the body.
+        name: Of the free body, `#7` where body 7 has none; `world` for static geometry.
+        parts: Visible shape, a part per geom, in the frame of the body.
     """
 
     name: str
@@ -98,52 +98,54 @@ class ModelBody(Frozen):
 
     @property
     def mesh(self) -> TriangleMesh:
-        """All it is seen as, in the frame of the body."""
-        return joined([part.mesh for part in self.parts])
+        """The visible shape, in the frame of the body."""
+        return concatenate_meshes([part.mesh for part in self.parts])
 
     @property
     def repaired(self) -> tuple[str, ...]:
-        """Geoms whose mesh is no closed solid as it stands, with what was done, e.g. `obj_003: filled`."""
+        """Geoms whose mesh was repaired, and how, e.g. `obj_003: filled`."""
         return tuple(part.repaired for part in self.parts if part.repaired)
 
 
-def bodies_of_model(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody]:
-    """The free bodies of the model in its order, and all that stands still, as they are seen.
+def load_bodies(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody]:
+    """Load the free bodies of the model in its order, and the static geometry, with their visible shapes.
 
-    Seen are the geoms that collide with nothing (a body's visual meshes) and those that collide where nothing of them
-    is (`geoms_without_visual`); where a body has none that collide with nothing, all of them.
+    Visible are the geoms that do not collide (a body's visual meshes) and colliding ones that no such geom represents
+    (`find_geoms_without_visual`); where all geoms of a body collide, all of them.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    free = free_bodies(model)
+    free = find_free_bodies(model)
     roots = model.body_rootid[model.geom_bodyid]
     still = ~np.isin(roots, free)
-    moving = tuple(_thing(model, data, body_name(model, root), root, np.flatnonzero(roots == root)) for root in free)
-    return moving, _thing(model, data, "world", 0, np.flatnonzero(still))
+    moving = tuple(
+        _load_body(model, data, body_name(model, root), root, np.flatnonzero(roots == root)) for root in free
+    )
+    return moving, _load_body(model, data, "world", 0, np.flatnonzero(still))
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Its name, or `#` and its id where it has none."""
+    """Name of a body, or `#` and its id where it has none."""
     return model.body(body).name or f"#{body}"
 
 
-def deepest_overlaps(
+def find_deepest_overlaps(
     moving: Sequence[ModelBody], poses: Sequence[Pose], still: ModelBody
 ) -> list[tuple[str, str, float]]:
-    """Every pair of things whose solids share volume, with the thickness of what they share [m]."""
+    """Find every pair of bodies whose solids share volume, with the thickness of the shared volume [m]."""
     standing = [*zip(moving, poses, strict=True), (still, identity_pose())]
-    placed = [(thing.name, [_Placed(part, pose) for part in thing.parts]) for thing, pose in standing]
+    placed = [(body.name, [_PosedSolid(part, pose) for part in body.parts]) for body, pose in standing]
     found = []
     for i, (name_a, parts_a) in enumerate(placed):
         for name_b, parts_b in placed[i + 1 :]:
-            depth = max((_overlap(a, b) for a in parts_a for b in parts_b), default=0.0)
+            depth = max((_measure_overlap(a, b) for a in parts_a for b in parts_b), default=0.0)
             if depth > 0.0:
                 found.append((name_a, name_b, depth))
     return found
 
 
-class _Placed:
-    """A part where its thing is."""
+class _PosedSolid:
+    """A part with its body at a pose."""
 
     def __init__(self, part: GeomSolid, pose: Pose) -> None:
         self._part, self._pose = part, pose
@@ -151,10 +153,10 @@ class _Placed:
         self.low, self.high = aabb(self.points)
 
     def solid_before(self, normal: Vector3, high: float) -> manifold3d.Manifold:
-        """The solid, or one that is the same where `x @ normal < high`."""
-        if len(self._part.mesh.faces) > _FEW_FACES and "_whole" not in vars(self) and self._part.is_plain:
-            some = overlapping_regions(replace(self._part.mesh, vertices=self.points), normal, high)
-            if some is not None and not (solid := as_solid(some)).is_empty():
+        """The solid, or one that equals it where `x @ normal < high`."""
+        if len(self._part.mesh.faces) > _MIN_CROPPED_FACES and "_whole" not in vars(self) and self._part.is_plain:
+            some = crop_to_half_space(replace(self._part.mesh, vertices=self.points), normal, high)
+            if some is not None and not (solid := mesh_to_solid(some)).is_empty():
                 return solid
         return self._whole
 
@@ -163,67 +165,53 @@ class _Placed:
         return self._part.solid_at(self._pose)
 
 
-def _overlap(a: _Placed, b: _Placed) -> float:
+def _measure_overlap(a: _PosedSolid, b: _PosedSolid) -> float:
     if (a.low >= b.high).any() or (b.low >= a.high).any():
         return 0.0
-    slab = slab_between(a.points, b.points)
+    slab = find_separating_slab(a.points, b.points)
     if slab.is_gap:
         return 0.0
-    # Of what either cut solid is beyond its end of the slab, nothing meets the other, cut or not.
+    # Beyond its end of the slab neither solid meets the other, cropped or not.
     regions = (a.solid_before(slab.normal, slab.high) ^ b.solid_before(-slab.normal, -slab.low)).decompose()
-    return max((region_thickness(region) for region in regions), default=0.0)
+    return max((measure_thickness(region) for region in regions), default=0.0)
 
 
-def _thing(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> ModelBody:
-    to_root = inverse(_pose(data.xpos[root], data.xmat[root]))
+def _load_body(model: mujoco.MjModel, data: mujoco.MjData, name: str, root: int, geoms: np.ndarray) -> ModelBody:
+    to_root = invert_pose(pose_from_rotation(data.xpos[root], data.xmat[root].reshape(3, 3)))
     parts = []
-    for geom in _shape_geoms(model, data, geoms):
-        shape = geom_shape(model, geom)
+    for geom in _select_shape_geoms(model, data, geoms):
+        shape = make_geom_mesh(model, geom)
         if shape is not None:
-            mesh = placed_mesh(shape, compose(to_root, _pose(data.geom_xpos[geom], data.geom_xmat[geom])))
+            pose = pose_from_rotation(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
+            mesh = place_mesh(shape, compose_poses(to_root, pose))
             parts.append(GeomSolid(model.geom(geom).name or name, mesh))
     return ModelBody(name, tuple(parts))
 
 
-def _shape_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> list[int]:
-    """The geoms that make up the shapes of bodies, each body judged for itself."""
+def _select_shape_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> list[int]:
+    """Select the geoms that make up the visible shapes of bodies."""
     chosen: list[int] = []
     for root in np.unique(model.body_rootid[model.geom_bodyid[geoms]]):
         own = [int(geom) for geom in geoms if model.body_rootid[model.geom_bodyid[geom]] == root]
         solid = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
         drawn = [geom for geom in own if geom not in solid] or own
-        chosen += [*drawn, *geoms_without_visual(model, data, drawn, solid)]
+        chosen += [*drawn, *find_geoms_without_visual(model, data, drawn, solid)]
     return chosen
 
 
-def _solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
-    """The mesh as a solid and what was done to close it; its convex hull (`hull`) where no repair helps."""
+def _close_mesh(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
+    """Make a solid of a mesh and name the repair: its convex hull (`hull`) where no other helps."""
     try:
-        return closed_solid(mesh)
+        return make_closed_solid(mesh)
     except GeometryError:
         return manifold3d.Manifold.hull_points(mesh.vertices.copy()), "hull"
 
 
-def _pose(position: np.ndarray, matrix: np.ndarray) -> Pose:
-    homogeneous = np.eye(4)
-    homogeneous[:3, :3], homogeneous[:3, 3] = matrix.reshape(3, 3), position
-    return pose_from_matrix(homogeneous)
-
-
-def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """All triangles of meshes of one frame as one mesh, without their colours; empty where there are none."""
-    if not meshes:
-        return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
-    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + np.int32(start) for mesh, start in zip(meshes, starts, strict=True)]
-    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
-
-
-def geom_shape(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:
-    """A geom as triangles in its own frame; None for kinds without volume of their own (height fields, fields)."""
+def make_geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:
+    """Make a geom's triangles in its own frame; None for types without volume of their own (height fields)."""
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return _mesh(model, int(model.geom_dataid[geom]))
+        return read_mesh(model, int(model.geom_dataid[geom]))
     if kind == mujoco.mjtGeom.mjGEOM_PLANE:
         slab = trimesh.creation.box((2 * _PLANE_REACH_M, 2 * _PLANE_REACH_M, _PLANE_REACH_M))
         slab.apply_translation([0, 0, -_PLANE_REACH_M / 2])
@@ -239,12 +227,3 @@ def geom_shape(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:
         ball = from_trimesh(trimesh.creation.icosphere(4))
         return TriangleMesh(ball.vertices * radii, ball.faces)
     return None
-
-
-def _mesh(model: mujoco.MjModel, index: int) -> TriangleMesh:
-    first, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
-    first_face, faces = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
-    return TriangleMesh(
-        model.mesh_vert[first : first + count].astype(np.float64),
-        model.mesh_face[first_face : first_face + faces].astype(np.int32),
-    )

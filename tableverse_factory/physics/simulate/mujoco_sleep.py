@@ -1,4 +1,4 @@
-"""MuJoCo's sleep: what rests, and is touched by nothing that moves, is not simulated."""
+"""MuJoCo's sleep: bodies at rest that no moving body touches are not simulated."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,8 +7,8 @@ import mujoco
 
 
 @contextmanager
-def sleeping(model: mujoco.MjModel, tolerance: float) -> Iterator[None]:
-    """Inside, bodies slower than the tolerance [m/s, rad/s] for ten steps fall asleep, with all that they touch."""
+def allow_sleep(model: mujoco.MjModel, tolerance: float) -> Iterator[None]:
+    """Let bodies slower than the tolerance [m/s, rad/s] for ten steps fall asleep, with those that they touch."""
     option = model.opt
     own = int(option.enableflags), float(option.sleep_tolerance)
     option.enableflags, option.sleep_tolerance = own[0] | int(mujoco.mjtEnableBit.mjENBL_SLEEP), tolerance

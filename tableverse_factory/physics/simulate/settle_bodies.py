@@ -1,4 +1,4 @@
-"""Bodies brought to rest on the table: simulated, and where that never ends, given more rolling friction."""
+"""Bring bodies to rest on the table; restless ones get more rolling friction."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,19 +9,19 @@ from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, quantize_pose, scene_spec
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_spec, quantize_pose
 from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 
 STEADIER_ROLLING_FRICTION = 0.02
-"""For a body that rocks for ever on the rounded edge of a piece: contacts jump from one end of the edge to the other,
-and each jump is a kick. It is written in the XML and in meta.json of the bodies that needed it.
+"""For a body that rocks forever on the rounded edge of a piece, kicked by contacts that jump between its ends. It is
+written in the XML and in meta.json of the bodies that needed it.
 """
 
 
 def bring_to_rest(
     bodies: Sequence[SceneBody], slab: Slab, *, timestep_s: float, max_time_s: float, gentle: bool
 ) -> tuple[tuple[SceneBody, ...], Rest]:
-    """Simulates from the bodies' poses to rest; once more, the restless ones steadied, if the time is up before.
+    """Simulate to rest; where the time is up before, again with more rolling friction for the restless bodies.
 
     Args:
         bodies: In the order of the answer.
@@ -31,33 +31,33 @@ def bring_to_rest(
         gentle: As in `simulate_to_rest`.
 
     Returns:
-        The bodies where they ended, and how the last try ended, with the time of both.
+        The bodies where they ended, and the outcome of the last try, with the time of both.
     """
-    ended, rest = _simulated(bodies, slab, timestep_s, max_time_s, gentle)
-    if rest.at_rest or rest.warnings or fallen(ended, slab):
+    ended, rest = _simulate(bodies, slab, timestep_s, max_time_s, gentle)
+    if rest.at_rest or rest.warnings or find_fallen(ended, slab):
         return ended, rest
-    steady = with_more_rolling_friction(
+    steady = increase_rolling_friction(
         ended, {b.object_id for b, restless in zip(ended, rest.moving, strict=True) if restless}
     )
-    ended, again = _simulated(steady, slab, timestep_s, max_time_s, gentle=False)
+    ended, again = _simulate(steady, slab, timestep_s, max_time_s, gentle=False)
     return ended, replace(again, time_s=rest.time_s + again.time_s)
 
 
-def with_more_rolling_friction(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody, ...]:
-    """The bodies, those named with `STEADIER_ROLLING_FRICTION`."""
+def increase_rolling_friction(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody, ...]:
+    """Give the named bodies `STEADIER_ROLLING_FRICTION`."""
     return tuple(
         replace(body, rolling_friction=STEADIER_ROLLING_FRICTION) if body.object_id in restless else body
         for body in bodies
     )
 
 
-def moved_to(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
-    """The bodies at these poses, rounded as the XML is: tables, meta.json and XML then agree to the last digit."""
+def move_bodies(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:
+    """Move bodies to poses, rounded as in the XML: tables, meta.json and XML then agree to the last digit."""
     return tuple(replace(body, pose=quantize_pose(pose)) for body, pose in zip(bodies, poses, strict=True))
 
 
-def fallen(bodies: Sequence[SceneBody], slab: Slab) -> list[str]:
-    """Ids of objects whose box centre is below the table top or beyond its edge."""
+def find_fallen(bodies: Sequence[SceneBody], slab: Slab) -> list[str]:
+    """Find the objects whose box centre is below the table top or beyond its edge."""
     if not bodies:
         return []
     centers = np.concatenate([transform_points(body.pose, box_center(body.mesh)[None]) for body in bodies])
@@ -65,9 +65,9 @@ def fallen(bodies: Sequence[SceneBody], slab: Slab) -> list[str]:
     return [body.object_id for body, gone in zip(bodies, off, strict=True) if gone]
 
 
-def _simulated(
+def _simulate(
     bodies: Sequence[SceneBody], slab: Slab, timestep_s: float, max_time_s: float, gentle: bool
 ) -> tuple[tuple[SceneBody, ...], Rest]:
-    spec, _ = scene_spec(bodies, slab, timestep_s=timestep_s, visuals=False)
+    spec, _ = make_scene_spec(bodies, slab, timestep_s=timestep_s, visuals=False)
     rest = simulate_to_rest(spec.compile(), max_time_s, gentle)
-    return moved_to(bodies, rest.poses), rest
+    return move_bodies(bodies, rest.poses), rest

@@ -1,18 +1,17 @@
-"""What filling the containers of one scene may cost: counted in work, not in seconds, so that a result repeats."""
+"""Budget for filling the containers of one scene, counted in work, not in seconds, so that results repeat."""
 
 from dataclasses import dataclass
 
-OUT_OF_BUDGET = "filling the containers of this scene took as much work as it may"
+BUDGET_SPENT = "filling the containers of this scene took as much work as it may"
 
 
 @dataclass(slots=True)
 class SimulationBudget:
-    """What is left; each drop or look that was begun is ended.
+    """Remaining budget; each drop or search that was started is finished.
 
     Attributes:
-        dropping_s: Simulated time for dropping things one by one [s].
-        freeing_s: Simulated time for freeing together what is in [s]. It is kept apart, or a scene that ran out would
-            lose what it has.
+        dropping_s: Simulated time for dropping contents one by one [s].
+        freeing_s: Simulated time for settling the contents together [s]; separate, so that dropping cannot exhaust it.
         comparisons: Of two convex pieces each, to find a free start for a fall.
     """
 
@@ -22,10 +21,10 @@ class SimulationBudget:
 
     @property
     def may_drop(self) -> bool:
-        """Whether another thing may be dropped."""
+        """Whether another object may be dropped."""
         return self.dropping_s > 0.0 and self.comparisons > 0
 
     @property
     def may_free(self) -> bool:
-        """Whether the contents of a container may be freed together."""
+        """Whether the contents of a container may be settled together."""
         return self.freeing_s > 0.0

@@ -1,4 +1,4 @@
-"""How one thing gets into a container: where it may start, an isolated free fall, and whether it lies inside then."""
+"""Start poses for dropping an object into a container."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -7,41 +7,41 @@ import numpy as np
 
 from schemas.geometry import ConvexPieces, Frozen, Points, Pose, Quaternion, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
-from tableverse_factory.geometry.collision.ray_clearance import MovingSolid, Ray
+from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, MovingSolid
 from tableverse_factory.geometry.collision.solids import place_pieces
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
-    normalized_quaternion,
+    normalize_quaternion,
     quaternion_about_z,
     rotation_matrix,
     transform_points,
-    translated,
+    translate_pose,
 )
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.relations.containers import HollowVessel
 from tableverse_factory.physics.mjcf.spec import SceneBody
 from tableverse_factory.stages.rectify.budget import SimulationBudget
+from tableverse_factory.stages.rectify.vertical import UP
 
-UP = np.array([0.0, 0.0, 1.0])
 HEADINGS = 8
-"""Sideways directions in which a thing that clips is pushed clear; as many again point halfway up."""
+"""Sideways directions in which an object that overlaps is pushed clear; as many again point halfway up."""
 TILT_STEPS = (0.0, 0.15, 0.3, 0.5)
-"""Shares by which a long thing is set more upright, where pushing it alone would take it far."""
+"""Shares by which a long object is turned upright, where pushing alone would move it far."""
 LONG_RATIO = 2.5
 METRES_PER_RAD = 0.05
-"""What turning a thing costs against pushing it."""
+"""Cost of turning an object against pushing it."""
 DRAWS = 16
-"""Random places and orientations that are looked at for one fall; the one that starts lowest is taken."""
+"""Random poses tried for one fall; the one that starts lowest is taken."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Member(Frozen):
+class CompositeMember(Frozen):
     """One object of a composite.
 
     Attributes:
         item: As it was placed.
         pieces: Its convex pieces.
-        body: The same for the simulation, where it is now.
+        body: Its simulation body, at the current pose.
     """
 
     item: PlacedObject
@@ -50,69 +50,62 @@ class Member(Frozen):
 
     @property
     def container_id(self) -> str:
-        """What holds it; empty for the outermost container."""
+        """Its container; empty for the outermost one."""
         return self.item.contained_in or ""
 
     @property
     def pose(self) -> Pose:
-        """Where it is now."""
+        """Current pose."""
         return self.body.pose
 
     @property
     def mesh(self) -> TriangleMesh:
-        """Its mesh where it is now."""
-        return placed_mesh(self.item.mesh, self.pose, self.item.scale)
+        """Its mesh at the current pose."""
+        return place_mesh(self.item.mesh, self.pose, self.item.scale)
 
     @property
     def corners(self) -> Points:
-        """Corners of its pieces where it is now [m]. Shape (n, 3)."""
+        """Corners of its pieces at the current pose [m]. Shape (n, 3)."""
         return transform_points(self.pose, np.concatenate([hull.vertices for hull in self.body.hulls]))
 
     @property
     def solid(self) -> MovingSolid:
-        """Its pieces where it is now."""
+        """Its pieces at the current pose."""
         uncovered = self.item.scale * self.pieces.uncovered_m
         return MovingSolid(place_pieces(self.pieces, self.pose, self.item.scale), np.zeros(3), uncovered)
 
-    def at(self, pose: Pose) -> "Member":
-        """The same thing at another pose."""
+    def at(self, pose: Pose) -> "CompositeMember":
+        """Put it at another pose."""
         return replace(self, body=replace(self.body, pose=pose))
 
 
 class Surroundings:
-    """What stands still while a thing looks for a free start.
-
-    Args:
-        fixed: The things.
-        clearance_m: To keep from them [m].
-        budget: Of the scene; each look is paid from it.
-    """
+    """Fixed bodies from which a falling one keeps a clearance [m]; each search is charged to the budget."""
 
     def __init__(self, fixed: Sequence[MovingSolid], clearance_m: float, budget: SimulationBudget) -> None:
         self._fixed, self._clearance_m, self._budget = fixed, clearance_m, budget
         self._pieces = sum(len(body.solids.starts) for body in fixed)
 
-    def freed(self, member: Member, direction: Vector3) -> tuple[Member, float]:
-        """The thing pushed clear of them in a direction (unit vector), and how far that is [m]."""
+    def freed(self, member: CompositeMember, direction: Vector3) -> tuple[CompositeMember, float]:
+        """Push an object clear in a direction (unit vector); returns it and the distance [m]."""
         self._budget.comparisons -= len(member.body.hulls) * self._pieces
-        way = Ray(direction).first_clear([member.solid], self._fixed, self._clearance_m)
-        return member.at(translated(member.pose, way * direction)), way
+        way = LinearSweep(direction).first_clear([member.solid], self._fixed, self._clearance_m)
+        return member.at(translate_pose(member.pose, way * direction)), way
 
     @property
     def affordable(self) -> bool:
-        """Whether the budget allows another look."""
+        """Whether the budget allows another search."""
         return self._budget.may_drop
 
 
-def seen_starts(member: Member, around: Surroundings, holder: HollowVessel) -> Iterator[Member]:
-    """Where a thing that was seen may start to fall: as it was seen, else pushed clear by as little as it takes.
+def find_seen_starts(member: CompositeMember, around: Surroundings, holder: HollowVessel) -> Iterator[CompositeMember]:
+    """Find starts for a seen object: its pose, else pushed clear as little as possible, long objects also more upright.
 
-    A long thing is also tried more upright. Only starts over or in the container are given, the nearest first; where
-    the budget runs out, those that were found until then.
+    Only starts over or in the container are given, the nearest first, and as many as the budget allows.
     """
-    found: list[tuple[float, int, Member]] = []
-    for turned, angle in _uprighted(member):
-        for direction in _directions():
+    found: list[tuple[float, int, CompositeMember]] = []
+    for turned, angle in _tilt_upright(member):
+        for direction in _list_push_directions():
             if not around.affordable:
                 break
             moved, way = around.freed(turned, direction)
@@ -126,33 +119,37 @@ def seen_starts(member: Member, around: Surroundings, holder: HollowVessel) -> I
             yield start
 
 
-def random_start(member: Member, around: Surroundings, holder: HollowVessel, rng: np.random.Generator) -> Member:
-    """A start over the container's room, at the lowest free height of the best of `DRAWS` draws.
+def draw_random_start(
+    member: CompositeMember, around: Surroundings, holder: HollowVessel, rng: np.random.Generator
+) -> CompositeMember:
+    """Draw a start over the container's room, at the lowest free height of the best of `DRAWS` draws.
 
-    Every other draw keeps the thing's orientation but for its heading; the rest have any orientation.
+    Every other draw keeps the object's orientation but for its heading; the rest have any orientation.
     """
-    draws = [_drawn(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
+    draws = [_draw_start(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
     raised = [around.freed(start, UP)[0] for start in draws]
-    return min(raised, key=_height)
+    return min(raised, key=_sum_heights)
 
 
-def _drawn(member: Member, holder: HollowVessel, anyhow: bool, rng: np.random.Generator) -> Member:
-    """The member over a random cell of the room, its lowest point on the floor."""
+def _draw_start(
+    member: CompositeMember, holder: HollowVessel, anyhow: bool, rng: np.random.Generator
+) -> CompositeMember:
+    """Put the member over a random cell of the room, its lowest point on the floor."""
     heights = holder.body.heights
     cells = np.argwhere(holder.room)
     at = (cells[int(rng.integers(len(cells)))] + heights.corner + rng.random(2)) * heights.cell
-    free = normalized_quaternion(rng.normal(size=4))
+    free = normalize_quaternion(rng.normal(size=4))
     heading = quaternion_about_z(float(rng.uniform(0.0, 2 * np.pi)))
     turn = free if anyhow else multiply_quaternions(heading, member.pose.quaternion_wxyz)
-    turned = member.at(Pose(np.zeros(3), normalized_quaternion(turn)))
+    turned = member.at(Pose(np.zeros(3), normalize_quaternion(turn)))
     corners = turned.corners
     low, high = corners.min(axis=0), corners.max(axis=0)
     middle = (low + high) / 2
     return turned.at(Pose(np.array([*(at - middle[:2]), holder.floor_z - low[2]]), turned.pose.quaternion_wxyz))
 
 
-def _uprighted(member: Member) -> Iterator[tuple[Member, float]]:
-    """The thing as it is, and where it is long, turned towards upright about its middle, with the angle [rad]."""
+def _tilt_upright(member: CompositeMember) -> Iterator[tuple[CompositeMember, float]]:
+    """Yield the object, and where it is long, tilts of it towards upright, with the angle [rad]."""
     yield member, 0.0
     corners = member.corners
     middle = corners.mean(axis=0)
@@ -165,23 +162,23 @@ def _uprighted(member: Member) -> Iterator[tuple[Member, float]]:
     if np.linalg.norm(across) < 1e-6:
         return
     for share in TILT_STEPS[1:]:
-        turn = _about(across / np.linalg.norm(across), share * tilt)
+        turn = _quaternion_about(across / np.linalg.norm(across), share * tilt)
         pose = member.pose
         position = rotation_matrix(turn) @ (pose.position - middle) + middle
-        turned = Pose(position, normalized_quaternion(multiply_quaternions(turn, pose.quaternion_wxyz)))
+        turned = Pose(position, normalize_quaternion(multiply_quaternions(turn, pose.quaternion_wxyz)))
         yield member.at(turned), share * tilt
 
 
-def _directions() -> list[np.ndarray]:
+def _list_push_directions() -> list[np.ndarray]:
     angles = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
     level = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
     return [UP, *level, *((flat + UP) / np.sqrt(2.0) for flat in level)]
 
 
-def _about(axis: np.ndarray, angle: float) -> Quaternion:
+def _quaternion_about(axis: np.ndarray, angle: float) -> Quaternion:
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
 
 
-def _height(member: Member) -> float:
+def _sum_heights(member: CompositeMember) -> float:
     heights = member.corners[:, 2]
     return float(heights.min() + heights.max())

@@ -1,71 +1,67 @@
-"""One composite in the making: a container that stands still, and what has been dropped into it so far."""
+"""Fill one container: drop contents into it one by one, then settle them together."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from schemas.config import Config
-from tableverse_factory.geometry.collision.contacts import seen_to_touch
-from tableverse_factory.geometry.math.transforms import compose, inverse
-from tableverse_factory.geometry.relations.containers import HollowVessel, holder_of
+from tableverse_factory.geometry.collision.contacts import meshes_touch
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
+from tableverse_factory.geometry.relations.containers import HollowVessel, make_hollow_vessel
 from tableverse_factory.physics.simulate.at_rest import Rest
-from tableverse_factory.physics.simulate.freefall import fall
-from tableverse_factory.stages.rectify.budget import OUT_OF_BUDGET, SimulationBudget
-from tableverse_factory.stages.rectify.drop_contents import Member, Surroundings, random_start, seen_starts
+from tableverse_factory.physics.simulate.freefall import simulate_fall
+from tableverse_factory.stages.rectify.budget import BUDGET_SPENT, SimulationBudget
+from tableverse_factory.stages.rectify.drop_contents import (
+    CompositeMember,
+    Surroundings,
+    draw_random_start,
+    find_seen_starts,
+)
 
 SEEN_TRIES, RANDOM_TRIES = 8, 3
-"""Falls from starts near where a thing was seen, and from random ones."""
+"""Falls from starts near the seen pose, and from random ones."""
 SLACK_M = 1e-4
-"""Gap that free fall keeps beyond the clearance: contacts give way by a fifth of this."""
+"""Gap that free fall keeps beyond the clearance; contacts yield by a fifth of this."""
 FREED_TRIES = 2
-"""How often all contents may be freed together: what rolled when the time was up starts from standstill again."""
+"""Tries of settling all contents together; each starts from standstill."""
 LEFT = "left its container when everything in it was freed together"
 RESTLESS = "did not come to rest when everything in its container was freed together"
 UNSTABLE = "the simulation broke down when everything in its container was freed together"
 
 
-class Filling:
-    """A container and its contents, in the order in which they went in.
+class ContainerFilling:
+    """An outermost container (`root`), which stands still, and its contents, in the order in which they went in."""
 
-    Args:
-        root: The outermost container; stands still.
-        config: Of the run.
-        rng: Of the stage; used for random starts alone.
-        budget: Of the scene.
-    """
-
-    def __init__(self, root: Member, config: Config, rng: np.random.Generator, budget: SimulationBudget) -> None:
-        self.members: dict[str, Member] = {root.item.object_id: root}
+    def __init__(
+        self, root: CompositeMember, config: Config, rng: np.random.Generator, budget: SimulationBudget
+    ) -> None:
+        self.members: dict[str, CompositeMember] = {root.item.object_id: root}
         self._root = root.item.object_id
         self._rectify, self._timestep_s = config.rectify, config.settle.timestep_s
         self._rng = rng
         self._budget = budget
 
     def holder(self, container_id: str) -> HollowVessel:
-        """The container where it is now."""
-        return holder_of(self.members[container_id].mesh)
+        """Make the container at its current pose."""
+        return make_hollow_vessel(self.members[container_id].mesh)
 
-    def put(self, member: Member, holder: HollowVessel) -> bool:
-        """Lets a thing fall into the container from near its pose; whether it came to lie inside."""
-        starts = seen_starts(member, self._surroundings(), holder)
+    def put(self, member: CompositeMember, holder: HollowVessel) -> bool:
+        """Drop an object into the container from near its pose; returns whether it came to lie inside."""
+        starts = find_seen_starts(member, self._surroundings(), holder)
         tries = zip(range(SEEN_TRIES), starts, strict=False)
         return any(self._fell_in(start, holder) for _, start in tries) or self.pour(member, holder)
 
-    def pour(self, member: Member, holder: HollowVessel) -> bool:
-        """Lets a thing fall into the container from a random start; whether it came to lie inside."""
+    def pour(self, member: CompositeMember, holder: HollowVessel) -> bool:
+        """Drop an object into the container from random starts; returns whether it came to lie inside."""
         around = self._surroundings()
         tries = (_ for _ in range(RANDOM_TRIES) if self._budget.may_drop)
-        starts = (random_start(member, around, holder, self._rng) for _ in tries)
+        starts = (draw_random_start(member, around, holder, self._rng) for _ in tries)
         return any(self._fell_in(start, holder, slippery=True) for start in starts)
 
     def relax(self) -> dict[str, str]:
-        """Frees all contents together until they rest in their containers.
-
-        Returns:
-            What had to be taken out for that, and why.
-        """
+        """Settle all contents together until they rest in their containers; returns those taken out, with reasons."""
         lost: dict[str, str] = {}
-        while (loose := self._loose()) and (lost or len(loose) > 1):  # a single thing has come to rest already
+        while (loose := self._loose()) and (lost or len(loose) > 1):  # a single one is at rest already
             out = self._freed(loose)
             if not out:
                 break
@@ -74,11 +70,11 @@ class Filling:
             lost |= out
         return lost
 
-    def _freed(self, loose: list[Member]) -> dict[str, str]:
-        """Frees contents together; what has to be taken out: nothing where all come to rest in their containers."""
+    def _freed(self, loose: list[CompositeMember]) -> dict[str, str]:
+        """Settle contents together; returns those that have to be taken out, with the reason."""
         for _ in range(FREED_TRIES):
             if not self._budget.may_free:
-                return {member.item.object_id: OUT_OF_BUDGET for member in loose}
+                return {member.item.object_id: BUDGET_SPENT for member in loose}
             rest = self._fallen([self.members[self._root]], loose)
             self._budget.freeing_s -= rest.time_s
             if rest.warnings:
@@ -95,22 +91,22 @@ class Filling:
         solids = [member.solid for member in self.members.values()]
         return Surroundings(solids, self._rectify.clearance_m, self._budget)
 
-    def _loose(self) -> list[Member]:
+    def _loose(self) -> list[CompositeMember]:
         return [member for name, member in self.members.items() if name != self._root]
 
     def _gone(self) -> list[str]:
-        """Contents that do not lie in their container."""
+        """List contents that do not lie in their container."""
         loose = self._loose()
         holders = {name: self.holder(name) for name in sorted({member.container_id for member in loose})}
         return [m.item.object_id for m in loose if not holders[m.container_id].holds(m.mesh)]
 
     def _remove(self, name: str) -> None:
-        """Takes a thing out, and all that it contains."""
+        """Take an object out, with all that it contains."""
         if self.members.pop(name, None) is not None:
             for inner in [m.item.object_id for m in self._loose() if m.container_id == name]:
                 self._remove(inner)
 
-    def _fell_in(self, start: Member, holder: HollowVessel, slippery: bool = False) -> bool:
+    def _fell_in(self, start: CompositeMember, holder: HollowVessel, slippery: bool = False) -> bool:
         if not self._budget.may_drop:
             return False
         inside = list(self.members.values())
@@ -124,19 +120,19 @@ class Filling:
         self.members[start.item.object_id] = ended
         return True
 
-    def _is_carried(self, member: Member, others: Sequence[Member]) -> bool:
-        """Whether one sees what it rests on: pieces that close a vessel would carry things over the void."""
+    def _is_carried(self, member: CompositeMember, others: Sequence[CompositeMember]) -> bool:
+        """Whether its mesh touches another: pieces that close a vessel would carry contents over the void."""
         solid, mesh = member.solid, member.mesh
         reach = self._gap_m([member, *others]) + SLACK_M
-        return any(seen_to_touch(solid, mesh, other.solid, other.mesh, reach) for other in others)
+        return any(meshes_touch(solid, mesh, other.solid, other.mesh, reach) for other in others)
 
-    def _gap_m(self, members: Sequence[Member]) -> float:
-        """The gap between pieces at which free fall leaves these things [m]."""
+    def _gap_m(self, members: Sequence[CompositeMember]) -> float:
+        """The gap between pieces that free fall keeps [m]."""
         uncovered = max(member.item.scale * member.pieces.uncovered_m for member in members)
         return self._rectify.clearance_m + 2 * uncovered + SLACK_M
 
-    def _fallen(self, fixed: list[Member], falling: list[Member], slippery: bool = False) -> Rest:
-        return fall(
+    def _fallen(self, fixed: list[CompositeMember], falling: list[CompositeMember], slippery: bool = False) -> Rest:
+        return simulate_fall(
             [member.body for member in fixed],
             [member.body for member in falling],
             gap_m=self._gap_m([*fixed, *falling]),
@@ -146,7 +142,7 @@ class Filling:
         )
 
 
-def carried_along(member: Member, container: Member) -> Member:
-    """A content where it was seen relative to its container, which may have moved since."""
-    motion = compose(container.pose, inverse(container.item.pose))
-    return member.at(compose(motion, member.item.pose))
+def follow_container(member: CompositeMember, container: CompositeMember) -> CompositeMember:
+    """Move a content along with its container, from where both were seen."""
+    motion = compose_poses(container.pose, invert_pose(container.item.pose))
+    return member.at(compose_poses(motion, member.item.pose))

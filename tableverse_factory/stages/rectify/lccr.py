@@ -1,4 +1,4 @@
-"""Layout-consistent collision rectification: the paper's three phases (section 3.2), ending free of everything."""
+"""Layout-consistent collision rectification: the paper's three phases (section 3.2), ending collision-free."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ import numpy as np
 
 from schemas.config import RectifyConfig
 from tableverse_factory.stages.rectify.fault_check import is_faultless
-from tableverse_factory.stages.rectify.groups import Group, entities, ground, group, lowest_of
-from tableverse_factory.stages.rectify.radial import radial_order, spread
+from tableverse_factory.stages.rectify.groups import Group, form_entities, form_groups, ground_groups, measure_lowest_m
+from tableverse_factory.stages.rectify.radial import order_radially, spread_groups
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
-from tableverse_factory.stages.rectify.vertical import disentangle, fill
+from tableverse_factory.stages.rectify.vertical import disentangle, lift_contents
 
-Spread = Callable[[Sequence[RigidPart], Sequence[Group], float], list[RigidPart]]
+SpreadFunction = Callable[[Sequence[RigidPart], Sequence[Group], float], list[RigidPart]]
 """Phase 2: parts, ordered groups and clearance [m] to moved parts."""
 
 HANGING_M = 1e-9
@@ -20,13 +20,13 @@ HANGING_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rectified:
-    """The outcome of a rectification.
+class RectificationResult:
+    """Result of a rectification.
 
     Attributes:
         parts: As given, moved; same order.
         groups: Indices into `parts`; the root first, then in the order of their distance from it.
-        method: What it took: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
+        method: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
     """
 
     parts: tuple[RigidPart, ...]
@@ -34,52 +34,55 @@ class Rectified:
     method: str = "lccr"
 
 
-def lccr(parts: Sequence[RigidPart], config: RectifyConfig, spread: Spread = spread) -> Rectified:
-    """Moves parts until none is nearer to another than the clearance.
+def rectify_lccr(
+    parts: Sequence[RigidPart], config: RectifyConfig, spread: SpreadFunction = spread_groups
+) -> RectificationResult:
+    """Move parts until none is nearer to another than the clearance.
 
-    The result depends on ids and geometry, not on the order of `parts`. A layout without a fault is left alone.
+    The result depends on ids and geometry, not on the order of `parts`. A faultless layout is left unchanged.
 
     Args:
         parts: The objects.
         config: Of the stage.
-        spread: How the groups are spread; the exact solution unless somebody compares.
+        spread: Phase 2; the exact solution by default.
     """
     order = sorted(range(len(parts)), key=lambda i: parts[i].object_id)
     given = [parts[i] for i in order]
-    composites = entities(given)
+    composites = form_entities(given)
     faultless = is_faultless(given, config.clearance_m)
-    filled = given if faultless else fill(given, composites, config.clearance_m)
-    groups = group(filled, composites, config.overlap_ratio, config.contact_m)
-    ordered = radial_order(filled, groups)
-    free = filled if faultless else _apart(filled, ordered, config.clearance_m, spread)
+    filled = given if faultless else lift_contents(given, composites, config.clearance_m)
+    groups = form_groups(filled, composites, config.overlap_ratio, config.contact_m)
+    ordered = order_radially(filled, groups)
+    free = filled if faultless else _separate_groups(filled, ordered, config.clearance_m, spread)
     back = {i: k for k, i in enumerate(order)}
-    return Rectified(
+    return RectificationResult(
         tuple(free[back[i]] for i in range(len(parts))),
         tuple(tuple(tuple(order[i] for i in entity) for entity in members) for members in ordered),
     )
 
 
-def _apart(parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float, spread: Spread) -> list[RigidPart]:
-    """Groups put on the table, spread, and freed within."""
-    return stacked_free(spread(ground(parts, ordered), ordered, clearance_m), ordered, clearance_m)
+def _separate_groups(
+    parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float, spread: SpreadFunction
+) -> list[RigidPart]:
+    return separate_stacks(spread(ground_groups(parts, ordered), ordered, clearance_m), ordered, clearance_m)
 
 
-def stacked_free(apart: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:
-    """Phase 3, and what the paper leaves open.
+def separate_stacks(apart: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:
+    """Run phase 3, and resolve two cases that the paper leaves open.
 
-    A part may rise into the overhang of another group, or leave its own group hanging where it was the lowest.
-    Two ways out, each of which ends free of everything: put the groups down and spread them once more with their final
-    shapes, or lift the part further, clear of all groups. The one that moves the parts less in sum is taken, as long
-    as every group stands on the table. Where none of this happens both are phase 3 as it stands.
+    A part may rise into the overhang of another group, or leave its own group hanging where it was the lowest. Either
+    the groups are put down and spread once more with their final shapes, or the part is lifted further, clear of all
+    groups. The one that moves the parts less in sum is taken, as long as every group stands on the table. Otherwise
+    both equal phase 3.
     """
-    outward = spread(ground(disentangle(apart, ordered, clearance_m), ordered), ordered, clearance_m)
+    outward = spread_groups(ground_groups(disentangle(apart, ordered, clearance_m), ordered), ordered, clearance_m)
     upward = disentangle(apart, ordered, clearance_m, against_all=True)
-    if max(lowest_of(upward, group) for group in ordered) > HANGING_M:
+    if max(measure_lowest_m(upward, group) for group in ordered) > HANGING_M:
         return outward
-    return min(outward, upward, key=lambda parts: _total_motion(parts, apart))
+    return min(outward, upward, key=lambda parts: _sum_motion(parts, apart))
 
 
-def _total_motion(parts: Sequence[RigidPart], before: Sequence[RigidPart]) -> float:
+def _sum_motion(parts: Sequence[RigidPart], before: Sequence[RigidPart]) -> float:
     return sum(
         float(np.linalg.norm(part.body.offset - old.body.offset)) for part, old in zip(parts, before, strict=True)
     )

@@ -1,4 +1,4 @@
-"""An object as rectification sees it: pieces that may not touch, a box and a footprint seen from above."""
+"""Objects as rigid parts for rectification: convex pieces, a box and a footprint seen from above."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,19 +10,19 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, Quaternion, Vector3
 from schemas.objects import PlacedObject
-from tableverse_factory.geometry.collision.ray_clearance import MovingSolid
-from tableverse_factory.geometry.collision.solids import Solids, concatenate, place_pieces
+from tableverse_factory.geometry.collision.linear_sweep import MovingSolid
+from tableverse_factory.geometry.collision.solids import Solids, concatenate_solids, place_pieces
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
-    compose,
+    compose_poses,
     multiply_quaternions,
     quaternion_from_rotation_vector,
     rotation_matrix,
     transform_points,
-    translated,
+    translate_pose,
 )
-from tableverse_factory.geometry.mesh.mass_integrals import volumes_and_centers
-from tableverse_factory.geometry.mesh.meshes import placed_mesh
+from tableverse_factory.geometry.mesh.mass_integrals import compute_volumes_and_centers
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 
 Vector2 = Float64[np.ndarray, "2"]
 Box2 = Float64[np.ndarray, "2 2"]
@@ -42,18 +42,17 @@ class RigidPart:
     """One object, where it is now.
 
     Attributes:
-        object_id: Its id: decides every tie, so that the order of a file means nothing.
+        object_id: Decides ties, so that the order of a file does not matter.
         container_id: The object that holds it, or None.
-        body: Its pieces and how far it has been moved.
+        body: Its pieces and their translation.
         box: Top-view box of the mesh where it was placed [m].
         lowest_m: Height of the lowest vertex of mesh and pieces where it was placed [m].
         footprint_m2: Area of the convex hull of its pieces seen from above, where it was placed [m²].
-        heading: Its own x axis seen from above (y where x is upright), unit length: turns with the layout.
+        heading: Its own x axis seen from above (y where x is upright), unit length.
         mass_center: Centre of mass of its pieces where it was placed [m].
         volume_m3: Of its pieces, overlaps counted twice [m³].
         vertices: Of its mesh where it was placed. Shape (n, 3) [m].
-        turned_by: How it has been turned about its centre of mass since it was placed: what stands above is as if it
-            had been placed like that.
+        turned_by: Rotation about its centre of mass since it was placed; all values above include it.
     """
 
     object_id: str
@@ -69,15 +68,15 @@ class RigidPart:
     turned_by: Quaternion
 
     def moved(self, by: Vector3) -> "RigidPart":
-        """The same part, translated by another `by` [m]."""
+        """Translate by another `by` [m]."""
         return replace(self, body=self.body.moved(by))
 
     def turned(self, rotation_vector: Vector3) -> "RigidPart":
-        """The same part, turned about its centre of mass by another rotation [rad]."""
+        """Rotate about the centre of mass by a rotation vector [rad]."""
         return self.turned_by_quaternion(quaternion_from_rotation_vector(rotation_vector))
 
     def turned_by_quaternion(self, turn: Quaternion) -> "RigidPart":
-        """The same part, turned about its centre of mass by another rotation."""
+        """Rotate about the centre of mass."""
         if turn[0] == 1.0:
             return self
         rotation = rotation_matrix(turn)
@@ -86,15 +85,15 @@ class RigidPart:
         return replace(
             self,
             body=replace(self.body, solids=solids),
-            heading=_unit(rotation[:2, :2] @ self.heading),
+            heading=_normalize(rotation[:2, :2] @ self.heading),
             vertices=vertices,
             turned_by=multiply_quaternions(turn, self.turned_by),
-            **_measures(vertices, solids),
+            **_measure_extent(vertices, solids),
         )
 
     def rounded(self, decimals: int) -> "RigidPart":
-        """As if placed where it is now, its coordinates rounded: what rounding errors made differ is equal again."""
-        solids = concatenate([self.body.solids], [self.body.offset]).rounded(decimals)
+        """Round coordinates at the current position, to remove rounding errors."""
+        solids = concatenate_solids([self.body.solids], [self.body.offset]).rounded(decimals)
         vertices = np.round(self.vertices + self.body.offset, decimals)
         return replace(
             self,
@@ -102,59 +101,57 @@ class RigidPart:
             vertices=vertices,
             heading=np.round(self.heading, decimals),
             mass_center=np.round(self.mass_center_now, decimals),
-            **_measures(vertices, solids),
+            **_measure_extent(vertices, solids),
         )
 
     def pose_now(self, pose: Pose) -> Pose:
-        """Where the object is now that was placed at this pose."""
+        """Current pose of the object that was placed at this pose."""
         if self.turned_by[0] == 1.0:
-            return translated(pose, self.body.offset)
+            return translate_pose(pose, self.body.offset)
         turn = Pose(np.zeros(3), self.turned_by)
-        about = compose(turn, Pose(pose.position - self.mass_center, pose.quaternion_wxyz))
-        return translated(about, self.mass_center + self.body.offset)
+        about = compose_poses(turn, Pose(pose.position - self.mass_center, pose.quaternion_wxyz))
+        return translate_pose(about, self.mass_center + self.body.offset)
 
     @property
     def box_now(self) -> Box2:
-        """Top-view box where the part is now [m]."""
-        moved: Box2 = self.box + self.body.offset[:2]
-        return moved
+        """Current top-view box [m]."""
+        return self.box + self.body.offset[:2]
 
     @property
     def lowest_now_m(self) -> float:
-        """Height of its lowest vertex where it is now [m]."""
+        """Current height of the lowest vertex [m]."""
         return self.lowest_m + float(self.body.offset[2])
 
     @property
     def mass_center_now(self) -> Vector3:
-        """Its centre of mass where it is now [m]."""
-        center: Vector3 = self.mass_center + self.body.offset
-        return center
+        """Current centre of mass [m]."""
+        return self.mass_center + self.body.offset
 
 
-def part_of(item: PlacedObject, pieces: ConvexPieces) -> RigidPart:
-    """The part of a placed object."""
+def make_rigid_part(item: PlacedObject, pieces: ConvexPieces) -> RigidPart:
+    """Make the part of a placed object."""
     solids = place_pieces(pieces, item.pose, item.scale)
-    vertices = placed_mesh(item.mesh, item.pose, item.scale).vertices
+    vertices = place_mesh(item.mesh, item.pose, item.scale).vertices
     volume, center = _volume_and_center(pieces)
     return RigidPart(
         object_id=item.object_id,
         container_id=item.contained_in,
         body=MovingSolid(solids, np.zeros(3), item.scale * pieces.uncovered_m),
-        heading=_heading(rotation_matrix(item.pose.quaternion_wxyz)),
+        heading=_compute_heading(rotation_matrix(item.pose.quaternion_wxyz)),
         mass_center=transform_points(item.pose, center[None], item.scale)[0],
         volume_m3=volume * item.scale**3,
-        footprint_m2=_hull_area(solids.points[:, :2]),
+        footprint_m2=_compute_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
-        **_measures(vertices, solids),
+        **_measure_extent(vertices, solids),
     )
 
 
-def merged(parts: Sequence[RigidPart]) -> RigidPart:
-    """Several parts as one rigid body, under the smallest of their ids; not yet moved."""
+def merge_rigid_parts(parts: Sequence[RigidPart]) -> RigidPart:
+    """Merge parts into one rigid body, under the smallest of their ids."""
     if len(parts) == 1:
         return parts[0]
-    solids = concatenate([part.body.solids for part in parts], [part.body.offset for part in parts])
+    solids = concatenate_solids([part.body.solids for part in parts], [part.body.offset for part in parts])
     vertices = np.concatenate([part.vertices + part.body.offset for part in parts])
     volumes = np.array([part.volume_m3 for part in parts])
     return replace(
@@ -164,70 +161,68 @@ def merged(parts: Sequence[RigidPart]) -> RigidPart:
         body=MovingSolid(solids, np.zeros(3), max(part.body.uncovered_m for part in parts)),
         mass_center=np.average([part.mass_center_now for part in parts], axis=0, weights=volumes),
         volume_m3=float(volumes.sum()),
-        footprint_m2=_hull_area(solids.points[:, :2]),
+        footprint_m2=_compute_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
-        **_measures(vertices, solids),
+        **_measure_extent(vertices, solids),
     )
 
 
-def carried_along(part: RigidPart, before: RigidPart, after: RigidPart) -> RigidPart:
-    """A part of a merged body that moved from `before` to `after`."""
+def follow_body(part: RigidPart, before: RigidPart, after: RigidPart) -> RigidPart:
+    """Move a part along with the merged body that moved from `before` to `after`."""
     rotation = rotation_matrix(after.turned_by)
     center = part.mass_center_now
     moved = rotation @ (center - before.mass_center_now) + after.mass_center_now
     return part.turned_by_quaternion(after.turned_by).moved(moved - center)
 
 
-def box_of(parts: Sequence[RigidPart]) -> Box2:
-    """The top-view box around several parts [m]."""
+def compute_box(parts: Sequence[RigidPart]) -> Box2:
+    """Compute the top-view box around parts [m]."""
     boxes = np.array([part.box_now for part in parts])
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
-def center_of(parts: Sequence[RigidPart]) -> Vector2:
-    """The centre of the top-view box around several parts [m]."""
-    center: Vector2 = box_of(parts).mean(axis=0)
-    return center
+def compute_center(parts: Sequence[RigidPart]) -> Vector2:
+    """Compute the centre of the top-view box around parts [m]."""
+    return compute_box(parts).mean(axis=0)
 
 
-def overlap_ratio(a: Box2, b: Box2) -> float:
-    """Area shared by two boxes over the area of the smaller one; 0 where that one has no area."""
+def compute_overlap_ratio(a: Box2, b: Box2) -> float:
+    """Compute the area shared by two boxes over that of the smaller one; 0 where that one has no area."""
     sides = np.minimum(a[1], b[1]) - np.maximum(a[0], b[0])
     smaller = min(float(np.prod(a[1] - a[0])), float(np.prod(b[1] - b[0])))
     return float(np.prod(sides)) / smaller if (sides > 0.0).all() and smaller > 0.0 else 0.0
 
 
-def breadth(parts: Sequence[RigidPart]) -> int:
-    """The largest footprint among the parts, in steps so fine that only rounding errors become ties."""
+def compute_breadth(parts: Sequence[RigidPart]) -> int:
+    """Compute the largest footprint of parts, rounded so that only rounding errors become ties."""
     return round(max(part.footprint_m2 for part in parts) / FOOTPRINT_STEP_M2)
 
 
 def _volume_and_center(pieces: ConvexPieces) -> tuple[float, Vector3]:
-    """Of pieces of one density, overlaps counted twice, in the mesh's own frame at scale 1; the volume is never 0."""
-    volumes, centers = volumes_and_centers(pieces.hulls, LEAST_VOLUME_M3)
+    """Compute volume (never 0) and centre of pieces, overlaps counted twice, in the mesh's own frame at scale 1."""
+    volumes, centers = compute_volumes_and_centers(pieces.hulls, LEAST_VOLUME_M3)
     center: Vector3 = np.average(centers, axis=0, weights=volumes)
     return float(volumes.sum()), center
 
 
-def _measures(vertices: Points, solids: Solids) -> _Measures:
+def _measure_extent(vertices: Points, solids: Solids) -> _Measures:
     low, high = aabb(vertices)
     return {"box": np.array([low[:2], high[:2]]), "lowest_m": float(min(low[2], solids.low[:, 2].min()))}
 
 
-def _hull_area(points: Points) -> float:
+def _compute_hull_area(points: Points) -> float:
     try:
         return float(ConvexHull(points).volume)  # of a plane hull, this is the area
     except QhullError:  # seen edge-on
         return 0.0
 
 
-def _heading(rotation: Float64[np.ndarray, "3 3"]) -> Vector2:
+def _compute_heading(rotation: Float64[np.ndarray, "3 3"]) -> Vector2:
     axes = rotation[:2, :2].T
     axis = axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1]
-    return _unit(axis)
+    return _normalize(axis)
 
 
-def _unit(axis: Vector2) -> Vector2:
-    unit: Vector2 = axis / np.linalg.norm(axis)
-    return unit
+def _normalize(axis: Vector2) -> Vector2:
+    return axis / np.linalg.norm(axis)

@@ -1,4 +1,4 @@
-"""Who carries, contains or is leant on by whom, read from a layout that is a little wrong everywhere."""
+"""Support relations (carrying, containing, leaning) inferred from a noisy layout."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,26 +9,26 @@ from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Points
-from tableverse_factory.geometry.collision.ray_clearance import Ray, are_within, nearest_point
+from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, are_within, find_nearest_point
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, Vector2
 
 TILT_NOISE_DEG = 3.0
 """An object is as good as upright if it would stand when tilted by up to this."""
 BASIN_DEG = 6.0
-"""Tilted by this much, an object that stands has its centre of mass higher than somewhere within the noise."""
+"""Tilted by this much, a standing object has its centre of mass higher than for some tilt within the noise."""
 BASIN_TOLERANCE_M = 2e-4
-"""Round things stand in any direction: their centre of mass need not rise, but must not sink by more than this."""
+"""Round objects stand in any direction: their centre of mass must not sink by more than this."""
 ON_TABLE_M = 0.008
 """An object whose lowest vertex is higher than this does not stand on the table."""
 
 VERTICAL_NOISE_M = 0.012
-"""Something that must rise or sink by no more than this to lie upon another may well lie upon it."""
+"""An object that must rise or sink by no more than this to lie upon another may lie upon it."""
 STEEP_NOISE_M = 0.025
-"""The same where a steep edge turns noise sideways into noise in height: if the other way round is twice as far."""
+"""The same at steep edges, which turn sideways noise into height, if the opposite order is twice as far."""
 NEEDY_REACH = 1.5
-"""What could not stand may have been taken this many times as far from what carries it as counts as contact."""
+"""Factor on the contact distance for an object that could not stand alone."""
 LEANING_REACH_M = 0.02
-"""Noise may have taken something this far from what it leans on."""
+"""Noise may have moved an object this far from the one it leans on."""
 
 Outline = Float64[np.ndarray, "n 3"]
 """Half planes (normal, offset) around a footprint."""
@@ -36,34 +36,34 @@ Outline = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True, slots=True)
 class SupportRelation:
-    """What was read.
+    """Support relations of a layout.
 
     Attributes:
-        pairs: (upper, lower): the lower one carries, contains or is leant on by the upper one.
-        standing: Of each part, whether the table alone carries it.
+        pairs: (upper, lower): the lower part carries or contains the upper one, or is leant on by it.
+        standing: Whether the table alone carries each part.
     """
 
     pairs: frozenset[tuple[int, int]]
     standing: tuple[bool, ...]
 
     def rise(self, i: int, j: int) -> float:
-        """1 where the other one carries the one, -1 where the one carries the other, 0 where neither."""
+        """1 where j carries i, -1 where i carries j, 0 where neither."""
         return 1.0 if (i, j) in self.pairs else -1.0 if (j, i) in self.pairs else 0.0
 
     def of(self, some: Sequence[int]) -> "SupportRelation":
-        """What was read of some of the parts, by their places among these."""
+        """Select the relations among some of the parts, renumbered."""
         place = {i: k for k, i in enumerate(some)}
         pairs = frozenset((place[i], place[j]) for i, j in self.pairs if i in place and j in place)
         return SupportRelation(pairs, tuple(self.standing[i] for i in some))
 
 
 def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelation:
-    """Support from heights, contact, footprints and where the centre of mass lies.
+    """Infer support from heights, contact, footprints and centres of mass.
 
-    Of two that are near one another, one carries the other if that one could not stand as it does, or if its centre of
-    mass is above the other's footprint. Which of them is above is a matter of how far it must rise or sink to lie upon
-    the other: that is of the order of the noise for the upper one, and of an object's height for the lower one. What
-    could not stand and has nothing under it so far leans on the nearest thing on the side to which it would fall.
+    Of two near parts, one carries the other if that one could not stand alone, or has its centre of mass above the
+    other's footprint. The upper one is the one that must rise or sink less to lie upon the other: by the order of the
+    noise, instead of an object's height. A part that could not stand alone and has no support so far leans on the
+    nearest part on the side to which it would fall.
     """
     reader = _Reader(parts)
     pairs: set[tuple[int, int]] = set()
@@ -82,23 +82,23 @@ def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelatio
 
 
 class _Reader:
-    """What is known of each part while pairs are looked at."""
+    """Properties of parts that decide about pairs."""
 
     def __init__(self, parts: Sequence[RigidPart]) -> None:
         self._parts = parts
-        self._falls = [_fall(part) for part in parts]
-        self._outlines = [_outline((part.body.solids.points + part.body.offset)[:, :2]) for part in parts]
-        self._up, self._down = Ray(np.array([0.0, 0.0, 1.0])), Ray(np.array([0.0, 0.0, -1.0]))
+        self._falls = [_find_fall_direction(part) for part in parts]
+        self._outlines = [_compute_half_planes((part.body.solids.points + part.body.offset)[:, :2]) for part in parts]
+        self._up, self._down = LinearSweep(np.array([0.0, 0.0, 1.0])), LinearSweep(np.array([0.0, 0.0, -1.0]))
 
     def needs_support(self, i: int) -> bool:
-        """Whether the table alone cannot carry the part as it stands, give or take the noise of its pose."""
+        """Whether the table alone cannot carry the part, within the noise of its pose."""
         return self._falls[i] is not None or self._hovers(i)
 
     def _hovers(self, i: int) -> bool:
         return self._parts[i].lowest_now_m > ON_TABLE_M
 
     def upper(self, i: int, j: int) -> int | None:
-        """Which of two parts near one another the other one carries, contains or props up; None if neither."""
+        """Decide which of two near parts is supported by the other; None if neither."""
         over = {i: self._is_over(i, j), j: self._is_over(j, i)}
         needy = {k: self.needs_support(k) for k in (i, j)}
         if not (over[i] or over[j] or needy[i] or needy[j]):
@@ -113,11 +113,11 @@ class _Reader:
         return min(steep, key=lambda k: (off[k], self._rank(k)), default=None)
 
     def leans_on(self, i: int, others: Sequence[int]) -> int | None:
-        """The nearest of the others on the side to which a part would fall, within reach; None if there is none."""
+        """Find the nearest of the others on the side to which a part would fall, within reach."""
         fall = self._falls[i]
         found = []
         for j in others:
-            gap, point = nearest_point(self._parts[i].body, self._parts[j].body, LEANING_REACH_M)
+            gap, point = find_nearest_point(self._parts[i].body, self._parts[j].body, LEANING_REACH_M)
             side = 0.0 if fall is None else float((point - self._parts[i].mass_center_now)[:2] @ fall)
             if gap <= LEANING_REACH_M and side >= 0.0:
                 found.append((gap, self._parts[j].object_id, j))
@@ -127,7 +127,7 @@ class _Reader:
         return -float(self._parts[k].mass_center_now[2]), self._parts[k].object_id
 
     def _off(self, i: int, j: int) -> float:
-        """How far a part must rise or sink to lie upon another one [m]."""
+        """Measure how far a part must rise or sink to lie upon another one [m]."""
         upper, lower = self._parts[i].body, self._parts[j].body
         rise = self._up.first_clear([upper], [lower], 0.0)
         return rise if rise > 0.0 else self._down.room([upper], [lower], 0.0, np.inf)
@@ -137,32 +137,33 @@ class _Reader:
         return bool((outline[:, :2] @ center[:2] + outline[:, 2] <= 0.0).all())
 
 
-def _fall(part: RigidPart) -> Vector2 | None:
-    """Which way the part would fall over if it stood on the table as it is, give or take the noise; None if not."""
+def _find_fall_direction(part: RigidPart) -> Vector2 | None:
+    """Find the direction in which the part would fall over on the table, beyond the noise; None if it stands."""
     around = part.body.solids.points - part.mass_center
     heights = (around @ _WITHIN_NOISE.T).max(axis=0)
     beyond = (around @ _BEYOND_NOISE.T).max(axis=0)
     lowest = int(np.argmin(beyond))
     if beyond[lowest] >= heights.min() - BASIN_TOLERANCE_M:
         return None
-    way: Vector2 = _BEYOND_NOISE[lowest, :2] / np.linalg.norm(_BEYOND_NOISE[lowest, :2])
-    return way
+    return _BEYOND_NOISE[lowest, :2] / np.linalg.norm(_BEYOND_NOISE[lowest, :2])
 
 
-def _outline(points: Float64[np.ndarray, "n 2"]) -> Outline:
+def _compute_half_planes(points: Float64[np.ndarray, "n 2"]) -> Outline:
     try:
         equations: Outline = ConvexHull(points).equations
-    except QhullError:  # seen edge-on: nothing is over it
+    except QhullError:  # seen edge-on: no point is over it
         equations = np.array([[0.0, 0.0, 1.0]])
     return equations
 
 
-def _downward(angle_deg: float, count: int) -> Points:
-    """Directions at an angle from straight down."""
+def _list_downward_directions(angle_deg: float, count: int) -> Points:
+    """List directions at an angle from straight down."""
     angle, azimuth = np.radians(angle_deg), (np.arange(count) + 0.5) * 2 * np.pi / count
     sideways = np.sin(angle) * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
     return np.column_stack([sideways, np.full(count, -np.cos(angle))])
 
 
-_WITHIN_NOISE = np.concatenate([_downward(0.0, 1), *(_downward(TILT_NOISE_DEG * k / 3, 12) for k in (1, 2, 3))])
-_BEYOND_NOISE = _downward(BASIN_DEG, 24)
+_WITHIN_NOISE = np.concatenate(
+    [_list_downward_directions(0.0, 1), *(_list_downward_directions(TILT_NOISE_DEG * k / 3, 12) for k in (1, 2, 3))]
+)
+_BEYOND_NOISE = _list_downward_directions(BASIN_DEG, 24)

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tableverse_factory.geometry.collision.ray_clearance import Ray
+from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
 from tableverse_factory.stages.rectify.groups import Entity, Group
-from tableverse_factory.stages.rectify.rigid_part import RigidPart, breadth
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_breadth
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def fill(parts: Sequence[RigidPart], composites: Sequence[Entity], clearance_m: float) -> list[RigidPart]:
-    """Lifts the contents of each composite, one after the other, out of their container and of one another."""
+def lift_contents(parts: Sequence[RigidPart], composites: Sequence[Entity], clearance_m: float) -> list[RigidPart]:
+    """Lift the contents of each composite, one after the other, out of their container and of one another."""
     lifted = list(parts)
     for entity in composites:
         _raise_in_turn(lifted, [(i,) for i in entity], [], clearance_m)
@@ -22,7 +22,7 @@ def fill(parts: Sequence[RigidPart], composites: Sequence[Entity], clearance_m: 
 def disentangle(
     parts: Sequence[RigidPart], groups: Sequence[Group], clearance_m: float, against_all: bool = False
 ) -> list[RigidPart]:
-    """Lifts entities of smaller footprint until they are disjoint from the broader ones of their group.
+    """Lift entities of smaller footprint until they are disjoint from the broader ones of their group.
 
     Args:
         parts: All parts.
@@ -34,16 +34,16 @@ def disentangle(
     for group in groups:
         own = {i for entity in group for i in entity}
         others = [i for i in range(len(parts)) if i not in own] if against_all else []
-        _raise_in_turn(lifted, by_footprint(parts, group), others, clearance_m)
+        _raise_in_turn(lifted, order_by_footprint(parts, group), others, clearance_m)
     return lifted
 
 
-def by_footprint(parts: Sequence[RigidPart], group: Group) -> list[Entity]:
-    """The entities of a group, the broadest first; ties go by object id."""
+def order_by_footprint(parts: Sequence[RigidPart], group: Group) -> list[Entity]:
+    """Order the entities of a group, the broadest first; ties go by object id."""
 
     def rank(entity: Entity) -> tuple[int, str]:
         own = [parts[i] for i in entity]
-        return -breadth(own), min(part.object_id for part in own)
+        return -compute_breadth(own), min(part.object_id for part in own)
 
     return sorted(group, key=rank)
 
@@ -51,7 +51,7 @@ def by_footprint(parts: Sequence[RigidPart], group: Group) -> list[Entity]:
 def _raise_in_turn(
     parts: list[RigidPart], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float
 ) -> None:
-    ray = Ray(UP)
+    ray = LinearSweep(UP)
     settled = list(order[0])
     for entity in order[1:]:
         fixed = [parts[i].body for i in (*settled, *obstacles)]

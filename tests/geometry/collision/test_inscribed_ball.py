@@ -8,9 +8,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tableverse_factory.geometry.collision.inscribed_ball import largest_ball
+from tableverse_factory.geometry.collision.inscribed_ball import find_largest_ball
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.geometry.mesh.repair import as_mesh, as_solid, closed_solid
+from tableverse_factory.geometry.mesh.repair import make_closed_solid, mesh_to_solid, solid_to_mesh
 from tests.helpers.bad_meshes import bowl
 
 RING = from_trimesh(trimesh.creation.torus(0.05, 0.015, 48, 24))
@@ -28,15 +28,15 @@ def tray() -> manifold3d.Manifold:
 @pytest.mark.parametrize(
     ("mesh", "diameter", "at_most"),
     [
-        (as_mesh(box().refine(6)), 0.06, 0.06),
-        (as_mesh(tray().refine(8)), 2e-3 * (8 - 21**0.5), 0.06),  # where three walls of 5, 5 and 6 mm meet
+        (solid_to_mesh(box().refine(6)), 0.06, 0.06),
+        (solid_to_mesh(tray().refine(8)), 2e-3 * (8 - 21**0.5), 0.06),  # where three walls of 5, 5 and 6 mm meet
         (SPHERE, 0.1, 0.1),
-        (as_mesh(closed_solid(bowl(bottomless=False))[0]), 0.0011, 0.07),
+        (solid_to_mesh(make_closed_solid(bowl(bottomless=False))[0]), 0.0011, 0.07),
     ],
     ids=["box", "tray", "ball", "bowl of one sheet"],
 )
 def test_the_ball_is_as_large_as_the_shape_is_thick(mesh, diameter, at_most):
-    assert largest_ball(mesh, 0.0, at_most) == pytest.approx(diameter, rel=0.1)
+    assert find_largest_ball(mesh, 0.0, at_most) == pytest.approx(diameter, rel=0.1)
 
 
 @settings(max_examples=40)
@@ -47,18 +47,18 @@ def test_a_film_around_something_thick_hides_nothing_and_is_not_thick(film, deep
     plate = manifold3d.Manifold.cube([0.2, 0.2, film])
     peg = manifold3d.Manifold.cube([wide, wide, deep + film]).translate([0.03, 0.05, -deep])
     turned = [solid.transform(_turn(turn)) for solid in (plate, plate + peg)]
-    alone, both = (largest_ball(as_mesh(solid), 0.0, deep + film) for solid in turned)
+    alone, both = (find_largest_ball(solid_to_mesh(solid), 0.0, deep + film) for solid in turned)
     assert alone <= film * 1.01 + 1e-7
     assert min(deep + film, 2 / 3 * wide) * 0.99 <= both <= deep + film
 
 
 @given(st.integers(0, 2**31), st.floats(0.02, 0.06))
 def test_no_ball_reaches_out_of_what_two_rings_share(turn, apart):
-    ring = as_solid(RING)
+    ring = mesh_to_solid(RING)
     shared = ring ^ ring.transform(_turn(turn)).translate([apart, 0.0, 0.0])
     for region in shared.decompose():
         # A ball inside has no more volume, and no more than the ring's own thickness.
-        found = largest_ball(as_mesh(region), 0.0, 0.2)
+        found = find_largest_ball(solid_to_mesh(region), 0.0, 0.2)
         assert np.pi / 6 * found**3 <= region.volume() * 1.01
         assert found <= 0.03 * 1.01
 
@@ -68,12 +68,12 @@ def test_a_finely_divided_shell_takes_no_time_to_speak_of():
     outer, inner = trimesh.creation.icosphere(5, 0.05), trimesh.creation.icosphere(5, 0.045)
     inner.invert()
     shell = from_trimesh(trimesh.util.concatenate([outer, inner]))
-    assert largest_ball(shell, 0.001, 0.1) == pytest.approx(0.005, rel=0.02)
-    assert largest_ball(from_trimesh(outer), 0.05, 0.1) == pytest.approx(0.1, rel=0.02)
+    assert find_largest_ball(shell, 0.001, 0.1) == pytest.approx(0.005, rel=0.02)
+    assert find_largest_ball(from_trimesh(outer), 0.05, 0.1) == pytest.approx(0.1, rel=0.02)
 
 
 def test_what_is_smaller_than_asked_for_is_not_looked_for():
-    assert largest_ball(SPHERE, 0.101, 0.2) == 0.0
+    assert find_largest_ball(SPHERE, 0.101, 0.2) == 0.0
 
 
 def _turn(seed: int) -> np.ndarray:

@@ -6,8 +6,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.geometry.collision.ray_clearance import MovingSolid, Ray, nearest_point
-from tableverse_factory.geometry.collision.separating_planes import Separator, Stance
+from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, MovingSolid, find_nearest_point
+from tableverse_factory.geometry.collision.separating_planes import PlaneFinder, PosedPieces
 from tableverse_factory.geometry.collision.solids import Solids
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
 
@@ -29,9 +29,9 @@ def cube(size: float, center: tuple[float, float, float]) -> Solids:
     return Solids([np.array(mesh.vertices) + center], [np.array(mesh.faces, dtype=np.int32)])
 
 
-def stance(solids: Solids, shift: np.ndarray, turn: np.ndarray | None = None) -> Stance:
+def stance(solids: Solids, shift: np.ndarray, turn: np.ndarray | None = None) -> PosedPieces:
     vector = np.zeros(3) if turn is None else turn
-    return Stance(solids, rotation_matrix(quaternion_from_rotation_vector(vector)), shift)
+    return PosedPieces(solids, rotation_matrix(quaternion_from_rotation_vector(vector)), shift)
 
 
 @settings(max_examples=40, deadline=None)
@@ -40,7 +40,7 @@ def test_a_translation_that_satisfies_every_plane_is_free(seed: int, rise: float
     rng = np.random.default_rng(seed)
     a, b = hulls(seed), hulls(seed + 1)
     shift = rng.normal(0.0, 0.03, 3)
-    planes = list(Separator().planes(stance(a, shift), stance(b, np.zeros(3)), MARGIN, 1.0, rise))
+    planes = list(PlaneFinder().planes(stance(a, shift), stance(b, np.zeros(3)), MARGIN, 1.0, rise))
     way = rng.normal(size=3)
     way /= np.linalg.norm(way)
     along = np.array([plane.direction @ way for plane in planes])
@@ -50,12 +50,12 @@ def test_a_translation_that_satisfies_every_plane_is_free(seed: int, rise: float
     needed = max([0.0, *(-spare[spare < 0.0] / along[spare < 0.0])])
     if (spare + needed * along < 0.0).any():
         return
-    gap, _ = nearest_point(MovingSolid(a, shift + needed * way), MovingSolid(b, np.zeros(3)), 1.0)
+    gap, _ = find_nearest_point(MovingSolid(a, shift + needed * way), MovingSolid(b, np.zeros(3)), 1.0)
     assert gap >= MARGIN - 1e-7
 
 
 def test_the_plane_between_two_cubes_is_known() -> None:
-    [plane] = Separator().planes(
+    [plane] = PlaneFinder().planes(
         stance(cube(0.1, (0, 0, 0)), np.array([0.12, 0.0, 0.0])),
         stance(cube(0.1, (0, 0, 0)), np.zeros(3)),
         0.005,
@@ -71,11 +71,11 @@ def test_what_stands_beside_goes_aside_and_what_belongs_above_goes_up() -> None:
     plate = trimesh.creation.box([0.2, 0.2, 0.01])
     solids = Solids([np.array(plate.vertices)], [np.array(plate.faces, dtype=np.int32)])
     upper, lower = stance(solids, np.array([0.19, 0.0, 0.004])), stance(solids, np.zeros(3))
-    [beside] = Separator().planes(upper, lower, MARGIN, REACH, 0.0)
+    [beside] = PlaneFinder().planes(upper, lower, MARGIN, REACH, 0.0)
     assert beside.direction == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
-    [above] = Separator().planes(upper, lower, MARGIN, REACH, 1.0)
+    [above] = PlaneFinder().planes(upper, lower, MARGIN, REACH, 1.0)
     assert above.direction == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
-    [below] = Separator().planes(upper, lower, MARGIN, REACH, -1.0)
+    [below] = PlaneFinder().planes(upper, lower, MARGIN, REACH, -1.0)
     assert below.direction == pytest.approx([0.0, 0.0, -1.0], abs=1e-6)
 
 
@@ -95,11 +95,11 @@ def test_room_ends_where_the_clearance_begins(seed: int) -> None:
         MovingSolid(hulls(seed), -0.3 * way + rng.normal(0.0, 0.01, 3)),
         MovingSolid(hulls(seed + 1), np.zeros(3)),
     )
-    room = Ray(way).room([moving], [fixed], MARGIN, 0.6)
+    room = LinearSweep(way).room([moving], [fixed], MARGIN, 0.6)
     for share in np.linspace(0.0, 1.0, 20):
-        assert nearest_point(moving.moved(share * room * way), fixed, 1.0)[0] >= MARGIN - 1e-6
+        assert find_nearest_point(moving.moved(share * room * way), fixed, 1.0)[0] >= MARGIN - 1e-6
     if room < 0.6:
-        assert nearest_point(moving.moved((room + 1e-5) * way), fixed, 1.0)[0] < MARGIN
+        assert find_nearest_point(moving.moved((room + 1e-5) * way), fixed, 1.0)[0] < MARGIN
 
 
 def test_there_is_no_room_inside_and_all_of_it_on_the_way_out() -> None:
@@ -108,5 +108,5 @@ def test_there_is_no_room_inside_and_all_of_it_on_the_way_out() -> None:
         MovingSolid(cube(0.1, (0, 0, 0)), np.array([0.0, 0.0, -0.1002])),
     )
     down, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
-    assert Ray(down).room([a], [b], MARGIN, 1.0) == 0.0
-    assert Ray(up).room([a], [b], MARGIN, 1.0) == 1.0
+    assert LinearSweep(down).room([a], [b], MARGIN, 1.0) == 0.0
+    assert LinearSweep(up).room([a], [b], MARGIN, 1.0) == 1.0

@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.geometry.math.min_rectangle import smallest_rectangle
+from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.planes import (
     Plane,
-    convex_outline,
-    depth_inside,
-    dominant_planes,
+    compute_convex_outline,
+    find_dominant_planes,
     fit_plane,
-    inside_outline,
-    refined_plane,
+    is_inside_outline,
+    measure_depth_inside,
+    refine_plane,
 )
 
 angles = st.floats(-3.0, 3.0)
@@ -67,7 +67,7 @@ def test_outliers_do_not_tilt_a_refined_plane():
     inliers, normal = points_on([0, 0, 1], 0.0, rng, 500)
     outliers = rng.uniform(0.05, 0.5, (200, 3))
     points = np.vstack([inliers, outliers])
-    found = refined_plane(Plane(np.array([0.0, 0.02, 1.0]), 0.0), points, np.full(700, 0.03))
+    found = refine_plane(Plane(np.array([0.0, 0.02, 1.0]), 0.0), points, np.full(700, 0.03))
     assert abs(float(found.normal @ normal)) > 1 - 1e-6
 
 
@@ -79,7 +79,7 @@ def test_planes_come_in_the_order_of_their_points_and_small_ones_are_hit():
     clutter = 5.0 + rng.uniform(-1, 1, (400, 3))
     points = np.vstack([large, middle, small, clutter])
     tolerance = np.full(len(points), 1e-6)
-    found = list(dominant_planes(points, tolerance, np.random.default_rng(0), max_planes=4, min_inliers=100))
+    found = list(find_dominant_planes(points, tolerance, np.random.default_rng(0), max_planes=4, min_inliers=100))
     assert [int(inliers.sum()) for _, inliers in found] == [3000, 800, 200]
     assert not (found[0][1] & found[1][1]).any(), "a point belongs to one plane"
 
@@ -88,7 +88,7 @@ def test_the_same_generator_gives_the_same_planes():
     points = np.random.default_rng(4).normal(size=(500, 3))
     tolerance = np.full(500, 0.1)
     first, second = (
-        [p.normal.tobytes() for p, _ in dominant_planes(points, tolerance, np.random.default_rng(9), 3, 10)]
+        [p.normal.tobytes() for p, _ in find_dominant_planes(points, tolerance, np.random.default_rng(9), 3, 10)]
         for _ in range(2)
     )
     assert first == second
@@ -100,7 +100,7 @@ def test_the_rectangle_of_a_rectangle_is_itself(yaw, half_x, half_y, x, y):
     axes = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     inner = np.random.default_rng(0).uniform(-1, 1, (50, 2))
     local = np.vstack([inner, [[-1, -1], [-1, 1], [1, -1], [1, 1]]]) * [half_x, half_y]
-    found = smallest_rectangle(local @ axes.T + [x, y])
+    found = fit_min_rectangle(local @ axes.T + [x, y])
     np.testing.assert_allclose(found.center, [x, y], atol=1e-9)
     assert np.prod(found.half_size) == pytest.approx(half_x * half_y, rel=1e-9)
     assert abs(np.sin(2 * (found.yaw - yaw))) < 1e-6, "the axes agree up to a quarter turn"
@@ -108,13 +108,13 @@ def test_the_rectangle_of_a_rectangle_is_itself(yaw, half_x, half_y, x, y):
 
 def test_points_on_a_line_still_have_an_outline_and_a_rectangle():
     points = np.stack([np.linspace(0, 1, 5), np.zeros(5)], axis=1)
-    assert inside_outline(convex_outline(points), points).all()
-    assert smallest_rectangle(convex_outline(points[:1])).half_size.max() < 0.01
+    assert is_inside_outline(compute_convex_outline(points), points).all()
+    assert fit_min_rectangle(compute_convex_outline(points[:1])).half_size.max() < 0.01
 
 
 def test_depth_inside_a_square():
     square = np.array([[0.0, 0], [2, 0], [2, 2], [0, 2]])
     grid = np.array([[[1.0, 1.0], [0.25, 1.0]], [[-0.5, 1.0], [1.0, 2.1]]])
-    np.testing.assert_allclose(depth_inside(square, grid), [[1.0, 0.25], [-0.5, -0.1]], atol=1e-12)
-    assert inside_outline(square, grid, 0.2).tolist() == [[True, True], [False, True]]
-    assert inside_outline(square, grid, -0.5).tolist() == [[True, False], [False, False]]
+    np.testing.assert_allclose(measure_depth_inside(square, grid), [[1.0, 0.25], [-0.5, -0.1]], atol=1e-12)
+    assert is_inside_outline(square, grid, 0.2).tolist() == [[True, True], [False, True]]
+    assert is_inside_outline(square, grid, -0.5).tolist() == [[True, False], [False, False]]

@@ -8,24 +8,24 @@ from hypothesis.extra.numpy import arrays
 
 from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import (
-    compose,
+    compose_poses,
     identity_pose,
-    inverse,
+    invert_pose,
     matrix_from_pose,
     multiply_quaternions,
-    normalized_quaternion,
+    normalize_quaternion,
     pose_from_matrix,
     quaternion_about_z,
     quaternion_from_matrix,
     rotation_angle,
     rotation_matrix,
     transform_points,
-    translated,
+    translate_pose,
 )
 
 units = st.floats(-1.0, 1.0, width=32)
 vectors = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0, width=32))
-quaternions = arrays(np.float64, 4, elements=units).filter(lambda q: np.linalg.norm(q) > 0.1).map(normalized_quaternion)
+quaternions = arrays(np.float64, 4, elements=units).filter(lambda q: np.linalg.norm(q) > 0.1).map(normalize_quaternion)
 poses = st.builds(Pose, vectors, quaternions)
 points = arrays(np.float64, (5, 3), elements=st.floats(-10.0, 10.0, width=32))
 
@@ -62,29 +62,29 @@ def test_products_of_quaternions_are_products_of_matrices(a, b):
 
 @given(quaternions)
 def test_a_quaternion_and_its_negative_are_written_alike(q):
-    np.testing.assert_array_equal(normalized_quaternion(-q), normalized_quaternion(q))
-    assert np.linalg.norm(normalized_quaternion(3.7 * q)) == pytest.approx(1.0)
+    np.testing.assert_array_equal(normalize_quaternion(-q), normalize_quaternion(q))
+    assert np.linalg.norm(normalize_quaternion(3.7 * q)) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("bad", [np.zeros(4), np.full(4, np.nan), np.array([np.inf, 0, 0, 0])])
 def test_a_quaternion_without_direction_is_refused(bad):
     with pytest.raises(ValueError, match="wxyz"):
-        normalized_quaternion(bad)
+        normalize_quaternion(bad)
 
 
 @given(poses, poses, poses)
 def test_motions_are_a_group(a, b, c):
-    assert_same_motion(compose(compose(a, b), c), compose(a, compose(b, c)))
-    assert_same_motion(compose(a, identity_pose()), a)
-    assert_same_motion(compose(identity_pose(), a), a)
-    assert_same_motion(compose(a, inverse(a)), identity_pose())
-    assert_same_motion(compose(inverse(a), a), identity_pose())
+    assert_same_motion(compose_poses(compose_poses(a, b), c), compose_poses(a, compose_poses(b, c)))
+    assert_same_motion(compose_poses(a, identity_pose()), a)
+    assert_same_motion(compose_poses(identity_pose(), a), a)
+    assert_same_motion(compose_poses(a, invert_pose(a)), identity_pose())
+    assert_same_motion(compose_poses(invert_pose(a), a), identity_pose())
 
 
 @given(poses, poses)
 def test_composition_is_the_product_of_matrices(a, b):
     np.testing.assert_allclose(
-        matrix_from_pose(compose(a, b)), matrix_from_pose(a) @ matrix_from_pose(b), rtol=0, atol=1e-9
+        matrix_from_pose(compose_poses(a, b)), matrix_from_pose(a) @ matrix_from_pose(b), rtol=0, atol=1e-9
     )
 
 
@@ -96,7 +96,7 @@ def test_matrix_and_pose_are_one_motion(pose):
 @given(poses, poses, points)
 def test_moving_points_twice_is_moving_them_by_the_composition(a, b, p):
     np.testing.assert_allclose(
-        transform_points(a, transform_points(b, p)), transform_points(compose(a, b), p), rtol=0, atol=1e-9
+        transform_points(a, transform_points(b, p)), transform_points(compose_poses(a, b), p), rtol=0, atol=1e-9
     )
 
 
@@ -108,7 +108,7 @@ def test_scale_comes_before_the_motion(pose, p, scale):
 
 @given(poses, vectors)
 def test_translation_is_seen_from_the_parent(pose, offset):
-    moved = translated(pose, offset)
+    moved = translate_pose(pose, offset)
     np.testing.assert_array_equal(moved.quaternion_wxyz, pose.quaternion_wxyz)
     np.testing.assert_allclose(moved.position - pose.position, offset, atol=1e-12)
 

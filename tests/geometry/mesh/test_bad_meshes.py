@@ -11,7 +11,7 @@ from schemas.config import RectifyConfig
 from schemas.geometry import TriangleMesh
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.convex.decompose import decompose
-from tableverse_factory.geometry.mesh.repair import as_mesh, closed_solid
+from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_mesh
 from tests.helpers.bad_meshes import BAD_MESHES, LARGE_MESHES, BadMesh
 
 CONFIG = RectifyConfig()
@@ -53,7 +53,7 @@ def test_two_million_faces_take_seconds(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["open_bowl", "bottomless_bowl"])
 def test_an_open_bowl_stays_open_and_its_hole_too(name: str) -> None:
-    solid = as_mesh(closed_solid(BAD_MESHES[name].make())[0])
+    solid = solid_to_mesh(make_closed_solid(BAD_MESHES[name].make())[0])
     on_axis = np.linalg.norm(solid.vertices[:, :2], axis=1) < 0.006
     assert on_axis.any() == (name == "open_bowl")
     assert solid.vertices[on_axis, 2].max(initial=0.0) < 0.01  # a foot, and no lid

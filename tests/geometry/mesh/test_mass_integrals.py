@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.mesh.mass_integrals import volume_integrals, volumes_and_centers
+from tableverse_factory.geometry.mesh.mass_integrals import compute_volumes_and_centers, integrate_volume
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tests.helpers.simple_scenes import ball, box
 
@@ -19,9 +19,9 @@ def shifted(mesh: TriangleMesh, *by: float) -> TriangleMesh:
 def test_each_is_as_by_itself() -> None:
     cone = from_trimesh(trimesh.creation.cone(0.03, 0.1))
     meshes = [shifted(box(0.1, 0.2, 0.3), 1.0, 2.0, 3.0), cone, FLAT, shifted(ball(0.03), -0.5, 0.0, 0.0)]
-    volumes, centers = volumes_and_centers(meshes, 1e-18)
+    volumes, centers = compute_volumes_and_centers(meshes, 1e-18)
     for k in (0, 1, 3):
-        volume, center, _ = volume_integrals(meshes[k])
+        volume, center, _ = integrate_volume(meshes[k])
         assert volumes[k] == pytest.approx(volume, rel=1e-9)
         np.testing.assert_allclose(centers[k], center, atol=1e-12)
     assert volumes[2] == 1e-18
@@ -33,14 +33,14 @@ def test_a_mesh_without_a_face_is_refused(place: int) -> None:
     meshes = [box(0.1, 0.1, 0.1)]
     meshes.insert(place, TriangleMesh(FLAT.vertices, np.zeros((0, 3), dtype=np.int32)))
     with pytest.raises(ValueError, match="without a corner or a face"):
-        volumes_and_centers(meshes, 1e-18)
+        compute_volumes_and_centers(meshes, 1e-18)
 
 
 def test_moments_of_a_turned_box_are_those_of_the_formula() -> None:
     size = np.array([0.1, 0.2, 0.3])
     turn = trimesh.transformations.euler_matrix(0.3, 0.7, 1.1)[:3, :3]
     given = box(*size)
-    volume, center, second = volume_integrals(TriangleMesh(given.vertices @ turn.T + 0.5, given.faces))
+    volume, center, second = integrate_volume(TriangleMesh(given.vertices @ turn.T + 0.5, given.faces))
     assert volume == pytest.approx(0.006)
     np.testing.assert_allclose(center, [0.5, 0.5, 0.5])
     np.testing.assert_allclose(second, turn @ np.diag(0.006 * size**2 / 12) @ turn.T, atol=1e-12)

@@ -9,10 +9,12 @@ import trimesh
 from schemas.config import RectifyConfig
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.geometry.convex.decompose import decompose
-from tableverse_factory.geometry.mesh.meshes import bounds, from_trimesh, read_mesh
-from tableverse_factory.physics.mjcf.spec import scene_body
-from tableverse_factory.physics.simulate.freefall import fall, holds_probe
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, read_mesh
+from tableverse_factory.physics.mjcf.spec import make_scene_body
+from tableverse_factory.physics.simulate.freefall import simulate_fall
 from tableverse_factory.sources.synthetic.catalogue import CATEGORIES
+from tests.helpers.cavity_probe import holds_probe
 
 UPRIGHT = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 VESSELS = ("bowl", "cup", "mug", "pan")
@@ -24,17 +26,17 @@ SCANNED = (
 
 def dropped_on(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], radius: float = 0.008) -> np.ndarray:
     """Where a ball ends that is dropped over the middle of a dish."""
-    dish = scene_body("dish", mesh, hulls, 1.0, 1.0, UPRIGHT)
-    low, high = bounds(mesh)
+    dish = make_scene_body("dish", mesh, hulls, 1.0, 1.0, UPRIGHT)
+    low, high = aabb(mesh.vertices)
     above = Pose(np.array([*((low + high) / 2)[:2], high[2] + 1.5 * radius]), UPRIGHT.quaternion_wxyz)
     ball = from_trimesh(trimesh.creation.icosphere(1, radius))
-    probe = scene_body("ball", ball, (ball,), 1.0, 0.005, above)
-    rest = fall([dish], [probe], gap_m=0.0, timestep_s=0.002, max_time_s=3.0)
+    probe = make_scene_body("ball", ball, (ball,), 1.0, 0.005, above)
+    rest = simulate_fall([dish], [probe], gap_m=0.0, timestep_s=0.002, max_time_s=3.0)
     return rest.poses[0].position
 
 
 def stays(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> bool:
-    low, high = bounds(mesh)
+    low, high = aabb(mesh.vertices)
     end = dropped_on(mesh, hulls)
     middle = np.abs(end[:2] - ((low + high) / 2)[:2]).max() < 0.35 * float(np.ptp([low[:2], high[:2]], axis=0).min())
     return bool(middle and end[2] < high[2] + 0.008)

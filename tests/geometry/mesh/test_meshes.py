@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 from tableverse_factory.geometry.mesh.meshes import (
     MAX_FACES,
-    bounds,
     box_center,
-    checked,
+    check_mesh,
     from_trimesh,
-    placed_mesh,
+    place_mesh,
     read_mesh,
     to_trimesh,
 )
@@ -32,32 +32,32 @@ FILES = {suffix: data.encode() if isinstance(data, str) else data for suffix, da
 @pytest.mark.parametrize("suffix", ["obj", "ply", "stl"])
 def test_a_box_comes_through_every_format(suffix):
     mesh = read_mesh(FILES[suffix], f"box.{suffix}")
-    low, high = bounds(mesh)
+    low, high = aabb(mesh.vertices)
     np.testing.assert_allclose(high - low, [0.1, 0.2, 0.3], atol=1e-6)
-    assert signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)
+    assert compute_signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)
     assert mesh.vertices.dtype == np.float64
     assert mesh.faces.dtype == np.int32
 
 
 def test_glb_is_turned_from_y_up():
     mesh = read_mesh(FILES["glb"], "box.glb")
-    low, high = bounds(mesh)
+    low, high = aabb(mesh.vertices)
     np.testing.assert_allclose(high - low, [0.1, 0.3, 0.2], atol=1e-6)
     tip = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 1.0, 0]], [[0, 1, 2]], process=False).export(file_type="glb")
-    assert bounds(read_mesh(tip, "tip.glb"))[1][2] == pytest.approx(1.0)  # what was up is up
-    assert signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)  # turned, not mirrored
+    assert aabb(read_mesh(tip, "tip.glb").vertices)[1][2] == pytest.approx(1.0)  # what was up is up
+    assert compute_signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)  # turned, not mirrored
 
 
 @given(st.floats(0.01, 2.0), st.floats(0.01, 2.0), st.floats(0.01, 2.0), st.floats(-3.0, 3.0), st.floats(0.1, 3.0))
 def test_volume_is_analytic_and_moves_with_the_mesh(a, b, c, angle, scale):
     box = from_trimesh(trimesh.creation.box((a, b, c)))
-    assert signed_volume(box) == pytest.approx(a * b * c)
+    assert compute_signed_volume(box) == pytest.approx(a * b * c)
     pose = Pose(np.array([1.0, -2.0, 0.5]), quaternion_about_z(angle))
-    moved = placed_mesh(box, pose, scale)
-    assert signed_volume(moved) == pytest.approx(a * b * c * scale**3)
+    moved = place_mesh(box, pose, scale)
+    assert compute_signed_volume(moved) == pytest.approx(a * b * c * scale**3)
     np.testing.assert_allclose(moved.vertices.mean(axis=0), pose.position, atol=1e-9)
     inside_out = TriangleMesh(box.vertices, box.faces[:, ::-1])
-    assert signed_volume(inside_out) == pytest.approx(-a * b * c)
+    assert compute_signed_volume(inside_out) == pytest.approx(-a * b * c)
 
 
 def test_the_box_centre_is_between_the_corners():
@@ -77,7 +77,7 @@ def test_colours_survive_the_bridge_to_trimesh():
 def test_the_bridge_shares_nothing():
     mesh = from_trimesh(BOX)
     to_trimesh(mesh).vertices[:] = 7.0
-    assert bounds(mesh)[1].max() < 1.0
+    assert aabb(mesh.vertices)[1].max() < 1.0
 
 
 def obj(*lines: str) -> bytes:
@@ -178,12 +178,12 @@ def test_too_many_triangles_are_refused():
     faces = np.zeros((MAX_FACES + 1, 3), dtype=np.int32)
     faces[:, 1], faces[:, 2] = 1, 2
     with pytest.raises(GeometryError, match=str(MAX_FACES)):
-        checked(TriangleMesh(np.eye(3), faces), "many")
+        check_mesh(TriangleMesh(np.eye(3), faces), "many")
 
 
 @pytest.mark.shared
 def test_scanned_meshes_are_whole(shared_dir):
     for path in sorted((shared_dir / "meshes").glob("*.obj"))[:8]:
         mesh = read_mesh(path.read_bytes(), path.name)
-        low, high = bounds(mesh)
+        low, high = aabb(mesh.vertices)
         assert 0.005 < (high - low).max() < 0.6, path.name  # metres: hand-sized things

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.mesh.mass_integrals import signed_volume, volume_integrals
+from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume, integrate_volume
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.geometry.mesh.shells import bounded_by_shells, is_one_shell
+from tableverse_factory.geometry.mesh.shells import is_one_shell, unite_shells
 from tests.helpers.bad_meshes import joined, shifted
 
 SIDES = st.tuples(*[st.floats(0.02, 0.1)] * 3)
@@ -41,27 +41,27 @@ def test_overlaps_count_once_and_a_shell_that_sticks_out_adds_whichever_way_it_i
     for sides, at, turn in boxes:
         union += manifold3d.Manifold.cube(list(sides), True).transform(_transform(at, turn)[:3])
     # The smallest of them, if any, is inside out; within the others it would be a hollow.
-    order = sorted(range(len(boxes)), key=lambda k: -signed_volume(shells[k]))
+    order = sorted(range(len(boxes)), key=lambda k: -compute_signed_volume(shells[k]))
     if flipped and len(shells) > 1:
         rest = manifold3d.Manifold()
         for k in order[:-1]:
             sides, at, turn = boxes[k]
             rest += manifold3d.Manifold.cube(list(sides), True).transform(_transform(at, turn)[:3])
-        assume(union.volume() - rest.volume() > 0.02 * signed_volume(shells[order[-1]]))
+        assume(union.volume() - rest.volume() > 0.02 * compute_signed_volume(shells[order[-1]]))
         shells[order[-1]] = inside_out(shells[order[-1]])
-    found = bounded_by_shells(joined(*shells))
-    assert signed_volume(found) == pytest.approx(float(union.volume()), rel=1e-9)
+    found = unite_shells(joined(*shells))
+    assert compute_signed_volume(found) == pytest.approx(float(union.volume()), rel=1e-9)
 
 
 def test_a_hollow_may_be_larger_than_each_of_the_shells_around_it():
     halves = [from_trimesh(trimesh.creation.box((0.06, 0.1, 0.1))) for _ in range(2)]
     walls = joined(shifted(halves[0], -0.02, 0.0, 0.0), shifted(halves[1], 0.02, 0.0, 0.0), inside_out(cube(0.09)))
-    assert signed_volume(bounded_by_shells(walls)) == pytest.approx(0.1**3 - 0.09**3, rel=1e-9)
+    assert compute_signed_volume(unite_shells(walls)) == pytest.approx(0.1**3 - 0.09**3, rel=1e-9)
 
 
 def test_a_hollow_stays_one_and_what_is_in_it_stays_there():
     nested = joined(cube(0.1), inside_out(cube(0.08)), shifted(cube(0.02), 0.01, 0.0, 0.0))
-    volume, center, _ = volume_integrals(bounded_by_shells(nested))
+    volume, center, _ = integrate_volume(unite_shells(nested))
     assert volume == pytest.approx(0.1**3 - 0.08**3 + 0.02**3, rel=1e-9)
     assert center == pytest.approx([0.01 * 0.02**3 / volume, 0.0, 0.0], abs=1e-12)
 
@@ -77,7 +77,7 @@ def test_a_hollow_stays_one_and_what_is_in_it_stays_there():
     ids=["one", "two apart", "a hollow", "one in a hollow"],
 )
 def test_a_mesh_with_nothing_amiss_is_left_alone(mesh):
-    assert bounded_by_shells(mesh) is mesh
+    assert unite_shells(mesh) is mesh
 
 
 def _transform(at: tuple[float, ...], turn: int) -> np.ndarray:

@@ -11,11 +11,16 @@ from tableverse_factory.geometry.math.transforms import (
     rotation_angle,
     transform_points,
 )
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.mesh.surface_samples import surface_samples
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 from tableverse_factory.geometry.registration.icp import PartialView
-from tableverse_factory.geometry.registration.register import STANDS_STD_M, median_distance, register, uncertainty_of
-from tableverse_factory.geometry.registration.symmetry import heading_folds
+from tableverse_factory.geometry.registration.register import (
+    STANDS_STD_M,
+    estimate_uncertainty,
+    measure_median_distance,
+    register,
+)
+from tableverse_factory.geometry.registration.symmetry import count_heading_folds
 
 EYE = np.array([0.3, -0.7, 0.6])
 AT_ORIGIN = Pose(np.zeros(3), quaternion_about_z(0.0))
@@ -46,7 +51,7 @@ def line(vertices: np.ndarray) -> np.ndarray:
 
 def view_of(mesh: TriangleMesh, noise_m: float = 0.001, every: int = 1) -> PartialView:
     """Samples of the faces towards the eye, and the rays that pass the mesh."""
-    points, triangle = surface_samples(mesh, 4000)
+    points, triangle = sample_surface(mesh, 4000)
     a, b, c = (mesh.vertices[mesh.faces[triangle, k]] for k in range(3))
     towards = (np.cross(b - a, c - a) * (EYE - points)).sum(axis=1) > 0.0
     away = -EYE / np.linalg.norm(EYE)
@@ -73,7 +78,7 @@ def view_of(mesh: TriangleMesh, noise_m: float = 0.001, every: int = 1) -> Parti
 
 
 def turned(mesh: TriangleMesh, degrees: float, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> TriangleMesh:
-    return placed_mesh(mesh, Pose(np.array(shift), quaternion_about_z(np.deg2rad(degrees))))
+    return place_mesh(mesh, Pose(np.array(shift), quaternion_about_z(np.deg2rad(degrees))))
 
 
 def placed(mesh: TriangleMesh, view: PartialView) -> np.ndarray:
@@ -174,7 +179,7 @@ def test_what_has_no_answer_is_refused(points, vertices, why: str) -> None:
 def test_the_residual_is_the_distance_to_the_surface() -> None:
     mesh = from_trimesh(trimesh.creation.box((0.2, 0.2, 0.2)))
     above = np.column_stack([np.random.default_rng(1).uniform(-0.09, 0.09, (200, 2)), np.full(200, 0.103)])
-    assert median_distance(above, mesh) == pytest.approx(0.003, abs=1e-6)
+    assert measure_median_distance(above, mesh) == pytest.approx(0.003, abs=1e-6)
 
 
 def test_a_round_mesh_has_no_heading_and_a_handle_gives_it_one() -> None:
@@ -183,10 +188,10 @@ def test_a_round_mesh_has_no_heading_and_a_handle_gives_it_one() -> None:
     round_one, mug = from_trimesh(cup), from_trimesh(trimesh.util.concatenate([cup, handle]))
     folds = []
     for mesh in (round_one, mug, from_trimesh(trimesh.creation.box((0.1, 0.1, 0.05)))):
-        points, _ = surface_samples(mesh, 3000)
-        folds.append(heading_folds(points, cKDTree(points)))
+        points, _ = sample_surface(mesh, 3000)
+        folds.append(count_heading_folds(points, cKDTree(points)))
     assert folds == [0, 1, 4]
-    sure = uncertainty_of(round_one, AT_ORIGIN, view_of(round_one))
+    sure = estimate_uncertainty(round_one, AT_ORIGIN, view_of(round_one))
     assert sure.heading_std_rad is None
     assert 0.0 < sure.position_std_m < 0.02
 
@@ -195,5 +200,6 @@ def test_what_less_is_seen_of_is_less_sure() -> None:
     mesh, whole = boot(), view_of(boot())
     corner = PartialView(whole.points[whole.points[:, 0] > 0.08], EYE, 0.0, STANDS_STD_M, whole.emptiness)
     assert (
-        uncertainty_of(mesh, AT_ORIGIN, corner).position_std_m > uncertainty_of(mesh, AT_ORIGIN, whole).position_std_m
+        estimate_uncertainty(mesh, AT_ORIGIN, corner).position_std_m
+        > estimate_uncertainty(mesh, AT_ORIGIN, whole).position_std_m
     )

@@ -9,18 +9,19 @@ from hypothesis import strategies as st
 from schemas.curation import Relation
 from schemas.geometry import TriangleMesh
 from schemas.objects import Table
-from tableverse_factory.geometry.mesh.height_maps import CELL_M, column_caster, height_map, turned_quarter
+from tableverse_factory.geometry.mesh.height_maps import CELL_M, compute_height_map, rotate_quarter_turn
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.geometry.relations.antipodal import antipodal_grips
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
+from tableverse_factory.geometry.relations.antipodal import find_antipodal_grips
 from tableverse_factory.geometry.relations.relations import (
     BodyFeatures,
-    body_of,
-    holds,
-    nearly_holds,
-    outline_gap,
-    turned_body,
+    compute_body_features,
+    measure_outline_gap,
+    relation_holds,
+    relation_nearly_holds,
+    rotate_body_quarter_turn,
 )
-from tableverse_factory.geometry.relations.stable_placement import find_placement, tabletop
+from tableverse_factory.geometry.relations.stable_placement import find_placement, make_support_surface
 
 TABLE = Table(np.zeros(2), np.array([0.6, 0.6]), 0.0, (0, 0, 0), 0.0)
 CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
@@ -41,7 +42,7 @@ def mesh_of(solid: trimesh.Trimesh, x: float, y: float, z: float = 0.0) -> Trian
 
 
 def box(size, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
-    return body_of(mesh_of(trimesh.creation.box(size), x, y, z))
+    return compute_body_features(mesh_of(trimesh.creation.box(size), x, y, z))
 
 
 def bowl_solid(radius=0.08, height=0.06, wall=0.004) -> trimesh.Trimesh:
@@ -50,11 +51,11 @@ def bowl_solid(radius=0.08, height=0.06, wall=0.004) -> trimesh.Trimesh:
 
 
 def bowl(x=0.0, y=0.0, **shape) -> BodyFeatures:
-    return body_of(mesh_of(bowl_solid(**shape), x, y))
+    return compute_body_features(mesh_of(bowl_solid(**shape), x, y))
 
 
 def ball(radius, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
-    return body_of(mesh_of(trimesh.creation.icosphere(3, radius), x, y, z))
+    return compute_body_features(mesh_of(trimesh.creation.icosphere(3, radius), x, y, z))
 
 
 @settings(max_examples=40, deadline=None)
@@ -62,12 +63,12 @@ def ball(radius, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
 def test_converse_relations(size_a, at_a, size_b, at_b):
     a, b = box(size_a, *at_a), box(size_b, *at_b)
     for relation, converse in CONVERSES:
-        assert holds(relation, a, b) == holds(converse, b, a)
-    assert not (holds(Relation.LEFT, a, b) and holds(Relation.RIGHT, a, b))
-    assert not (holds(Relation.BEHIND, a, b) and holds(Relation.IN_FRONT, a, b))
-    assert not (holds(Relation.ON, a, b) and holds(Relation.ON, b, a))
+        assert relation_holds(relation, a, b) == relation_holds(converse, b, a)
+    assert not (relation_holds(Relation.LEFT, a, b) and relation_holds(Relation.RIGHT, a, b))
+    assert not (relation_holds(Relation.BEHIND, a, b) and relation_holds(Relation.IN_FRONT, a, b))
+    assert not (relation_holds(Relation.ON, a, b) and relation_holds(Relation.ON, b, a))
     for relation in Relation:
-        assert not holds(relation, a, b) or nearly_holds(relation, a, b)
+        assert not relation_holds(relation, a, b) or relation_nearly_holds(relation, a, b)
 
 
 @settings(max_examples=30, deadline=None)
@@ -75,9 +76,9 @@ def test_converse_relations(size_a, at_a, size_b, at_b):
 def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
     a, b = box(size_a, *at_a), box(size_b, *at_b)
     mirrored_a, mirrored_b = box(size_a, -at_a[0], at_a[1]), box(size_b, -at_b[0], at_b[1])
-    assert holds(Relation.LEFT, a, b) == holds(Relation.RIGHT, mirrored_a, mirrored_b)
+    assert relation_holds(Relation.LEFT, a, b) == relation_holds(Relation.RIGHT, mirrored_a, mirrored_b)
     for relation in (Relation.BEHIND, Relation.IN_FRONT, Relation.NEXT_TO):
-        assert holds(relation, a, b) == holds(relation, mirrored_a, mirrored_b)
+        assert relation_holds(relation, a, b) == relation_holds(relation, mirrored_a, mirrored_b)
 
 
 @settings(max_examples=30, deadline=None)
@@ -85,7 +86,7 @@ def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
 def test_the_gap_of_axis_aligned_boxes_is_the_gap_of_their_boxes(size_a, at_a, size_b, at_b):
     a, b = box(size_a, *at_a), box(size_b, *at_b)
     apart = np.maximum(np.maximum(a.low - b.high, b.low - a.high)[:2], 0.0)
-    assert outline_gap(a, b) == pytest.approx(float(np.hypot(*apart)), abs=1e-9)
+    assert measure_outline_gap(a, b) == pytest.approx(float(np.hypot(*apart)), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -98,59 +99,61 @@ def test_the_gap_of_axis_aligned_boxes_is_the_gap_of_their_boxes(size_a, at_a, s
     ],
 )
 def test_the_viewer_stands_on_the_camera_side(relation, at):
-    held = {r for r in Relation if holds(r, box((0.05, 0.05, 0.05), *at), box((0.05, 0.05, 0.05)))}
+    held = {r for r in Relation if relation_holds(r, box((0.05, 0.05, 0.05), *at), box((0.05, 0.05, 0.05)))}
     assert held == {relation, Relation.OUTSIDE}
 
 
 @pytest.mark.parametrize(("gap", "beside"), [(0.01, True), (0.059, True), (0.061, False)])
 def test_next_to_ends_at_six_centimetres(gap, beside):
-    assert holds(Relation.NEXT_TO, box((0.05, 0.05, 0.1)), box((0.05, 0.05, 0.05), 0.05 + gap)) is beside
+    assert relation_holds(Relation.NEXT_TO, box((0.05, 0.05, 0.1)), box((0.05, 0.05, 0.05), 0.05 + gap)) is beside
 
 
 def test_on_needs_contact_from_above_and_the_middle_over_it():
     table = box((0.2, 0.2, 0.05))
-    assert holds(Relation.ON, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.05), table)
-    assert holds(Relation.ON, box((0.05, 0.05, 0.05), 0.09, 0.0, 0.05), table)
-    assert not holds(Relation.ON, box((0.05, 0.05, 0.05), 0.12, 0.0, 0.05), table)
-    assert not holds(Relation.ON, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.07), table)
-    assert not holds(Relation.ON, box((0.05, 0.05, 0.05), 0.2, 0.0), table)
-    assert not holds(Relation.ON, table, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.05))
+    assert relation_holds(Relation.ON, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.05), table)
+    assert relation_holds(Relation.ON, box((0.05, 0.05, 0.05), 0.09, 0.0, 0.05), table)
+    assert not relation_holds(Relation.ON, box((0.05, 0.05, 0.05), 0.12, 0.0, 0.05), table)
+    assert not relation_holds(Relation.ON, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.07), table)
+    assert not relation_holds(Relation.ON, box((0.05, 0.05, 0.05), 0.2, 0.0), table)
+    assert not relation_holds(Relation.ON, table, box((0.05, 0.05, 0.05), 0.0, 0.0, 0.05))
 
 
 def test_inside_is_in_the_cavity_not_in_the_box():
     vessel = bowl()
     inside, above, beside = ball(0.03, 0, 0, 0.004), ball(0.03, 0, 0, 0.08), ball(0.03, 0.14)
     for relation in CONTAINING:
-        assert holds(relation, inside, vessel)
-        assert not holds(relation, above, vessel)
-        assert not holds(relation, beside, vessel)
-        assert not holds(relation, inside, box((0.16, 0.16, 0.06)))  # a solid has no inside
-    assert not holds(Relation.OUTSIDE, inside, vessel)
-    assert holds(Relation.OUTSIDE, beside, vessel)
-    assert not holds(Relation.ON, inside, vessel)
-    assert holds(Relation.ON, inside, body_of(mesh_of(trimesh.creation.cylinder(0.1, 0.004), 0, 0)))
+        assert relation_holds(relation, inside, vessel)
+        assert not relation_holds(relation, above, vessel)
+        assert not relation_holds(relation, beside, vessel)
+        assert not relation_holds(relation, inside, box((0.16, 0.16, 0.06)))  # a solid has no inside
+    assert not relation_holds(Relation.OUTSIDE, inside, vessel)
+    assert relation_holds(Relation.OUTSIDE, beside, vessel)
+    assert not relation_holds(Relation.ON, inside, vessel)
+    assert relation_holds(
+        Relation.ON, inside, compute_body_features(mesh_of(trimesh.creation.cylinder(0.1, 0.004), 0, 0))
+    )
 
 
 def test_what_a_tilted_vessel_stands_on_is_not_inside_it():
     """Seen from above it is within the opening and below the rim, but under the floor."""
     tilted = bowl_solid()
     tilted.apply_transform(trimesh.transformations.rotation_matrix(np.radians(20), (0, 1, 0)))
-    vessel = body_of(mesh_of(tilted, 0, 0))
+    vessel = compute_body_features(mesh_of(tilted, 0, 0))
     pen = trimesh.creation.box((0.012, 0.08, 0.012))
     assert vessel.cavity is not None
-    under, within = body_of(mesh_of(pen, -0.02, 0)), body_of(mesh_of(pen, -0.02, 0, 0.04))
+    under, within = compute_body_features(mesh_of(pen, -0.02, 0)), compute_body_features(mesh_of(pen, -0.02, 0, 0.04))
     assert under.high[2] < vessel.cavity.rim_z
     for relation in CONTAINING:
-        assert not holds(relation, under, vessel)
-        assert holds(relation, within, vessel)
-    assert holds(Relation.OUTSIDE, under, vessel)
+        assert not relation_holds(relation, under, vessel)
+        assert relation_holds(relation, within, vessel)
+    assert relation_holds(Relation.OUTSIDE, under, vessel)
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(0.004, 0.1))
 def test_inside_implies_within_the_box_of_the_vessel(x, y, z):
     vessel, thing = bowl(), ball(0.02, x, y, z)
-    if holds(Relation.INSIDE, thing, vessel):
+    if relation_holds(Relation.INSIDE, thing, vessel):
         middle = (thing.low + thing.high)[:2] / 2
         assert (middle >= vessel.low[:2]).all()
         assert (middle <= vessel.high[:2]).all()
@@ -201,7 +204,7 @@ def test_a_vessel_is_found_however_thin_its_wall_and_wherever_it_stands(
     ]  # fmt: skip
     solid = trimesh.creation.revolve(profile, sections=sections)
     solid.apply_transform(trimesh.transformations.rotation_matrix(yaw, [0, 0, 1]))
-    cavity = body_of(mesh_of(solid, *at)).cavity
+    cavity = compute_body_features(mesh_of(solid, *at)).cavity
     assert cavity is not None
     assert cavity.rim_z == pytest.approx(height, abs=1e-6)
     assert cavity.floor_z == pytest.approx(0.004, abs=2.5e-3)
@@ -212,7 +215,7 @@ def test_no_edge_rises_above_its_cells_or_hangs_below_them(seed):
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-0.05, 0.05, (6, 3))
     mesh = TriangleMesh(corners, np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32))
-    heights = height_map(mesh, column_caster(mesh))
+    heights = compute_height_map(mesh, make_raycasting_scene(mesh))
     for a, b in ((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3)):
         points = corners[a] + rng.uniform(0.0, 1.0, (50, 1)) * (corners[b] - corners[a])
         i, j = (np.floor(points[:, :2] / CELL_M).astype(int) - heights.corner).T
@@ -226,12 +229,12 @@ def test_no_vessel_upside_down_lying_or_with_a_hole_in_its_floor():
     lying.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     ring = trimesh.creation.annulus(0.05, 0.06, 0.05)
     for solid in (upside_down, lying, ring):
-        assert body_of(mesh_of(solid, 0, 0)).cavity is None
+        assert compute_body_features(mesh_of(solid, 0, 0)).cavity is None
 
 
 def test_height_map_of_a_box_is_its_top_and_bottom():
     mesh = mesh_of(trimesh.creation.box((0.06, 0.03, 0.05)), 0.1, -0.2, 0.02)
-    heights = height_map(mesh, column_caster(mesh))
+    heights = compute_height_map(mesh, make_raycasting_scene(mesh))
     assert heights.filled.all()
     np.testing.assert_allclose(heights.top, 0.07, atol=1e-6)
     np.testing.assert_allclose(heights.bottom, 0.02, atol=1e-6)
@@ -242,11 +245,11 @@ def test_four_quarter_turns_are_none():
     body = box((0.06, 0.03, 0.05), 0.101, -0.2)
     turned = body
     for _ in range(4):
-        turned = turned_body(turned)
+        turned = rotate_body_quarter_turn(turned)
     np.testing.assert_allclose(turned.low, body.low)
     assert turned.heights.corner == body.heights.corner
     np.testing.assert_array_equal(turned.heights.top, body.heights.top)
-    once = turned_quarter(body.heights)
+    once = rotate_quarter_turn(body.heights)
     assert once.top.shape == body.heights.top.shape[::-1]
 
 
@@ -256,10 +259,10 @@ def test_a_place_that_is_found_holds_is_free_and_is_on_the_table(relation):
     slab = box((0.12, 0.12, 0.05), -0.2, 0.1)
     wall = box((0.02, 0.3, 0.2), 0.11, 0.0)
     reference = slab if relation is Relation.ON else vessel
-    scene = tabletop((thing, vessel, slab, wall), TABLE)
+    scene = make_support_surface((thing, vessel, slab, wall), TABLE)
     found = find_placement(relation, thing, reference, scene, scene.without(0))
     assert found is not None
-    assert holds(relation, found.body, reference)
+    assert relation_holds(relation, found.body, reference)
     assert (np.abs(found.body.low[:2]) <= 0.6).all()
     for other in (vessel, slab, wall):
         overlap = np.minimum(found.body.high, other.high) - np.maximum(found.body.low, other.low)
@@ -271,7 +274,7 @@ def test_a_place_that_is_found_holds_is_free_and_is_on_the_table(relation):
 def test_no_place_where_there_is_no_room():
     block, reference = box((0.1, 0.1, 0.1), 0.4, 0.4), box((0.1, 0.1, 0.1), -0.2, 0.0)
     small = Table(np.array([0.1, 0.2]), np.array([0.36, 0.3]), 0.0, (0, 0, 0), 0.0)
-    scene = tabletop((block, reference), small)
+    scene = make_support_surface((block, reference), small)
     assert find_placement(Relation.LEFT, block, reference, scene, scene.without(0)) is None
     assert find_placement(Relation.RIGHT, block, reference, scene, scene.without(0)) is not None
 
@@ -288,8 +291,11 @@ def test_no_place_where_there_is_no_room():
     ],
 )
 def test_only_flat_tops_carry(support, carries):
-    can, below = body_of(mesh_of(trimesh.creation.cylinder(0.03, 0.1), 0.3, 0.3)), body_of(mesh_of(support, 0, 0))
-    scene = tabletop((can, below), TABLE)
+    can, below = (
+        compute_body_features(mesh_of(trimesh.creation.cylinder(0.03, 0.1), 0.3, 0.3)),
+        compute_body_features(mesh_of(support, 0, 0)),
+    )
+    scene = make_support_surface((can, below), TABLE)
     assert (find_placement(Relation.ON, can, below, scene, scene.without(0)) is not None) == carries
 
 
@@ -306,7 +312,7 @@ def test_only_flat_tops_carry(support, carries):
 )
 def test_a_gripper_holds_what_fits_between_its_fingers(solid, graspable):
     mesh = mesh_of(solid, 0.1, 0.1)
-    grips = antipodal_grips(mesh, column_caster(mesh), 0.078)
+    grips = find_antipodal_grips(mesh, make_raycasting_scene(mesh), 0.078)
     assert (grips.share > 0.01) == graspable
     width = np.linalg.norm(grips.second - grips.first, axis=1)
     assert (width <= 0.078).all()

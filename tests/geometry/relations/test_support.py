@@ -6,8 +6,8 @@ import trimesh
 
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from tableverse_factory.geometry.collision.solids import place_pieces
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
-from tableverse_factory.geometry.relations.support import Pairs, carried_by_meshes, carried_by_pieces
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.relations.support import Pairs, find_mesh_support, find_piece_support
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 Standing = tuple[TriangleMesh, Pose]
@@ -24,8 +24,8 @@ def box(size, x: float, y: float, z: float, quaternion=UPRIGHT) -> Standing:
 
 def carried(*things: Standing) -> Pairs:
     """What meshes and pieces agree upon; each thing is convex."""
-    on_meshes = carried_by_meshes([placed_mesh(*thing) for thing in things])
-    on_pieces = carried_by_pieces(
+    on_meshes = find_mesh_support([place_mesh(*thing) for thing in things])
+    on_pieces = find_piece_support(
         [place_pieces(ConvexPieces((mesh,), 1.0, 0.0, ""), pose, 1.0) for mesh, pose in things]
     )
     assert on_meshes == on_pieces
@@ -70,5 +70,5 @@ def test_leaning_counts_as_carried_only_where_it_rests_more_than_it_leans(
 def test_nested_bowls_carry_one_another_on_their_meshes() -> None:
     line = [(0, 0), (0.04, 0), (0.08, 0.06), (0.076, 0.06), (0.038, 0.004), (0, 0.004)]
     bowl = from_trimesh(trimesh.creation.revolve(np.array(line), sections=64))
-    upper = placed_mesh(bowl, Pose(np.array([0.0, 0.0, 0.0045]), np.array(UPRIGHT)))
-    assert carried_by_meshes([bowl, upper]) == {(1, 0)}
+    upper = place_mesh(bowl, Pose(np.array([0.0, 0.0, 0.0045]), np.array(UPRIGHT)))
+    assert find_mesh_support([bowl, upper]) == {(1, 0)}

@@ -13,7 +13,7 @@ from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.load import load_model
-from tableverse_factory.physics.mjcf.scene_objects import load_scene_objects, slab_of
+from tableverse_factory.physics.mjcf.scene_objects import load_scene_objects, read_slab
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, ball, box, curated, layout
 
@@ -52,7 +52,7 @@ def test_things_stand_where_the_simulator_has_them(scene):
 
 def test_the_slab_is_the_table_of_the_file(scene):
     files = dict(scene.files)
-    slab, model = slab_of(files), load_model(files)
+    slab, model = read_slab(files), load_model(files)
     np.testing.assert_allclose(slab.half_size_xy, model.geom("table").size[:2])
     np.testing.assert_allclose(slab.center_xy, model.body("table").pos[:2])
     assert all(
@@ -77,7 +77,7 @@ def test_files_that_are_missing_or_no_meshes_are_refused(scene):
         load_scene_objects({**files, name: b"v nan 0 0\nf 1 1 1\n"}, [row])
     for xml in (b"", b"<mujoco/>", b"\xff", b"<mujoco><worldbody><body name='table'/></worldbody></mujoco>"):
         with pytest.raises(InputError):
-            slab_of({"scene.xml": xml})
+            read_slab({"scene.xml": xml})
 
 
 @pytest.mark.parametrize(
@@ -100,6 +100,6 @@ def test_nothing_outside_a_scene_is_opened(scene, tmp_path, names):
         signal.alarm(10)
         try:
             with pytest.raises(InputError, match="which is none of its files"):
-                slab_of({**files, "scene.xml": hostile})
+                read_slab({**files, "scene.xml": hostile})
         finally:
             signal.alarm(0)

@@ -9,44 +9,45 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.geometry import Camera, Pose, TriangleMesh
-from schemas.identity import colliding_names
+from schemas.identity import find_name_clashes
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import (
     identity_pose,
-    normalized_quaternion,
+    normalize_quaternion,
     rotation_angle,
     rotation_matrix,
     transform_points,
 )
-from tableverse_factory.physics.mjcf.slab import OBJECT_MARGIN_M, slab_under
-from tableverse_factory.physics.mjcf.spec import PhotoCamera, SceneBody, scene_body, scene_files
-from tableverse_factory.physics.simulate.at_rest import body_poses, free_bodies
+from tableverse_factory.physics.mjcf.slab import OBJECT_MARGIN_M, fit_slab
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_body, make_scene_files
+from tableverse_factory.physics.simulate.at_rest import find_free_bodies, read_body_poses
 from tests.helpers.simple_scenes import TABLE, ball, box, cylinder
 
-SLAB = slab_under(TABLE, [], [], [])
+SLAB = fit_slab(TABLE, [], [], [])
 POSES = st.builds(
-    lambda p, q: Pose(np.array(p), normalized_quaternion(np.array(q))),
+    lambda p, q: Pose(np.array(p), normalize_quaternion(np.array(q))),
     st.tuples(*[st.floats(-20.0, 20.0)] * 3),
     st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
 
 
 def body_of(mesh: TriangleMesh, pose: Pose, object_id: str = "obj_000", mass: float = 0.3) -> SceneBody:
-    return scene_body(object_id, mesh, (mesh,), 1.0, mass, pose)
+    return make_scene_body(object_id, mesh, (mesh,), 1.0, mass, pose)
 
 
 @settings(max_examples=25, deadline=None)
 @given(POSES)
 def test_pose_in_is_pose_out(pose: Pose) -> None:
-    model = scene_files([body_of(box(0.1, 0.06, 0.03), pose)], SLAB).model()
-    (found,) = body_poses(model, mujoco.MjData(model), free_bodies(model))
+    model = make_scene_files([body_of(box(0.1, 0.06, 0.03), pose)], SLAB).model()
+    (found,) = read_body_poses(model, mujoco.MjData(model), find_free_bodies(model))
     np.testing.assert_allclose(found.position, pose.position, atol=1e-9)
     assert rotation_angle(found.quaternion_wxyz, pose.quaternion_wxyz) < 1e-9
 
 
 def test_vertices_stand_where_the_pose_puts_them() -> None:
     lopsided = TriangleMesh(box(0.1, 0.06, 0.03).vertices + np.array([0.5, -0.2, 0.1]), box(1, 1, 1).faces)
-    pose = Pose(np.array([0.1, 0.2, 0.3]), normalized_quaternion(np.array([0.3, -0.5, 0.2, 0.7])))
-    model = scene_files([body_of(lopsided, pose)], SLAB).model()
+    pose = Pose(np.array([0.1, 0.2, 0.3]), normalize_quaternion(np.array([0.3, -0.5, 0.2, 0.7])))
+    model = make_scene_files([body_of(lopsided, pose)], SLAB).model()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
@@ -62,22 +63,22 @@ def test_vertices_stand_where_the_pose_puts_them() -> None:
 def test_mass_centre_and_inertia_are_those_of_the_mesh() -> None:
     mesh = cylinder(0.04, 0.1, sections=30)
     two_pieces = (mesh, mesh)  # overlapping pieces must not count twice
-    body = scene_body("obj_000", mesh, two_pieces, 1.0, 0.37, identity_pose())
-    model = scene_files([body], SLAB).model()
+    body = make_scene_body("obj_000", mesh, two_pieces, 1.0, 0.37, identity_pose())
+    model = make_scene_files([body], SLAB).model()
     at = model.body("obj_000")
     assert at.mass[0] == pytest.approx(0.37, rel=1e-9)
     np.testing.assert_allclose(np.sort(at.inertia), np.linalg.eigvalsh(body.properties.inertia), rtol=1e-6)
 
 
 def test_scale_is_in_the_files() -> None:
-    body = scene_body("obj_000", box(1.0, 1.0, 1.0), (box(1.0, 1.0, 1.0),), 0.1, 1.0, identity_pose())
-    model = scene_files([body], SLAB).model()
+    body = make_scene_body("obj_000", box(1.0, 1.0, 1.0), (box(1.0, 1.0, 1.0),), 0.1, 1.0, identity_pose())
+    model = make_scene_files([body], SLAB).model()
     assert np.abs(model.mesh_vert).max() == pytest.approx(0.05, rel=1e-6)
     np.testing.assert_allclose(model.body("obj_000").inertia, 0.01 / 6, rtol=1e-6)
 
 
 def test_groups_classes_and_settings_are_in_the_xml() -> None:
-    files = scene_files([body_of(ball(0.03), identity_pose())], SLAB, timestep_s=0.001)
+    files = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB, timestep_s=0.001)
     model = files.model()
     visual, piece, table = model.geom("obj_000"), model.geom("obj_000_piece_00"), model.geom("table")
     assert (visual.group[0], visual.contype[0], visual.conaffinity[0]) == (2, 0, 0)
@@ -94,14 +95,14 @@ def test_groups_classes_and_settings_are_in_the_xml() -> None:
 
 
 def test_words_that_older_mujoco_does_not_know_are_not_written() -> None:
-    xml = scene_files([body_of(ball(0.03), identity_pose())], SLAB).xml
+    xml = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB).xml
     assert "colorspace" not in xml
     assert "directional" not in xml
     assert '<flag multiccd="enable" />' in xml
 
 
 def test_loads_from_an_extracted_folder_as_from_memory(tmp_path: Path) -> None:
-    files = scene_files([body_of(ball(0.03), identity_pose())], SLAB)
+    files = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB)
     (tmp_path / "assets").mkdir()
     (tmp_path / "scene.xml").write_text(files.xml)
     for name, data in files.assets.items():
@@ -112,7 +113,9 @@ def test_loads_from_an_extracted_folder_as_from_memory(tmp_path: Path) -> None:
 
 def test_equal_scenes_give_equal_bytes() -> None:
     def again() -> tuple[str, dict[str, bytes]]:
-        files = scene_files([body_of(ball(0.03), identity_pose()), body_of(box(1, 1, 1), identity_pose(), "b")], SLAB)
+        files = make_scene_files(
+            [body_of(ball(0.03), identity_pose()), body_of(box(1, 1, 1), identity_pose(), "b")], SLAB
+        )
         return files.xml, files.assets
 
     assert again() == again()
@@ -121,9 +124,9 @@ def test_equal_scenes_give_equal_bytes() -> None:
 def test_an_open_mesh_and_a_sliver_load() -> None:
     whole = box(0.1, 0.1, 0.1)
     sheet = TriangleMesh(whole.vertices, whole.faces[:3])
-    body = scene_body("obj_000", sheet, (whole, box(0.1, 0.1, 1e-5)), 1.0, 0.1, identity_pose())
+    body = make_scene_body("obj_000", sheet, (whole, box(0.1, 0.1, 1e-5)), 1.0, 0.1, identity_pose())
     assert body.dropped_pieces == 1
-    assert scene_files([body], SLAB).model().ngeom == 3
+    assert make_scene_files([body], SLAB).model().ngeom == 3
 
 
 @pytest.mark.parametrize(
@@ -137,12 +140,12 @@ def test_an_open_mesh_and_a_sliver_load() -> None:
     ],
 )
 def test_ids_that_cannot_share_a_scene(ids: list[str], bad: list[str]) -> None:
-    assert colliding_names(ids) == bad
+    assert find_name_clashes(ids) == bad
 
 
 def test_the_longest_id_still_fits_a_tar() -> None:
     long_id = "a" * 96
-    files = scene_files([body_of(ball(0.03), identity_pose(), long_id)], SLAB)
+    files = make_scene_files([body_of(ball(0.03), identity_pose(), long_id)], SLAB)
     assert files.model().body(long_id).mass[0] > 0
     assert max(len(name) for name in files.assets) <= 100
 
@@ -151,7 +154,7 @@ def test_the_pictures_camera_sees_what_the_picture_saw() -> None:
     camera = Camera(600.0, 600.0, 320.0, 240.0, 640, 480)
     # In the table frame: half a metre up, looking straight down, x of the picture along x of the table.
     looking_down = Pose(np.array([0.0, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]))
-    files = scene_files([body_of(ball(0.03), identity_pose())], SLAB, view=PhotoCamera(camera, looking_down))
+    files = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB, view=PosedCamera(camera, looking_down))
     model = files.model()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -163,7 +166,7 @@ def test_the_pictures_camera_sees_what_the_picture_saw() -> None:
 def test_the_slab_reaches_beyond_every_object(yaw: float, x: float, y: float) -> None:
     from dataclasses import replace
 
-    slab = slab_under(
+    slab = fit_slab(
         replace(TABLE, yaw=yaw), [box(0.1, 0.1, 0.1)], [Pose(np.array([x, y, 0.05]), np.array([1.0, 0, 0, 0]))], [1.0]
     )
     away = OBJECT_MARGIN_M + 0.05

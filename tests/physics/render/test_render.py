@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 
 from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.geometry.math.camera import backproject, project
-from tableverse_factory.geometry.math.transforms import inverse, rotation_matrix, transform_points
+from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.physics.render.normals import corner_normals
+from tableverse_factory.physics.render.normals import compute_corner_normals
 from tableverse_factory.physics.render.raycast import Raycaster
 from tableverse_factory.physics.render.render import Lighting, look_at, render
 
@@ -42,7 +42,7 @@ class TestLookAt:
         if distance < 1e-3:
             return
         pose = look_at(np.array(eye), np.array(target))
-        world_to_camera = inverse(pose)
+        world_to_camera = invert_pose(pose)
         assert_allclose(transform_points(world_to_camera, np.array([target])), [[0, 0, distance]], atol=1e-9)
         assert abs(np.linalg.det(rotation_matrix(pose.quaternion_wxyz)) - 1.0) < 1e-9
         above = transform_points(world_to_camera, np.add([target], [0.0, 0.0, 1.0]))[0] - [0, 0, distance]
@@ -50,7 +50,7 @@ class TestLookAt:
 
     def test_straight_down_has_y_up_in_the_picture(self) -> None:
         pose = look_at(np.array([0.3, 0.1, 2.0]), np.array([0.3, 0.1, 0.0]))
-        pixels = project(transform_points(inverse(pose), np.array([[0.3, 0.5, 0.0], [0.7, 0.1, 0.0]])), CAMERA)
+        pixels = project(transform_points(invert_pose(pose), np.array([[0.3, 0.5, 0.0], [0.7, 0.1, 0.0]])), CAMERA)
         assert pixels[0, 1] < CAMERA.cy
         assert pixels[1, 0] > CAMERA.cx
 
@@ -136,7 +136,7 @@ class TestShading:
         parts = [plane(1.0), plane(0.1, height=0.4)]
         lighting = Lighting(key_direction=(-1.0, 0.0, 1.0))  # the shadow falls 0.4 m to the right
         at = np.rint(
-            project(transform_points(inverse(self.pose), np.array([[0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]])), CAMERA)
+            project(transform_points(invert_pose(self.pose), np.array([[0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]])), CAMERA)
         )
         (u0, v0), (u1, v1) = at.astype(int)
         lit, plain = (render(parts, CAMERA, self.pose, lighting=lighting, shadows=on) for on in (True, False))
@@ -149,7 +149,7 @@ class TestShading:
         overcast = Lighting(key=(0.0, 0.0, 0.0))
         dark, bright = (render(parts, CAMERA, eye, lighting=overcast, shadows=False, sky_rays=n) for n in (12, 0))
         corner, far = np.rint(
-            project(transform_points(inverse(eye), np.array([[0.0, 0.09, 0.0], [0.0, -0.25, 0.0]])), CAMERA)
+            project(transform_points(invert_pose(eye), np.array([[0.0, 0.09, 0.0], [0.0, -0.25, 0.0]])), CAMERA)
         ).astype(int)
         ratio = dark.color.astype(float).mean(axis=2) / bright.color.astype(float).mean(axis=2)
         assert ratio[corner[1], corner[0]] < 0.9 < 0.97 < ratio[far[1], far[0]]
@@ -170,7 +170,7 @@ class TestShading:
 class TestNormals:
     def test_round_things_are_smooth(self) -> None:
         ball = sphere(0.5, (0.0, 0.0, 0.0), 3)
-        assert_allclose(corner_normals(ball), ball.vertices[ball.faces] / 0.5, atol=0.02)
+        assert_allclose(compute_corner_normals(ball), ball.vertices[ball.faces] / 0.5, atol=0.02)
 
     @pytest.mark.parametrize("merged", [True, False])
     def test_edges_of_a_box_stay_sharp_whether_or_not_vertices_are_shared(self, merged: bool) -> None:
@@ -178,13 +178,15 @@ class TestNormals:
         mesh = from_trimesh(box)
         if not merged:
             mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(36, dtype=np.int32).reshape(-1, 3))
-        assert_allclose(corner_normals(mesh), np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-6)
+        assert_allclose(compute_corner_normals(mesh), np.repeat(box.face_normals[:, None], 3, axis=1), atol=1e-6)
 
     def test_slivers_and_wide_fans_stay_finite(self) -> None:
         count = 600
         angles = 2 * np.pi * np.arange(count) / count
         rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
         faces = [[0, 1 + k, 1 + (k + 1) % count] for k in range(count)] + [[0, 0, 1], [1, 1, 1]]
-        normals = corner_normals(TriangleMesh(np.vstack([[0.0, 0.0, 0.5], rim]), np.array(faces, dtype=np.int32)))
+        normals = compute_corner_normals(
+            TriangleMesh(np.vstack([[0.0, 0.0, 0.5], rim]), np.array(faces, dtype=np.int32))
+        )
         assert np.isfinite(normals).all()
         assert (normals[:count, :, 2] > 0.0).all()

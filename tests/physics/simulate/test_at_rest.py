@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Pose, TriangleMesh
-from tableverse_factory.physics.mjcf.slab import slab_under
-from tableverse_factory.physics.mjcf.spec import scene_body, scene_spec
+from tableverse_factory.physics.mjcf.slab import fit_slab
+from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_spec
 from tableverse_factory.physics.simulate import at_rest
 from tableverse_factory.physics.simulate.at_rest import SPEED_LIMIT, measure_drift, simulate_to_rest
 from tests.helpers.simple_scenes import TABLE, UPRIGHT, ball, box
 
-SLAB = slab_under(TABLE, [], [], [])
+SLAB = fit_slab(TABLE, [], [], [])
 CUBE = box(0.05, 0.05, 0.05)
 
 
@@ -21,10 +21,12 @@ def model_of(
     things: Sequence[tuple[TriangleMesh, tuple[float, float, float]]], masses: Sequence[float] | None = None
 ) -> mujoco.MjModel:
     bodies = [
-        scene_body(f"obj_{k:03d}", mesh, (mesh,), 1.0, (masses or [0.2] * len(things))[k], Pose(np.array(at), UPRIGHT))
+        make_scene_body(
+            f"obj_{k:03d}", mesh, (mesh,), 1.0, (masses or [0.2] * len(things))[k], Pose(np.array(at), UPRIGHT)
+        )
         for k, (mesh, at) in enumerate(things)
     ]
-    return scene_spec(bodies, SLAB)[0].compile()
+    return make_scene_spec(bodies, SLAB)[0].compile()
 
 
 def test_free_fall_takes_the_time_and_has_the_energy_of_free_fall() -> None:

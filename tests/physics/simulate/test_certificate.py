@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas.geometry import ConvexPieces, Pose, TriangleMesh
-from tableverse_factory.geometry.collision.penetration import piece_penetrations
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
+from tableverse_factory.geometry.collision.penetration import measure_piece_penetrations
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.physics.mjcf.pose_history import History
-from tableverse_factory.physics.mjcf.slab import slab_under
-from tableverse_factory.physics.mjcf.spec import scene_body, scene_files
-from tableverse_factory.physics.simulate.certificate import certify, deepest_contact, measure
+from tableverse_factory.physics.mjcf.pose_history import PoseHistory
+from tableverse_factory.physics.mjcf.slab import fit_slab
+from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_files
+from tableverse_factory.physics.simulate.certificate import certify, find_deepest_contact, measure_model
 from tests.helpers.simple_scenes import TABLE, UPRIGHT, ball, box
 
-SLAB = slab_under(TABLE, [], [], [])
+SLAB = fit_slab(TABLE, [], [], [])
 CUBE = box(0.05, 0.05, 0.05)
 
 
@@ -28,12 +28,12 @@ def at(x: float, y: float, z: float) -> Pose:
 
 
 def model_of(things: Sequence[tuple[TriangleMesh, Pose]]) -> mujoco.MjModel:
-    bodies = [scene_body(f"obj_{k:03d}", mesh, (mesh,), 1.0, 0.2, pose) for k, (mesh, pose) in enumerate(things)]
-    return scene_files(bodies, SLAB).model()
+    bodies = [make_scene_body(f"obj_{k:03d}", mesh, (mesh,), 1.0, 0.2, pose) for k, (mesh, pose) in enumerate(things)]
+    return make_scene_files(bodies, SLAB).model()
 
 
 def test_a_box_on_the_table_is_at_rest_and_free() -> None:
-    found = measure(model_of([(CUBE, at(0, 0, 0.02499))]))
+    found = measure_model(model_of([(CUBE, at(0, 0, 0.02499))]))
     assert found.at_rest
     assert not found.colliding(0.001)
     assert found.drift_m < 1e-4
@@ -42,7 +42,7 @@ def test_a_box_on_the_table_is_at_rest_and_free() -> None:
 
 @pytest.mark.parametrize("depth", [0.0002, 0.003])
 def test_a_planted_penetration_is_found_on_pieces_and_on_meshes(depth: float) -> None:
-    found = measure(model_of([(CUBE, at(0, 0, 0.025)), (CUBE, at(0.05 - depth, 0.003, 0.025))]))
+    found = measure_model(model_of([(CUBE, at(0, 0, 0.025)), (CUBE, at(0.05 - depth, 0.003, 0.025))]))
     for measured, pair in (found.pieces, found.meshes):
         assert measured == pytest.approx(depth, abs=max(1e-5, 0.05 * depth))
         assert pair == "obj_000 & obj_001"
@@ -50,7 +50,7 @@ def test_a_planted_penetration_is_found_on_pieces_and_on_meshes(depth: float) ->
 
 
 def test_sinking_into_the_table_counts() -> None:
-    found = measure(model_of([(CUBE, at(0, 0, 0.025 - 0.003))]))
+    found = measure_model(model_of([(CUBE, at(0, 0, 0.025 - 0.003))]))
     assert found.pieces[0] == pytest.approx(0.003, abs=2e-4)
     assert found.meshes[0] == pytest.approx(0.003, abs=2e-4)
     assert found.meshes[1] == "obj_000 & world"
@@ -59,10 +59,10 @@ def test_sinking_into_the_table_counts() -> None:
 def test_a_collision_of_meshes_behind_free_pieces_is_found() -> None:
     small = box(0.04, 0.04, 0.04)
     bodies = [
-        scene_body("obj_000", CUBE, (small,), 1.0, 0.2, at(0, 0, 0.025)),
-        scene_body("obj_001", CUBE, (small,), 1.0, 0.2, at(0.047, 0, 0.025)),
+        make_scene_body("obj_000", CUBE, (small,), 1.0, 0.2, at(0, 0, 0.025)),
+        make_scene_body("obj_001", CUBE, (small,), 1.0, 0.2, at(0.047, 0, 0.025)),
     ]
-    found = measure(scene_files(bodies, SLAB).model())
+    found = measure_model(make_scene_files(bodies, SLAB).model())
     assert found.pieces[0] == 0.0
     assert found.meshes[0] == pytest.approx(0.003, abs=1e-5)
     assert found.colliding(0.001)
@@ -78,18 +78,18 @@ def test_piece_depths_agree_with_an_independent_computation(
 ) -> None:
     poses = [
         at(0, 0, 1.0),
-        Pose(np.array(offset) + np.array([0.03, 0, 1.0]), normalized_quaternion(np.array(quaternion))),
+        Pose(np.array(offset) + np.array([0.03, 0, 1.0]), normalize_quaternion(np.array(quaternion))),
     ]
     meshes = [ball(0.03), box(0.05, 0.03, 0.06)]
     pieces = [ConvexPieces((mesh,), 1.0, 0.0, "convex") for mesh in meshes]
-    ours, _ = deepest_contact(model_of(list(zip(meshes, poses, strict=True))), poses)
-    coal = max((depth for _, _, depth in piece_penetrations(pieces, poses, [1.0, 1.0])), default=0.0)
+    ours, _ = find_deepest_contact(model_of(list(zip(meshes, poses, strict=True))), poses)
+    coal = max((depth for _, _, depth in measure_piece_penetrations(pieces, poses, [1.0, 1.0])), default=0.0)
     # Both expand a polytope and stop a little early, each in its own direction: deep overlaps differ by 1.5 % at most.
     assert ours == pytest.approx(coal, rel=0.02, abs=1e-5)
 
 
 def test_an_object_in_mid_air_falls_and_is_named() -> None:
-    found = measure(model_of([(CUBE, at(0, 0, 0.025)), (CUBE, at(2.0, 0, 0.025))]))
+    found = measure_model(model_of([(CUBE, at(0, 0, 0.025)), (CUBE, at(2.0, 0, 0.025))]))
     assert found.fell == ("obj_001",)
     assert not found.at_rest
     assert "obj_000" not in found.moved
@@ -98,7 +98,7 @@ def test_an_object_in_mid_air_falls_and_is_named() -> None:
 def test_sliding_is_drift() -> None:
     model = model_of([(CUBE, at(0, 0, 0.025))])
     model.opt.gravity[:] = [9.81 * 0.9, 0, -9.81]
-    found = measure(model)
+    found = measure_model(model)
     assert found.moved == ("obj_000",)
     assert not found.at_rest
 
@@ -107,7 +107,7 @@ def test_contents_that_left_their_container_are_named() -> None:
     tub = from_trimesh(trimesh.creation.box((0.12, 0.12, 0.002)))
     inside, heaped, outside = at(0, 0, 0.03), at(0.02, 0, 0.045), at(0.2, 0, 0.02)
     things = [(tub, at(0, 0, 0.001)), (ball(0.02), inside), (ball(0.02), heaped), (ball(0.02), outside)]
-    history = History(contained_in={f"obj_{k:03d}": "obj_000" for k in (1, 2, 3)})
+    history = PoseHistory(contained_in={f"obj_{k:03d}": "obj_000" for k in (1, 2, 3)})
     certificate, _ = certify(model_of(things), history, 0.001)
     # A tray holds what lies on it and what is heaped over it, and not what lies beside it.
     assert certificate.left_container == ("obj_003",)
@@ -115,7 +115,7 @@ def test_contents_that_left_their_container_are_named() -> None:
 
 def test_before_and_displacement_come_from_the_history() -> None:
     model = model_of([(CUBE, at(0, 0, 0.025)), (CUBE, at(0.06, 0, 0.025))])
-    history = History(
+    history = PoseHistory(
         placed={"obj_000": at(0, 0, 0.025), "obj_001": at(0.03, 0.04, 0.025)},
         rectified={"obj_000": at(0, 0, 0.025), "obj_001": at(0.046, 0, 0.025)},
     )
@@ -158,16 +158,16 @@ FOREIGN = """
 )
 def test_foreign_scenes_of_primitives_on_a_plane(kind: str, size: str, height: float) -> None:
     sunk = mujoco.MjModel.from_xml_string(FOREIGN.format(z=height - 0.003, kind=kind, size=size))
-    found = measure(sunk)
+    found = measure_model(sunk)
     assert found.bodies == ("#1", "cart")
     assert found.pieces[0] == pytest.approx(0.003, abs=1e-4)
     assert found.meshes[0] == pytest.approx(0.003, abs=2e-4)
     assert found.meshes[1] == "#1 & world"
     above = mujoco.MjModel.from_xml_string(FOREIGN.format(z=height + 0.001, kind=kind, size=size))
-    assert not measure(above).colliding(1e-4)
+    assert not measure_model(above).colliding(1e-4)
 
 
 def test_a_mesh_that_had_to_be_closed_is_named() -> None:
     sheet = TriangleMesh(CUBE.vertices, CUBE.faces[:-1])
-    body = scene_body("obj_000", sheet, (CUBE,), 1.0, 0.2, at(0, 0, 0.025))
-    assert measure(scene_files([body], SLAB).model()).repaired == ("obj_000: filled",)
+    body = make_scene_body("obj_000", sheet, (CUBE,), 1.0, 0.2, at(0, 0, 0.025))
+    assert measure_model(make_scene_files([body], SLAB).model()).repaired == ("obj_000: filled",)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.physics.simulate.certificate import Measurement, measure
-from tableverse_factory.physics.simulate.model_solids import GeomSolid, ModelBody, deepest_overlaps
+from tableverse_factory.physics.simulate.certificate import Measurement, measure_model
+from tableverse_factory.physics.simulate.model_solids import GeomSolid, ModelBody, find_deepest_overlaps
 
 DEPTHS_MM = (0.05, 0.5, 2.0, 10.0)
 ANYWHERE = [(0.0, 0.0, 0.0), (30.0, -20.0, 75.0), (120.0, 40.0, 10.0)]
@@ -24,7 +24,7 @@ ANYWHERE = [(0.0, 0.0, 0.0), (30.0, -20.0, 75.0), (120.0, 40.0, 10.0)]
 
 def of_xml(bodies: str, assets: str = "", files: dict[str, bytes] | None = None) -> Measurement:
     text = f"<mujoco><option gravity='0 0 0'/><asset>{assets}</asset><worldbody>{bodies}</worldbody></mujoco>"
-    return measure(mujoco.MjModel.from_xml_string(text, files or {}))
+    return measure_model(mujoco.MjModel.from_xml_string(text, files or {}))
 
 
 def body(geom: str, position: np.ndarray, turn: Rotation) -> str:
@@ -167,7 +167,7 @@ def test_drift_on_a_slope_is_what_galilei_and_coulomb_say(degrees: float, fricti
       <geom type="plane" size="500 500 1" quat="{z} 0 {x} 0"/>
       <body name="slider" pos="{up[0]} {up[1]} {up[2]}" quat="{z} 0 {x} 0"><freejoint/>
         <geom type="box" size="0.06 0.06 0.02"/></body></worldbody></mujoco>"""
-    found = measure(mujoco.MjModel.from_xml_string(xml))
+    found = measure_model(mujoco.MjModel.from_xml_string(xml))
     pull = 9.81 * (np.sin(angle) - friction * np.cos(angle))
     if pull < 0.0:
         assert found.drift_m < 1e-3
@@ -194,7 +194,7 @@ def test_a_foreign_scene_of_many_files(tmp_path: Path) -> None:
         <body name="stone" pos="0 0.258284271 0.5"><freejoint/><geom type="box" size="0.1 0.032 0.1"/></body>
         </worldbody></mujoco>"""
     )
-    found = measure(mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
+    found = measure_model(mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
     assert found.bodies == ("tree", "stone")
     edge = 0.2 + 0.02 * np.sqrt(2.0)  # the cube's edge, turned by 90 degrees about z to lie along y
     depth = edge - (0.258284271 - 0.032)
@@ -217,7 +217,7 @@ def test_the_depths_of_a_sheet_are_the_same_whatever_was_measured_before() -> No
         ModelBody(name, (GeomSolid(name, mesh),)) for name, mesh in (("sheet", flat), ("box", box_above), ("pin", pin))
     ]
     still = ModelBody("world", ())
-    first = deepest_overlaps(moving, poses, still)
-    assert deepest_overlaps(moving, poses, still) == first
+    first = find_deepest_overlaps(moving, poses, still)
+    assert find_deepest_overlaps(moving, poses, still) == first
     assert ("sheet", "pin") in [pair[:2] for pair in first]
     assert moving[0].repaired

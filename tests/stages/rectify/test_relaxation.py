@@ -65,7 +65,7 @@ def test_a_heap_beyond_the_work_allowed_does_not_keep_the_rest_from_its_least_mo
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
 
 
-@pytest.mark.parametrize(("bound", "most"), [("MOST_WORK", 1.5e7), ("MOST_WAYS", 130)])
+@pytest.mark.parametrize(("bound", "most"), [("MAX_WORK", 1.5e7), ("MAX_WAYS_OUT", 130)])
 def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
     bound: str, most: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,7 +93,9 @@ def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
 def test_clusters_that_would_meet_on_their_ways_are_one() -> None:
     """Each pair would part by half its overlap, and the inner ones into one another."""
     at = [-0.135, -0.053, 0.053, 0.135]
-    result = rectify_jointly([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
+    result = rectify_jointly(
+        [part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG
+    )
     ahead = (0.1 + CONFIG.clearance_m) * np.arange(4)
     least = isotonic_regression(at - ahead).x + ahead - at
     assert result.method == "joint"
@@ -103,7 +105,9 @@ def test_clusters_that_would_meet_on_their_ways_are_one() -> None:
 @pytest.mark.parametrize("pitch", [0.06, 0.05, 0.03])
 def test_in_a_row_of_deep_overlaps_nothing_moves_more_than_along_the_row(pitch: float) -> None:
     at = pitch * (np.arange(5) - 2)
-    result = rectify_jointly([part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG)
+    result = rectify_jointly(
+        [part(placed(f"obj_{k}", box(0.1, 0.1, 0.1), (x, 0, 0.05))) for k, x in enumerate(at)], CONFIG
+    )
     ahead = (0.1 + CONFIG.clearance_m) * np.arange(5)
     along = isotonic_regression(at - ahead).x + ahead - at
     assert (offsets(result) ** 2).sum() <= (along**2).sum() + 1e-6

@@ -1,4 +1,4 @@
-"""Exact distances along a ray: how far must something move until it is clear of everything (paper equation (2)).
+"""Linear sweeps: how far a body must move along a direction until it is clear of everything (paper equation (2)).
 
 For convex A and B the distance between A + d v and B is a convex function of d, so the d at which they are nearer than
 a margin form one interval. A tangent of a convex function never crosses it: Newton's steps from outside (conservative
@@ -13,15 +13,15 @@ import coal
 import numpy as np
 
 from schemas.geometry import Matrix3, Points, Vector3
-from tableverse_factory.geometry.collision.solids import Solids, meetings
+from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces
 
 TOLERANCE_M = 1e-7
 """Gaps are known to this; what is clear to within it counts as clear."""
-LEAST_MARGIN_M = 1e-6
-"""With no clearance asked for: disjoint is a little more than touching."""
+MIN_MARGIN_M = 1e-6
+"""Least clearance: disjoint is a little more than touching."""
 GJK_TOLERANCE = 1e-9
 MAX_STEPS = 200
-"""Newton's steps; it takes three to six. Stopping early leaves more room than needed, never less."""
+"""Of Newton; three to six are usual. Stopping early leaves more room than needed, never less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class MovingSolid:
     uncovered_m: float = 0.0
 
     def moved(self, by: Vector3) -> "MovingSolid":
-        """The same pieces, translated by another `by` [m]."""
+        """Translate by another `by` [m]."""
         return replace(self, offset=self.offset + by)
 
 
@@ -57,13 +57,12 @@ class _Pair:
     high: float
 
 
-class Ray:
-    """A direction along which bodies move, and the exact distances along it."""
+class LinearSweep:
+    """A direction (unit vector in the table frame) along which bodies move, and the exact distances along it."""
 
     def __init__(self, direction: Vector3) -> None:
-        """Takes a unit vector in the table frame."""
         self._direction = direction
-        self._axes = basis(direction)
+        self._axes = complete_basis(direction)
         self._request = coal.DistanceRequest()
         self._request.enable_signed_distance = False
         self._request.gjk_tolerance = GJK_TOLERANCE
@@ -72,10 +71,10 @@ class Ray:
         self._still = coal.Transform3s()
 
     def first_clear(self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float) -> float:
-        """The smallest d >= 0 [m] at which every moving body, moved by d, is clear of every fixed body.
+        """Find the smallest d >= 0 [m] at which every moving body, moved by d, is clear of every fixed body.
 
         Clear means at least `clearance_m` apart, and further by what either mesh sticks out of its pieces.
-        The walk keeps, for each pair, a d before which it cannot touch, and looks at a pair only when d gets there.
+        Each pair waits on a heap until d reaches the value before which it cannot touch.
         """
         pairs = [pair for body in moving for other in fixed for pair in self._pairs(body, other, clearance_m)]
         waiting = [(pair.low, k) for k, pair in enumerate(pairs)]
@@ -96,7 +95,7 @@ class Ray:
     def room(
         self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float, limit_m: float
     ) -> float:
-        """How far [m] the moving bodies can go before one of them is no longer clear of a fixed one.
+        """Find how far [m] the moving bodies can go before one of them is no longer clear of a fixed one.
 
         At most `limit_m`, and never negative: 0 where they are not clear to begin with, unless they are leaving.
         """
@@ -109,7 +108,7 @@ class Ray:
         return max(room, 0.0)
 
     def _lower_end(self, pair: _Pair, limit: float) -> float:
-        """Where the interval in which a pair is too near begins, or the limit, by Newton's steps from outside."""
+        """Find where the interval in which a pair is too near begins, at most the limit."""
         d = max(pair.low, 0.0)
         for _ in range(MAX_STEPS):
             gap, slope = self._probe(pair, d)
@@ -123,7 +122,7 @@ class Ray:
         return d
 
     def _upper_end(self, pair: _Pair) -> float:
-        """Where the interval in which a pair is too near ends, by Newton's steps from outside."""
+        """Find where the interval in which a pair is too near ends."""
         d = pair.high
         for _ in range(MAX_STEPS):
             gap, slope = self._probe(pair, d)
@@ -141,8 +140,8 @@ class Ray:
         return max(gap, 0.0), -float(self._result.normal @ self._direction)
 
     def _pairs(self, a: MovingSolid, b: MovingSolid, clearance_m: float) -> list[_Pair]:
-        """The pairs of pieces that may come too near for some d >= 0."""
-        margin = max(clearance_m + a.uncovered_m + b.uncovered_m, LEAST_MARGIN_M)
+        """Find the pairs of pieces that may come too near for some d >= 0."""
+        margin = max(clearance_m + a.uncovered_m + b.uncovered_m, MIN_MARGIN_M)
         low_a, high_a = self._extents(a)
         low_b, high_b = self._extents(b)
         first = low_b[None] - high_a[:, None] - margin
@@ -164,23 +163,20 @@ class Ray:
 
 def are_within(a: MovingSolid, b: MovingSolid, reach_m: float) -> bool:
     """Whether any piece of one body comes within `reach_m` [m] of a piece of the other."""
-    return any(True for _ in meetings(a.solids, b.solids, reach_m, a.offset - b.offset, signed=False))
+    return any(True for _ in find_near_pieces(a.solids, b.solids, reach_m, a.offset - b.offset, signed=False))
 
 
-def nearest_point(a: MovingSolid, b: MovingSolid, reach_m: float) -> tuple[float, Vector3]:
-    """How near two bodies come [m], and where on the first; infinity and nowhere beyond `reach_m`.
-
-    Where they overlap it is 0, at one of the places where they do.
-    """
+def find_nearest_point(a: MovingSolid, b: MovingSolid, reach_m: float) -> tuple[float, Vector3]:
+    """Find how near two bodies come [m], 0 where they overlap, and where on the first; inf and NaN beyond `reach_m`."""
     least, where = np.inf, np.full(3, np.nan)
-    for gap, result in meetings(a.solids, b.solids, reach_m, a.offset - b.offset):
+    for gap, result in find_near_pieces(a.solids, b.solids, reach_m, a.offset - b.offset):
         if max(gap, 0.0) < least:
             least, where = max(gap, 0.0), np.array(result.getNearestPoint1()) + b.offset
     return float(least), where
 
 
-def basis(direction: Vector3) -> Matrix3:
-    """An orthonormal basis, as columns, that begins with a unit vector."""
+def complete_basis(direction: Vector3) -> Matrix3:
+    """Complete a unit vector to an orthonormal basis, as columns."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     second = np.cross(direction, helper)
     second /= np.linalg.norm(second)
