@@ -132,7 +132,6 @@ def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
 
 
 def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemark]:
-    """Remark on ids that the scene does not have."""
     criteria = answer.per_criterion
     lists = {
         "usability": [i for ids in answer.usability.evidence_ids.values() for i in ids],

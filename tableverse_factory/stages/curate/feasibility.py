@@ -82,14 +82,13 @@ class Feasibility:
     def _find_pick_obstacle(self, x: int) -> str:
         if self._grips[x].share < MIN_GRIP_SHARE:
             return "not_graspable"
-        mine = self._scene.bodies[x]
+        body_x = self._scene.bodies[x]
         for other, body in enumerate(self._scene.bodies):
-            if other != x and (rests_on(body, mine) or is_inside(body, mine)):
+            if other != x and (rests_on(body, body_x) or is_inside(body, body_x)):
                 return "carries_others"
         return "" if self._count_free_grips(x) >= MIN_FREE_GRIPS else "out_of_reach"
 
     def _count_free_grips(self, x: int) -> int:
-        """Count the grips with room for both fingers from above."""
         fingers = self._grips[x].fingers()
         heights = self._heights_without(x)
         index = np.floor(fingers[..., :2] / self._scene.cell).astype(int) - np.array(self._scene.corner)

@@ -50,7 +50,6 @@ def _is_valid(value: Any, kind: type[BaseModel]) -> bool:
 
 
 def _list_entries(value: Any) -> list[tuple[str, Any]]:
-    """List the entries of a mapping whose keys are ids."""
     pairs = list(value.items())[:MAX_ENTRIES] if isinstance(value, dict) else []
     return [(key, entry) for key, entry in pairs if _ID.fullmatch(key)]
 

@@ -73,5 +73,4 @@ def _measure_clarity(case: JudgeInput, partitioned: bool) -> float:
 
 
 def _to_points(share: float) -> int:
-    """Map a share of 0 to 1 to 1 to 10 points."""
     return int(1.5 + 9 * min(max(share, 0.0), 1.0))

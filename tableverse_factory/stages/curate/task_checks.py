@@ -53,7 +53,6 @@ def check_tasks(
 
 
 def _explain_refusal(task: GeneratedTask, case: JudgeInput, objects: tuple[ObjectAssessment, ...]) -> str:
-    """Explain why a task is refused; empty if it meets every hard constraint."""
     count = len(case.items)
     if not (0 <= task.x_id < count and 0 <= task.y_id < count):
         return "unknown_id"
@@ -80,7 +79,6 @@ def fits_template(task: GeneratedTask) -> bool:
 
 
 def _list_head_nouns(label: str, verdict: ObjectAssessment) -> frozenset[str]:
-    """List the head nouns of an object's names."""
     names = (label, verdict.relabel_name, verdict.corrected_label, *verdict.distinguishing_phrases)
     return frozenset(find_head_noun(name) for name in names if name)
 
@@ -95,7 +93,6 @@ def _names_another(name: str, index: int, heads: list[frozenset[str]]) -> bool:
 
 
 def _is_shared(name: str, objects: tuple[ObjectAssessment, ...]) -> bool:
-    """Whether a bare name belongs to several objects, so that it is ambiguous."""
     bare = _strip_article(name).casefold()
     return sum(_strip_article(verdict.relabel_name).casefold() == bare for verdict in objects) > 1
 

@@ -63,7 +63,6 @@ def is_partitioned(bodies: tuple[BodyFeatures, ...]) -> bool:
 
 
 def _measure_extent(bodies: tuple[BodyFeatures, ...]) -> float:
-    """Measure the longer side of the smallest rectangle around bodies, seen from above [m]."""
     points = np.concatenate([body.outline for body in bodies])
     try:
         return 2 * float(fit_min_rectangle(points).half_size.max())
@@ -72,7 +71,6 @@ def _measure_extent(bodies: tuple[BodyFeatures, ...]) -> float:
 
 
 def _span_tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the minimum spanning tree: the gap [m] and the two ends of each edge."""
     n = len(bodies)
     gaps = np.zeros((n, n))
     for i in range(n):
@@ -83,7 +81,6 @@ def _span_tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray
 
 
 def _find_cuts(gaps: np.ndarray) -> list[float]:
-    """Find the widest gap, and any other that is far wider than the next."""
     ordered = np.sort(gaps)[::-1]
     cuts = [float(ordered[0])]
     for wider, next_gap in pairwise(ordered[1:]):

@@ -71,8 +71,8 @@ def list_triangle_texels(square: int, second: bool) -> tuple[Int64[np.ndarray, "
     Beyond the face's edge, in the gutter, texels repeat the edge.
     """
     row, column = np.indices((square, square))
-    mine = (row + column >= square) == second
-    i, j = column[mine], row[mine]
+    half = (row + column >= square) == second
+    i, j = column[half], row[half]
     inset, reach = _inset_triangle(square)
     one, two = (square - 1 - i, square - 1 - j) if second else (i, j)
     weights = np.stack([reach + 2 * inset - one - two, one - inset, two - inset], axis=-1) / reach
@@ -108,7 +108,6 @@ def _choose_levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m
 
 
 def _sort_along_curve(points: Points) -> Int64[np.ndarray, " n"]:
-    """Sort the points along a Morton curve."""
     low, high = aabb(points)
     cells = ((points - low) / max(float((high - low).max()), 1e-30) * 1023).astype(np.int64)
     code = np.zeros(len(points), dtype=np.int64)

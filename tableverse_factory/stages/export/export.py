@@ -137,7 +137,6 @@ def _build_camera(layout: RectifiedLayout) -> PosedCamera | None:
 
 
 def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | None:
-    """Explain why the scene may not be exported; None if it may."""
     certificate, measured = written.certificate, written.measured
     if measured.warnings:
         return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(measured.warnings)}")

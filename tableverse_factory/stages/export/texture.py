@@ -56,7 +56,6 @@ def _measure_detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Fl
 
 
 def _choose_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
-    """Choose the atlas with as much detail as fits."""
     sizes = ((SMALL_SIDE, SMALL_TRIES), (LARGE_SIDE, LARGE_TRIES)) if detail.any() else ((SMALL_SIDE, 1),)
     for side, tries in sizes:
         for power in range(tries):

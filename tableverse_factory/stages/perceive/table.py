@@ -142,7 +142,6 @@ def _measure_table_share(view: TableView, inside: Mask) -> float:
 
 
 def _sample_grid(valid: Mask) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the rows and columns of a regular grid of readings."""
     step = max(1, int(np.sqrt(valid.sum() / SAMPLES)))
     rows, columns = np.nonzero(valid[::step, ::step])
     return rows * step, columns * step

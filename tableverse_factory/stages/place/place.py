@@ -130,7 +130,7 @@ def _estimate_support_std(perceived: PerceivedObject, support: DepthSupport) -> 
 
 
 def _measure_breadth(points: Points) -> float:
-    """Standard deviation of points across the line that fits them best [m]."""
+    """Measure the standard deviation of points across the line that fits them best [m]."""
     centred = points - points.mean(axis=0)
     return float(np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred / len(points))[1], 0.0)))
 

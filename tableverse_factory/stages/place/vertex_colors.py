@@ -54,7 +54,6 @@ def compute_vertex_normals(mesh: TriangleMesh) -> Points:
 
 
 def _extract_heading(pose: Pose) -> Float64[np.ndarray, "4"]:
-    """Extract the rotation about the vertical of an orientation."""
     w, z = pose.quaternion_wxyz[0], pose.quaternion_wxyz[3]
     length = float(np.hypot(w, z))
     return np.array([w, 0.0, 0.0, z]) / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])

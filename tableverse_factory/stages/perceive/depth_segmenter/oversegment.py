@@ -126,7 +126,7 @@ def _find_gap_links(
 
 
 def _merge_links(links: Links, a: int, b: int) -> None:
-    """Hands the neighbours of `b` to `a`."""
+    """Hand the neighbours of `b` to `a`."""
     for c, (total, length) in links.pop(b).items():
         if c == a:
             continue

@@ -88,9 +88,9 @@ def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> M
     step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
     wall = np.zeros(steps + 1)
     for k in range(steps + 1):
-        there = off[within & (step == k)]
-        if len(there) >= MIN_WALL_PX:
-            wall[k] = min(float(np.percentile(there, OUTERMOST)), rim.radius)
+        distances = off[within & (step == k)]
+        if len(distances) >= MIN_WALL_PX:
+            wall[k] = min(float(np.percentile(distances, OUTERMOST)), rim.radius)
     wall = np.maximum.accumulate(wall)
     floor = level & (heights < rim.floor + WALL_M)
     lining: Mask = within & (floor | (off > wall[step] - WALL_M))
@@ -117,7 +117,6 @@ def _split_contents(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Ma
 
 
 def _find_walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
-    """Find the ids of the vessel's parts, the largest first."""
     near, count = ids[rim.window], int(ids.max(initial=0)) + 1
     sizes = np.bincount(ids[view.valid], minlength=count)
     at_rim = own & (np.abs(view.heights[rim.window] - rim.height) < 2 * WALL_M) & (off > rim.radius - WALL_M)

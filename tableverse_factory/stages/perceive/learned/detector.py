@@ -77,12 +77,12 @@ def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
     """Compute the points of the network's output with a reading, and the object of each from 1, 0 for none."""
     table = compute_table_points(view)
     center = np.median(table[view.raised][:, :2], axis=0) if view.raised.any() else np.zeros(2)
-    said = _run_network(net, compute_features(table, view.valid, center))
+    output = _run_network(net, compute_features(table, view.valid, center))
     thin = np.s_[::THINNING, ::THINNING]
     table, valid = table[thin], view.valid[thin]
-    said = said[:, : valid.shape[0], : valid.shape[1]]
-    chosen = valid & (said[0] > 0.0)
-    votes = table[chosen] + OFFSET_UNIT_M * np.moveaxis(said[1:], 0, -1)[chosen]
+    output = output[:, : valid.shape[0], : valid.shape[1]]
+    chosen = valid & (output[0] > 0.0)
+    votes = table[chosen] + OFFSET_UNIT_M * np.moveaxis(output[1:], 0, -1)[chosen]
     image = np.zeros(valid.shape, dtype=np.int32)
     image[chosen] = cluster_votes(votes.astype(np.float64), MIN_VOTES) + 1
     return table[valid], _remove_crumbs(image)[valid]

@@ -91,6 +91,6 @@ def encode_image(color: Picture) -> tuple[bytes, ImageSize]:
 
 
 def _explain_missing_table(record: DetectionRecord) -> str:
-    """What became of a table that was in the answer."""
+    """Explain why a table in the answer was dropped; empty if there was none."""
     lost = [remark for remark in record.remarks if remark.rule == "behind_person"]
     return f": {lost[-1].detail}" if lost else ""

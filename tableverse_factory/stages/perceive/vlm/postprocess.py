@@ -100,8 +100,8 @@ class _RuleSet:
 
         A label that may name something else ("surface", "white counter") counts where no other names a table.
         """
-        said = [*self.singles, *(composite.container for composite in self.composites)]
-        is_table = names_table if any(names_table(entry.label) for entry in said) else may_name_table
+        entries = [*self.singles, *(composite.container for composite in self.composites)]
+        is_table = names_table if any(names_table(entry.label) for entry in entries) else may_name_table
         for composite in [composite for composite in self.composites if is_table(composite.container.label)]:
             self._remark(composite.container, "table_as_container", "what stands on a table is not in it")
             self.composites.remove(composite)
@@ -204,7 +204,6 @@ class _RuleSet:
         return self._remark(entry, "behind_person", f"{share:.0%} of its box lies in a person's, and it is not held")
 
     def _merge_containers(self) -> None:
-        """Merge composites of the same container."""
         joined: list[ParsedComposite] = []
         for composite in self.composites:
             k = next((k for k, other in enumerate(joined) if _is_same(composite.container, other.container)), None)

@@ -80,7 +80,7 @@ def _find_protrusions(view: ObjectView, body: Manifold) -> IdImage:
 
 
 def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of each point of the table frame in the window, not clipped."""
+    """Find row and column of points of the table frame in the window, not clipped."""
     pixels = np.rint(project(transform_points(invert_pose(view.camera_to_table), points), view.camera)).astype(int)
     return pixels[:, 1], pixels[:, 0]
 

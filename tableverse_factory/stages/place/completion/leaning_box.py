@@ -85,7 +85,6 @@ def _estimate_axes(view: ObjectView) -> Matrix3:
 
 
 def _average_direction(normals: Points) -> Vector3:
-    """Average the direction of normals whose signs may differ."""
     _, vectors = np.linalg.eigh(normals.T @ normals)
     direction: Vector3 = vectors[:, 2]
     return direction

@@ -211,7 +211,6 @@ def _build_solid(votes: _Votes) -> CrossSection:
 
 
 def _build_cavity(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
-    """Build the section of a cavity, open at the top."""
     inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
     inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
     return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
@@ -252,7 +251,6 @@ def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) 
 
 
 def _touches_wall(votes: _Votes, cavity: Cells, row: int) -> bool:
-    """Whether solid was seen just outside the cavity at this height."""
     edge = int(np.flatnonzero(cavity[:, row])[-1])
     return bool((votes.field[edge + 1 : edge + 3, row] > 0.0).any())
 

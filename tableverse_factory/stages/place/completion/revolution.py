@@ -78,6 +78,5 @@ def fit_about_axis(view: ObjectView, rays: RaySample, axis: Pose, freedom: float
 
 
 def _to_frame(solid: Manifold, axis: Pose) -> TriangleMesh:
-    """Convert a solid of the table frame to the frame of its axis."""
     mesh = from_manifold(solid)
     return TriangleMesh(transform_points(invert_pose(axis), mesh.vertices), mesh.faces)

@@ -40,7 +40,6 @@ def propose_axes(view: ObjectView) -> list[tuple[Pose, float]]:
 
 
 def _find_long_direction(points: Points) -> Vector3:
-    """Find the horizontal direction along which the points spread most."""
     flat = points[:, :2] - points[:, :2].mean(axis=0)
     _, vectors = np.linalg.eigh(flat.T @ flat)
     return np.array([vectors[0, 1], vectors[1, 1], 0.0])

@@ -1,7 +1,6 @@
 """The mesh model `carved`: the simplest of five kinds of shape that explains the picture."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from scipy.spatial import ConvexHull, QhullError
 
@@ -35,21 +34,6 @@ Shape = tuple[TriangleMesh, Pose, float]
 """Mesh, pose, and cost: disagreement with the picture [m]."""
 
 
-@dataclass(frozen=True, slots=True)
-class _ShapeKind:
-    """A kind of shape.
-
-    Attributes:
-        method: Its name in the dataset.
-        freedom: Cost of following the picture more freely than a simpler kind [m].
-        make: Fits its best shape; None or GeometryError where there is none.
-    """
-
-    method: str
-    freedom: float
-    make: Callable[[ObjectView, RaySample], Shape | None]
-
-
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
     """Fit boxes, a surface of revolution, a half-turn symmetric solid and columns, and select the best.
 
@@ -59,30 +43,22 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
     rays = sample_rays(view)
     best: tuple[float, str, TriangleMesh, Pose] | None = None
     reasons: list[str] = []
-    for kind in KINDS:
-        if best is not None and best[0] < kind.freedom + UNAVOIDABLE_M:
+    for method, freedom, make in KINDS:
+        if best is not None and best[0] < freedom + UNAVOIDABLE_M:
             continue
         try:
-            shape = kind.make(view, rays)
+            shape = make(view, rays)
         except GeometryError as error:
             reasons.append(str(error))
             continue
-        if shape is not None and (best is None or shape[2] + kind.freedom < best[0]):
-            best = (shape[2] + kind.freedom, kind.method, shape[0], shape[1])
+        if shape is not None and (best is None or shape[2] + freedom < best[0]):
+            best = (shape[2] + freedom, method, shape[0], shape[1])
     if best is None:
         raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
-    _, method, mesh, pose = best
+    _, best_method, mesh, pose = best
     if view.support.leaning:
         mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
-    return Completion(mesh, pose, method)
-
-
-def _make_upright_box(view: ObjectView, rays: RaySample) -> Shape:
-    return _discount_box(fit_upright_box(view, rays))
-
-
-def _make_leaning_box(view: ObjectView, rays: RaySample) -> Shape:
-    return _discount_box(fit_leaning_box(view, rays))
+    return Completion(mesh, pose, best_method)
 
 
 def _discount_box(box: SolidBox) -> Shape:
@@ -113,11 +89,12 @@ def _make_columns(view: ObjectView, rays: RaySample) -> Shape:
     return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose))
 
 
-KINDS = (
-    _ShapeKind("carved/box", 0.0, _make_upright_box),
-    _ShapeKind("carved/revolution", 1e-4, _make_revolution),
-    _ShapeKind("carved/leaning_box", 3e-4, _make_leaning_box),
-    _ShapeKind("carved/half_turn", 5e-4, _make_half_turn),
-    _ShapeKind("carved/columns", 2.0e-3, _make_columns),
+KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Shape | None]], ...] = (
+    ("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
+    ("carved/revolution", 1e-4, _make_revolution),
+    ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
+    ("carved/half_turn", 5e-4, _make_half_turn),
+    ("carved/columns", 2.0e-3, _make_columns),
 )
-"""Kinds in the order of trial: the fewer freedoms a kind has, the earlier and the cheaper."""
+"""Name in the dataset, cost of its freedom to follow the picture [m] and best fit of each kind, in the order of trial:
+the fewer freedoms a kind has, the earlier and the cheaper."""

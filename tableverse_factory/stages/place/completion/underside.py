@@ -135,15 +135,14 @@ def _sample_inward(
     footprint: Footprint, heights: Map, at: Int64[np.ndarray, "n 2"], inward: Float64[np.ndarray, "n 2"], steps: Values
 ) -> Values:
     """Sample heights some steps inward from each border column [m]."""
-    there = np.rint(at + inward * steps[:, None]).astype(int)
-    there = np.clip(there, 0, np.array(footprint.top.shape) - 1)
-    inside = footprint.closed[tuple(there.T)]
-    found: Values = np.where(inside, heights[tuple(there.T)], heights[tuple(at.T)])
+    inner = np.rint(at + inward * steps[:, None]).astype(int)
+    inner = np.clip(inner, 0, np.array(footprint.top.shape) - 1)
+    inside = footprint.closed[tuple(inner.T)]
+    found: Values = np.where(inside, heights[tuple(inner.T)], heights[tuple(at.T)])
     return found
 
 
 def _compute_uprightness(footprint: Footprint) -> Map:
-    """Compute the cosine between the top surface's normal and the vertical."""
     weight = ndimage.gaussian_filter(footprint.closed.astype(float), SMOOTHING_CELLS)
     top = np.where(footprint.closed, footprint.top, 0.0)
     smooth = ndimage.gaussian_filter(top, SMOOTHING_CELLS) / np.maximum(weight, 1e-6)

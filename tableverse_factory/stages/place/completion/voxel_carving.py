@@ -140,7 +140,6 @@ def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
 
 
 def _is_torn(field: Field) -> bool:
-    """Whether the solid falls into more than one part that counts."""
     labels, _ = ndimage.label(field > 0.0)
     sizes = np.sort(np.bincount(labels.ravel())[1:])
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())

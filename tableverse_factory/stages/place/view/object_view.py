@@ -155,7 +155,6 @@ def measure_clearances(
 
 
 def _crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """Compute the intrinsics of a part of the picture."""
     size = columns.stop - columns.start, rows.stop - rows.start
     return Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
 

@@ -10,6 +10,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_holes
 from tableverse_factory.stages.perceive.perceive import perceive
 from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 
@@ -141,3 +142,15 @@ def test_real_table_tops_hold_as_many_objects_as_one_counts(shared_dir, tmp_path
     observation = observe(row, Config(), np.random.default_rng(0), Services(tmp_path)).value
     outcome = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path))
     assert count[0] <= len(outcome.value.objects) <= count[1]
+
+
+def test_small_holes_close_only_within_one_object():
+    ids = np.ones((30, 30), dtype=np.int32)
+    ids[:, 15:] = 2
+    ids[5:8, 5:8] = 0
+    ids[20:22, 14:16] = 0
+    ids[10:20, 20:29] = 0
+    closed = fill_holes(ids)
+    assert (closed[5:8, 5:8] == 1).all()
+    assert (closed[20:22, 14:16] == 0).all(), "between two objects"
+    assert (closed[10:20, 20:29] == 0).all(), "too large for a lost reading"

@@ -295,10 +295,10 @@ def test_gated_and_unknown_models_are_told_apart_without_the_token(tmp_path):
     script = """if True:
         from tableverse_factory.core.errors import ModelAccessError
         from tableverse_factory.models.local.device import Device
-        from tableverse_factory.stages.perceive.sam.model import load
+        from tableverse_factory.stages.perceive.sam.model import load_sam
         for weights in ("some/gated", "some/unknown"):
             try:
-                load("sam3", weights, Device("cpu", "float32"))
+                load_sam("sam3", weights, Device("cpu", "float32"))
             except ModelAccessError as error:
                 print(error)
     """
