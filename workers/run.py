@@ -48,7 +48,7 @@ WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
 
 @dataclass(frozen=True, slots=True)
 class BuildRequest:
-    """What to build, where, and with what.
+    """Request of a build.
 
     Attributes:
         manifest: Image manifest (Parquet); None to add stages to a finished dataset, whose rows are restored from it.
@@ -83,7 +83,7 @@ class BuildRequest:
 
 @dataclass(frozen=True, slots=True)
 class BuildSummary:
-    """How a run of the build ended.
+    """Result of one run of a build.
 
     Attributes:
         out: Folder of the dataset.

@@ -23,8 +23,8 @@ from tableverse_factory.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from workers import BuildSummary
     from workers.progress.tally import DisplayGroup
+    from workers.run import BuildSummary
 
 SOME_FAILED = 3
 OVER_BUDGET = 4
@@ -80,7 +80,7 @@ def build(
 
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
-    from workers import build as run
+    from workers.api import build as run
     from workers.driver.signals import StopSignals
 
     summary = run(

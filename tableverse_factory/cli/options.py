@@ -10,7 +10,7 @@ from tableverse_factory.cli.completions import complete_config_keys, complete_sc
 
 
 class ExecutorName(StrEnum):
-    """Where the stages run."""
+    """Executor of the stages."""
 
     LOCAL = "local"
     RAY = "ray"
@@ -65,7 +65,7 @@ Address = Annotated[
 Pools = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML: what the actors of each pool hold (docs/building.md).")
 ]
-Limit = Annotated[int | None, typer.Option(min=1, metavar="N", help="Stop after so many scenes.")]
+Limit = Annotated[int | None, typer.Option(min=1, metavar="N", help="Most scenes of this run.")]
 Shards = Annotated[str | None, typer.Option(metavar="3-7,9", help="Work on these shards only.")]
 MaxUsd = Annotated[
     float | None,

@@ -66,7 +66,7 @@ def query(
         ),
     ] = "",
     limit: Annotated[
-        int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="At most so many rows.")
+        int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="Most rows to print.")
     ] = None,
     output: Annotated[Format, typer.Option("--format", "-f", help="A table for people, or all rows for a script.")] = (
         Format.TABLE

@@ -32,9 +32,8 @@ def synth(
     """Make synthetic captures, or layouts, with known truth.
 
     Captures are RGB-D pictures of cluttered table-tops with masks, detections and the truth. `--kind layouts` makes
-    the same scenes as layout files instead, colliding as real registrations do, and the poses at which the things
-    truly rest: OUT/layouts, OUT/meshes, OUT/truth. Scenes that are there already are kept, so the same command again
-    goes on where it stopped.
+    the same scenes as layout files, with the collisions of real registrations, and the true resting poses of the
+    objects: OUT/layouts, OUT/meshes, OUT/truth. Existing scenes are kept, so the same command again resumes.
 
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """

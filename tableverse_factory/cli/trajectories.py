@@ -49,7 +49,7 @@ def trajectories(
 
     Example: `tableverse trajectories out --workers 2 --set trajectories.max_tasks=5`
     """
-    from workers import build
+    from workers.api import build
     from workers.driver.signals import StopSignals
 
     summary = build(

@@ -76,7 +76,7 @@ def killed_before(step: str, order: BuildRequest, monkeypatch) -> None:
 def test_without_from_it_goes_on_too_and_another_stage_begins_anew(half, out, monkeypatch):
     with pytest.raises(BuildError, match=r"max_time_s was 7\.0 and is now 9\.0.* --from settle"):
         run_build(asked(half, out, 9.0, None), Silent())
-    killed_before("take_back", asked(half, out, 7.0, "export"), monkeypatch)
+    killed_before("invalidate_scenes", asked(half, out, 7.0, "export"), monkeypatch)
     assert not (out / WORK / MARKER).exists()
     run_build(replace(asked(half, out, 7.0, "export"), limit=1), Silent())
     assert read_build_state(out).remaining == 3, "those that are sad or empty keep their end, one is done, three wait"
@@ -97,10 +97,10 @@ def test_a_new_out_is_begun_from_the_start_and_its_stop_costs_nothing(half, tmp_
 STEPS = [
     "second journal",
     "write_run",
-    "mark",
+    "write_rerun_marker",
     *(
         pytest.param(step, marks=pytest.mark.slow)
-        for step in ("unmark", "publish_ready", "take_back", "forget_records")
+        for step in ("clear_rerun_marker", "publish_ready", "invalidate_scenes", "delete_checkpoints")
     ),
 ]
 
@@ -121,7 +121,7 @@ def killed_while_published(folder: Path, monkeypatch) -> Path:
     build(manifest, out)
     invalidate.reopen_scenes(out, ["scene_002"])
     with monkeypatch.context() as patched:
-        patched.setattr(commit, "put_into_place", die)
+        patched.setattr(commit, "move", die)
         with pytest.raises(Killed):
             build(manifest, out)
     assert not list((out / "scenes").iterdir())
