@@ -8,11 +8,11 @@ import pytest
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.core.seeding import rng_for
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.manifest import make_manifest
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tests.helpers.captures_on_disk import write_layout
 
 
@@ -36,7 +36,7 @@ class Watched:
 @pytest.fixture(scope="module")
 def entries(tmp_path_factory) -> list[ImageRow]:
     folder = tmp_path_factory.mktemp("line")
-    synthesize(folder / "in", 1, seed=5)
+    synthesize_captures(folder / "in", 1, seed=5)
     write_layout(folder / "in" / "box" / "box.json")
     return list(make_manifest([str(folder / "in")], Config().observe).rows)
 
@@ -48,9 +48,9 @@ def test_stages_read_what_they_declare(entries, tmp_path, kind):
     for stage in PIPELINES[kind]:
         read: set[str] = set()
         watched: Any = Watched(Config(), "", read)
-        outcome = stage.run(item, watched, rng_for(0, row.scene_id, stage.name), Services(Path(tmp_path)))
+        outcome = stage.run(item, watched, make_rng(0, row.scene_id, stage.name), Services(Path(tmp_path)))
         assert isinstance(outcome, Done), outcome
-        undeclared = read - set(stage.values(Config()))
+        undeclared = read - set(stage.select_values(Config()))
         assert not undeclared, f"{stage.name} reads {undeclared} and does not say so"
         item = outcome.value
 
@@ -59,5 +59,5 @@ def test_what_a_stage_declares_is_there():
     for line in PIPELINES.values():
         for stage in line:
             assert stage.section in Config.model_fields
-            assert stage.values(Config())
-            assert not any(name.endswith("deadline_s") for name in stage.values(Config()))
+            assert stage.select_values(Config())
+            assert not any(name.endswith("deadline_s") for name in stage.select_values(Config()))

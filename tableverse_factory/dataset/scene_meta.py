@@ -1,6 +1,7 @@
 """`meta.json` as `tableverse verify` and growing datasets read it, without importing physics."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 from schemas.geometry import Pose
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 
 FORMAT = "tableverse-scene-1"
+FARTHEST_M = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +46,11 @@ def read_meta(data: bytes) -> SceneMeta:
             Certificate(**{**stored, "displacement_m": pairs, **names}),
             PoseHistory(
                 placed={
-                    name: _read_pose(item["poses"]["placed"])
+                    name: _parse_pose(item["poses"]["placed"])
                     for name, item in objects.items()
                     if item["poses"]["placed"] is not None
                 },
-                rectified={name: _read_pose(item["poses"]["rectified"]) for name, item in objects.items()},
+                rectified={name: _parse_pose(item["poses"]["rectified"]) for name, item in objects.items()},
                 contained_in={
                     name: holder
                     for name, item in objects.items()
@@ -60,8 +63,25 @@ def read_meta(data: bytes) -> SceneMeta:
         raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error
 
 
-def _read_pose(value: Mapping[str, Any]) -> Pose:
+def read_meta_pose(value: Any, owner: str) -> Pose:
+    """Read `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m].
+
+    Args:
+        value: As parsed.
+        owner: For errors: an object's id, or `the camera`.
+
+    Raises:
+        InputError: `bad_meta` if it is no pose.
+    """
+    try:
+        return _parse_pose(value, FARTHEST_M)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        problem = f"{sanitize_line(owner, 60)} makes no sense: {sanitize_line(str(error), 120)}"
+        raise InputError(f"meta.json: a pose of {problem}", "bad_meta") from None
+
+
+def _parse_pose(value: Mapping[str, Any], farthest_m: float = math.inf) -> Pose:
     position, quaternion = (np.array(value[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
-    if position.shape != (3,) or quaternion.shape != (4,) or not np.isfinite(position).all():
-        raise ValueError(f"{value!r} is no pose")
+    if position.shape != (3,) or quaternion.shape != (4,) or not np.abs(position).max() < farthest_m:
+        raise ValueError("numbers that make no pose")
     return Pose(position, normalize_quaternion(quaternion))

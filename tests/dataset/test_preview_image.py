@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.dataset.meta_poses import read_meta_pose
 from tableverse_factory.dataset.preview_image import read_photograph
+from tableverse_factory.dataset.scene_meta import read_meta_pose
 
 
 def encoded(width: int, height: int, kind: str = "JPEG") -> bytes:

@@ -23,8 +23,8 @@ from tableverse_factory.dataset.shards import TarShard
 from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import rotation_angle
-from tableverse_factory.physics.mjcf.drawables import load_scenery
 from tableverse_factory.physics.mjcf.load import load_model
+from tableverse_factory.physics.mjcf.scenery import load_scenery
 from tableverse_factory.physics.render.domain_randomization import (
     CAMERA_SHIFT_M,
     CAMERA_TURN_RAD,

@@ -26,11 +26,11 @@ from tableverse_factory.core.storage.files import (
     StoragePath,
     list_names,
     list_sizes,
+    make_write_error,
     read_whole,
     remove,
     remove_folder,
     write_atomic,
-    write_error,
 )
 from tableverse_factory.dataset.shards import shard_stem
 from tableverse_factory.stage import Stage
@@ -171,7 +171,7 @@ class CheckpointStore:
         try:
             append_checkpoint(self._open_pack(folder), framed)
         except OSError as error:
-            raise write_error(self._folder / folder, error) from error
+            raise make_write_error(self._folder / folder, error) from error
 
     def delete(self, shard: int, stages: Collection[str] | None = None) -> None:
         """Delete the checkpoints of a shard, or of some of its stages.

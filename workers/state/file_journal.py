@@ -4,22 +4,15 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from schemas.codec import decode, encode
+from schemas.codec import decode
 from schemas.work import SceneResult
-from tableverse_factory.core.storage.files import write_error
-from workers.state.journal_frames import (
-    REOPEN,
-    RESULT,
-    JournalEntry,
-    JournalState,
-    encode_entry,
-    fold_frames,
-    scan_journal,
-)
+from tableverse_factory.core.framing import encode_header
+from tableverse_factory.core.storage.files import make_write_error
+from workers.state.journal_frames import Journal, JournalEntry, JournalState, fold_frames, scan_journal
 
 
-class FileJournal:
-    """Journal file open for appending; a recorded result survives a kill (see `workers.state.journal.Journal`)."""
+class FileJournal(Journal):
+    """Journal file, in which a recorded result survives a kill."""
 
     def __init__(self, path: Path) -> None:
         """Open or create the journal and cut off a torn last frame.
@@ -28,26 +21,14 @@ class FileJournal:
             BuildError: if the disk refuses.
         """
         state = read_file_journal(path)
-        self.results, self.reopened = state.results, set(state.reopened)
+        super().__init__(state)
         self._path, self._end = path, state.end
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
             self._file.truncate(self._end)
         except OSError as error:
-            raise write_error(path, error) from error
-
-    def record(self, result: SceneResult) -> None:
-        """Append a result; if the disk is full, the journal stays as before."""
-        payload = encode(result)
-        self._append(RESULT, result.scene_id, payload)
-        self.results[result.scene_id] = JournalEntry(self._end - len(payload), len(payload))
-
-    def reopen(self, scene_id: str) -> None:
-        """Append that a scene must be recomputed."""
-        self._append(REOPEN, scene_id, b"")
-        self.results.pop(scene_id, None)
-        self.reopened.add(scene_id)
+            raise make_write_error(path, error) from error
 
     def read(self, scene_id: str) -> SceneResult:
         """Read the latest result of a scene."""
@@ -65,17 +46,20 @@ class FileJournal:
         self._file.close()
         self._path.unlink()
 
-    def _append(self, kind: bytes, scene_id: str, payload: bytes) -> None:
-        parts = encode_entry(kind, scene_id, payload)
+    def _append(self, kind: bytes, scene_id: str, payload: bytes) -> JournalEntry:
+        """Append a frame; if the disk is full, the journal stays as before."""
+        header = encode_header(payload, kind + scene_id.encode())
         try:
-            for part in parts:
+            for part in (header, payload):
                 left = memoryview(part)
                 while left:
                     left = left[self._file.write(left) :]
         except OSError as error:
             self._file.truncate(self._end)
-            raise write_error(self._path, error) from error
-        self._end += sum(map(len, parts))
+            raise make_write_error(self._path, error) from error
+        entry = JournalEntry(self._end + len(header), len(payload))
+        self._end = entry.offset + entry.size
+        return entry
 
 
 def read_file_result(path: Path, entry: JournalEntry) -> SceneResult:

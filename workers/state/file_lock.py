@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Self
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import write_error
+from tableverse_factory.core.storage.files import make_write_error
 from workers.state.lock_owner import describe_owner, encode_owner, identify_process
 
 
@@ -23,7 +23,7 @@ class FileLock:
             while not self._acquire():
                 pass
         except OSError as error:
-            raise write_error(self._path, error) from error
+            raise make_write_error(self._path, error) from error
         return self
 
     def __exit__(

@@ -2,50 +2,17 @@
 
 import re
 from collections.abc import Iterable
-from typing import Protocol
 
 from upath import UPath
 
 from schemas.work import SceneResult
 from tableverse_factory.core.storage.files import StoragePath
 from workers.state.file_journal import FileJournal, read_file_journal, read_file_result
-from workers.state.journal_frames import JournalEntry, JournalState
+from workers.state.journal_frames import Journal, JournalEntry, JournalState
 from workers.state.object_journal import ObjectJournal, find_objects_end, read_object_journal, read_object_result
 
 SUFFIX = ".journal"
 _NAME = re.compile(rf"shard-(\d{{5,9}}){re.escape(SUFFIX)}")
-
-
-class Journal(Protocol):
-    """Journal of one shard, open for appending by one writer.
-
-    Every method raises BuildError if the disk or the store refuses, or another process writes this journal.
-
-    Attributes:
-        results: The latest result of each scene.
-        reopened: Scenes that were taken back.
-    """
-
-    results: dict[str, JournalEntry]
-    reopened: set[str]
-
-    def record(self, result: SceneResult) -> None:
-        """Append a result; it survives a kill at once on the disk, after about a second in a store."""
-
-    def reopen(self, scene_id: str) -> None:
-        """Append that a scene must be recomputed; durable once the journal is closed."""
-
-    def read(self, scene_id: str) -> SceneResult:
-        """Read the latest result of a scene."""
-
-    def tick(self) -> None:
-        """Write results that have waited long enough; called several times a second."""
-
-    def close(self) -> None:
-        """Write what waits; the journal stays."""
-
-    def remove(self) -> None:
-        """Delete the journal, whose shard is committed."""
 
 
 def open_journal(path: StoragePath) -> Journal:

@@ -1,13 +1,16 @@
-"""Journal entries as frames: a finished scene, or a scene that must be recomputed.
+"""Interface and content of journals: frames, each a finished scene or a scene that must be recomputed.
 
 A `reopen` entry (`failures --retry`) invalidates the scene's earlier results in the journal and in the committed shard.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from tableverse_factory.core.framing import encode_header, scan_frames
+from schemas.codec import encode
+from schemas.work import SceneResult
+from tableverse_factory.core.framing import scan_frames
 
 RESULT, REOPEN = b"+", b"-"
 """First byte of a frame's label; the scene id follows."""
@@ -55,9 +58,48 @@ class JournalState:
 EMPTY_JOURNAL = JournalState({}, frozenset(), 0)
 
 
-def encode_entry(kind: bytes, scene_id: str, payload: bytes) -> tuple[bytes, bytes]:
-    """Encode a frame in two parts: header with the scene id, and payload."""
-    return encode_header(payload, kind + scene_id.encode()), payload
+class Journal(ABC):
+    """Journal of one shard, open for appending by one writer.
+
+    Every method raises BuildError if the disk or the store refuses, or another process writes this journal.
+
+    Attributes:
+        results: The latest result of each scene.
+        reopened: Scenes that were taken back.
+    """
+
+    def __init__(self, state: JournalState) -> None:
+        self.results, self.reopened = state.results, set(state.reopened)
+
+    def record(self, result: SceneResult) -> None:
+        """Append a result; it survives a kill at once on the disk, after about a second in a store."""
+        self.results[result.scene_id] = self._append(RESULT, result.scene_id, encode(result))
+
+    def reopen(self, scene_id: str) -> None:
+        """Append that a scene must be recomputed; durable once the journal is closed."""
+        self._append(REOPEN, scene_id, b"")
+        self.results.pop(scene_id, None)
+        self.reopened.add(scene_id)
+
+    @abstractmethod
+    def read(self, scene_id: str) -> SceneResult:
+        """Read the latest result of a scene."""
+
+    @abstractmethod
+    def tick(self) -> None:
+        """Write results that have waited long enough; called several times a second."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what waits; the journal stays."""
+
+    @abstractmethod
+    def remove(self) -> None:
+        """Delete the journal, whose shard is committed."""
+
+    @abstractmethod
+    def _append(self, kind: bytes, scene_id: str, payload: bytes) -> JournalEntry:
+        """Append a frame and return the position of its payload."""
 
 
 def scan_journal(stream: BinaryIO, start: int, base: int = 0) -> Iterator[JournalFrame]:

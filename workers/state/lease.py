@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Self
 from upath import UPath
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.core.storage.files import get_store, list_names, write_error
+from tableverse_factory.core.storage.files import get_store, list_names, make_write_error
 from workers.state.lock_owner import decode_owner, describe_owner, encode_owner, identify_process
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Lease:
                 time.sleep(_POLL_S)
             self._check_conditional_writes()
         except OSError as error:
-            raise write_error(self._path, error) from error
+            raise make_write_error(self._path, error) from error
         self._store.fence = self._is_safe
         self._thread.start()
         return self

@@ -9,7 +9,8 @@ from tableverse_factory.dataset.integrity import check_files, check_tars
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards, shard_stem
 from workers.state.commit import commit_shard, publish_ready
-from workers.state.journal import SUFFIX, Journal, find_journals, open_journal, read_journal
+from workers.state.journal import SUFFIX, find_journals, open_journal, read_journal
+from workers.state.journal_frames import Journal
 
 WORK = ".work"
 

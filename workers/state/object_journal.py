@@ -9,25 +9,25 @@ import time
 
 from upath import UPath
 
-from schemas.codec import decode, encode
+from schemas.codec import decode
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.framing import encode_header
 from tableverse_factory.core.storage.files import (
     get_store,
     list_names,
     list_sizes,
+    make_write_error,
     read_range,
     read_whole,
     remove_folder,
-    write_error,
 )
 from workers.state.journal_frames import (
-    REOPEN,
     RESULT,
+    Journal,
     JournalEntry,
     JournalFrame,
     JournalState,
-    encode_entry,
     fold_frames,
     scan_journal,
 )
@@ -36,8 +36,8 @@ MAX_BUFFER_BYTES = 8 * 1024**2
 MAX_BUFFER_AGE_S = 1.0
 
 
-class ObjectJournal:
-    """Journal in a store, open for appending (see `workers.state.journal.Journal`)."""
+class ObjectJournal(Journal):
+    """Journal in a store, which buffers results."""
 
     def __init__(self, folder: UPath) -> None:
         """Read the journal; the first result creates the first object.
@@ -46,25 +46,11 @@ class ObjectJournal:
             StoreError: if the store refuses or does not answer.
         """
         state = read_object_journal(folder)
-        self.results, self.reopened = state.results, set(state.reopened)
+        super().__init__(state)
         self._folder, self._start = folder, state.end
         self._buffer = bytearray()
         self._since = 0.0
         self._refused = False
-
-    def record(self, result: SceneResult) -> None:
-        """Append a result; it is written when the buffer is full or old enough."""
-        payload = encode(result)
-        end = self._add(RESULT, result.scene_id, payload)
-        self.results[result.scene_id] = JournalEntry(end - len(payload), len(payload), self._start)
-        if len(self._buffer) >= MAX_BUFFER_BYTES:
-            self._flush()
-
-    def reopen(self, scene_id: str) -> None:
-        """Append that a scene must be recomputed."""
-        self._add(REOPEN, scene_id, b"")
-        self.results.pop(scene_id, None)
-        self.reopened.add(scene_id)
 
     def read(self, scene_id: str) -> SceneResult:
         """Read the latest result of a scene."""
@@ -90,13 +76,15 @@ class ObjectJournal:
         self._buffer.clear()
         remove_folder(self._folder)
 
-    def _add(self, kind: bytes, scene_id: str, payload: bytes) -> int:
-        """Append a frame to the buffer and return its end in the journal [bytes]."""
+    def _append(self, kind: bytes, scene_id: str, payload: bytes) -> JournalEntry:
         if not self._buffer:
             self._since = time.monotonic()
-        for part in encode_entry(kind, scene_id, payload):
-            self._buffer += part
-        return self._start + len(self._buffer)
+        self._buffer += encode_header(payload, kind + scene_id.encode())
+        entry = JournalEntry(self._start + len(self._buffer), len(payload), self._start)
+        self._buffer += payload
+        if kind == RESULT and len(self._buffer) >= MAX_BUFFER_BYTES:
+            self._flush()
+        return entry
 
     def _flush(self) -> None:
         if not self._buffer:
@@ -106,7 +94,7 @@ class ObjectJournal:
         try:
             etag = get_store(path).put_if_absent(path.path, bytes(self._buffer))
         except OSError as error:
-            raise write_error(path, error) from error
+            raise make_write_error(path, error) from error
         if etag is None:
             raise BuildError(
                 f"{path} was written by another process, so this one stops. Finished scenes are kept: when no other "

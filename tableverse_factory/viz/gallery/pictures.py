@@ -12,11 +12,11 @@ from PIL import Image
 from schemas.geometry import Camera, Picture, Points, Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.dataset.meta_poses import read_meta_pose
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH, TALLEST, read_photograph
+from tableverse_factory.dataset.scene_meta import read_meta_pose
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
-from tableverse_factory.physics.mjcf.drawables import Scenery, load_scenery
+from tableverse_factory.physics.mjcf.scenery import Scenery, load_scenery
 from tableverse_factory.physics.render.preview import PreviewRenderer
 from tableverse_factory.physics.render.views import (
     RenderQuality,

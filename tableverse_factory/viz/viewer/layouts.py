@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from schemas.geometry import Pose
-from tableverse_factory.dataset.meta_poses import read_meta_pose
+from tableverse_factory.dataset.scene_meta import read_meta_pose
 
 SETTLED, RECTIFIED, OBSERVED = "settled", "rectified", "observed"
 LAYOUTS = (OBSERVED, RECTIFIED, SETTLED)
