@@ -10,7 +10,7 @@ from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_stages import bench_stages
 from tableverse_factory.cli.bench_trajectories import bench_trajectories
 from tableverse_factory.cli.options import AsJson, ConfigFile
-from tableverse_factory.cli.tables import make_table, print_json, print_table
+from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.decompose import PieceScore
@@ -83,7 +83,7 @@ def bench_lccr(
 
 def _show_summaries(summaries: dict[str, dict[str, float | None]]) -> None:
 
-    table = make_table("", *summaries)
+    table = make_figures_table("", *summaries)
     for row in next(iter(summaries.values())):
         table.add_row(row, *(_format_figure(values[row]) for values in summaries.values()))
     print_table(table)
@@ -127,7 +127,7 @@ def bench_decompose(
 def _show_pieces(scores: list["PieceScore"]) -> None:
 
     figures = ("CPU s", "faster", "pieces", "volume", "error %", "Hausdorff %", "cavity kept %")
-    table = make_table("mesh", "method", *figures)
+    table = make_figures_table("mesh", "method", *figures)
     for s in scores:
         counts = (f"{s.cpu_s:.1f}", f"{s.faster:.1f}", str(s.pieces), f"{s.volume_ratio:.2f}")
         shares = (f"{100 * s.volume_error:.0f}", f"{100 * s.hausdorff:.1f}", f"{100 * s.cavity_kept:.0f}")

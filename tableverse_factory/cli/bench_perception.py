@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
-from tableverse_factory.cli.tables import make_table, print_json, print_table
+from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.completion import CompletionScore
@@ -95,7 +95,7 @@ def bench_completion(
 
 def _show_completions(scores: list["CompletionScore"]) -> None:
     title = "two views of each mesh: IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
-    table = make_table("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
+    table = make_figures_table("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
     ours = [score for score in scores if score.method.startswith("carved")]
     groups["carved, as chosen"] = ours
@@ -152,7 +152,7 @@ def _show_placements(
 
 def _show_way(title: str, entries: list["PlacementError"]) -> None:
     placed = [entry for entry in entries if entry.completion]
-    table = make_table("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
+    table = make_figures_table("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
     kinds = {kind: [e for e in placed if e.completion == kind] for kind in sorted({e.completion for e in placed})}
     for kind, of_kind in {**(kinds if len(kinds) > 1 else {}), "all": placed}.items():
         table.add_row(kind, str(len(of_kind)), *_placement_figures(of_kind))
@@ -197,7 +197,7 @@ def _derive_scores(row: "MaskScore") -> dict[str, object]:
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:
     known = rows[-1].containment is not None
     names = ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s")
-    table = make_table("capture", *names, *(["contained: true/found/correct"] if known else []))
+    table = make_figures_table("capture", *names, *(["contained: true/found/correct"] if known else []))
     for row in rows:
         figures = [f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}"]
         pairs = row.containment

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.options import AsJson
-from tableverse_factory.cli.tables import make_table, print_json, print_table
+from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.factory import FactoryRun
@@ -50,7 +50,7 @@ def bench_factory(
 
 
 def _show_runs(runs: list["FactoryRun"]) -> None:
-    table = make_table(
+    table = make_figures_table(
         "build", "workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver", "peak MB", "MB per 10,000"
     )
     for run in runs:
@@ -96,7 +96,7 @@ def bench_query(
 
 
 def _show_times(times: list["QueryTimes"]) -> None:
-    table = make_table(
+    table = make_figures_table(
         "dataset", "shards", "scenes", "objects", "filter ms", "CPU ms", "anew", "count", "scene", "first scene"
     )
     for t in times:

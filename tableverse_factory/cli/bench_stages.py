@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
-from tableverse_factory.cli.tables import make_table, print_json, print_table
+from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.stages import SceneCost
@@ -57,7 +57,7 @@ def _show_costs(costs: list["SceneCost"]) -> None:
     from tableverse_factory.evaluation.bench.stages import compute_medians
 
     columns = {cache: compute_medians([cost for cost in costs if cost.cache == cache]) for cache in ("cold", "warm")}
-    table = make_table("CPU s, median", *columns)
+    table = make_figures_table("CPU s, median", *columns)
     for name in columns["cold"]:
         table.add_row(name, *(f"{column.get(name, 0.0):.2f}" for column in columns.values()))
     print_table(table)

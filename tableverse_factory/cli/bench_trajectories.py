@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
-from tableverse_factory.cli.tables import make_table, print_json, print_table
+from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
 
 if TYPE_CHECKING:
     from schemas.scene import ExportedScene
@@ -66,7 +66,7 @@ def _load_scenes(dataset: str, most: int | None) -> list["ExportedScene"]:
 def _show_times(costs: list["TaskCost"]) -> None:
     from tableverse_factory.evaluation.bench.trajectories import compute_quantiles, summarize_paths
 
-    table = make_table("CPU ms", "tasks", "median", "p95")
+    table = make_figures_table("CPU ms", "tasks", "median", "p95")
     for name, (count, median, high) in compute_quantiles(costs).items():
         table.add_row(name, str(count), f"{1e3 * median:.1f}", f"{1e3 * high:.1f}")
     print_table(table)
@@ -79,7 +79,7 @@ def _show_rates(costs: list["TaskCost"]) -> None:
     from tableverse_factory.evaluation.bench.trajectories import count_outcomes
 
     counts = count_outcomes(costs)
-    table = make_table("relation", "tasks", "succeed", "nothing beside", "succeed")
+    table = make_figures_table("relation", "tasks", "succeed", "nothing beside", "succeed")
     for relation, count in counts.tasks.items():
         free = counts.free[relation]
         of_free = f"{counts.free_succeeded[relation] / free:.0%}" if free else ""

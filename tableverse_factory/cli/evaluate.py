@@ -1,10 +1,9 @@
-"""`tableverse evaluate`: any method's scenes against one another, against a judge, against the truth."""
+"""`tableverse evaluate`: collisions, judge's marks and layout errors of the scenes of any methods."""
 
-import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -19,19 +18,17 @@ _SHOWN_LINES = 3
 evaluate = typer.Typer(name="evaluate", help="Compare the scenes of any methods.", no_args_is_help=True)
 
 Methods = Annotated[
-    list[str] | None, typer.Option("--method", help="NAME=PATH; as often as there are methods.", metavar="NAME=PATH")
+    list[str] | None, typer.Option("--method", help="A method as NAME=PATH; may repeat.", metavar="NAME=PATH")
 ]
 Paths = Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")]
 Reference = Annotated[
     Path | None,
-    typer.Option(help="Folder of the real pictures; without it, those that a dataset keeps.", file_okay=False),
+    typer.Option(help="Folder of the real pictures; by default, those in a dataset.", file_okay=False),
 ]
-Rounds = Annotated[
-    int, typer.Option(min=1, max=12, help="Times each scene is asked about, at most once for each method.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Of the order of columns and of the intervals.")]
+Rounds = Annotated[int, typer.Option(min=1, max=12, help="Questions per scene, at most one per method.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the order of columns and of the intervals.")]
 Cell = Annotated[int, typer.Option(min=64, max=1024, help="Side of a cell of the grid [px].")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="Its section `curate` names the judge.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML whose section `curate` names the judge.")]
 Overrides = Annotated[list[str] | None, typer.Option("--set", help="A key of the configuration.", metavar="KEY=VALUE")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")]
 
@@ -44,31 +41,31 @@ def evaluate_collisions(
     ] = None,
     method: Methods = None,
     epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m].")
+        float, typer.Option("--epsilon", min=0.0, help="Depth beyond which objects collide [m].")
     ] = 0.0001,
     meshes_only: Annotated[
-        bool, typer.Option("--meshes-only", help="Leave out the convex pieces, which take time to make.")
+        bool, typer.Option("--meshes-only", help="Skip the convex pieces, which take time to make.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Count the scenes in which any two objects lie inside one another, on meshes and on convex pieces.
+    """Count the scenes in which two objects overlap, on meshes and on convex pieces.
 
-    Exit code 1 if a scene could not be measured; it is named, and does not count.
+    Exit code 1 if a scene could not be measured; it is named and does not count.
 
     Example: `tableverse evaluate collisions --method ours=out --method midi=midi/ --epsilon 0.001`
     """
     import json
 
-    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.evaluation.methods.collisions import measure_method
-    from tableverse_factory.evaluation.methods.methods import named_methods
-    from tableverse_factory.evaluation.methods.sources import dropped_scenes, find_scenes
+    from tableverse_factory.evaluation.methods.methods import parse_methods
+    from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, find_scenes
 
-    cache = None if meshes_only else cache_folder()
-    methods = named_methods(paths or [], method or [])
+    cache = None if meshes_only else get_cache_dir()
+    methods = parse_methods(paths or [], method or [])
     sources = {name: find_scenes(path) for name, path in methods.items()}
     measured = [
-        measure_method(name, _watched(its, name), epsilon_m, cache, dropped_scenes(methods[name]))
+        measure_method(name, _track(its, name), epsilon_m, cache, count_dropped_scenes(methods[name]))
         for name, its in sources.items()
     ]
     if as_json:
@@ -81,15 +78,12 @@ def evaluate_collisions(
 
 def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> None:
     import numpy as np
-    from rich.console import Console
-    from rich.table import Table
 
-    from tableverse_factory.core.text import sanitize_line
+    from tableverse_factory.cli.tables import make_figures_table, print_table
 
     title = f"scenes in which two objects overlap by more than {1e3 * epsilon_m:g} mm"
-    table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
-    for name in ("scenes", "objects", "colliding %", "95 %", "on pieces %", "median mm", "deepest mm"):
-        table.add_column(name, justify="right")
+    figures = ("scenes", "objects", "colliding %", "95 %", "on pieces %", "median mm", "deepest mm")
+    table = make_figures_table("method", *figures)
     for each in methods:
         depths = [1e3 * scene.depth_m for scene in each.measured] or [float("nan")]
         low, high = each.interval() or (float("nan"), float("nan"))
@@ -97,15 +91,13 @@ def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> Non
         rates = _percent(each.rate()), interval, _percent(each.piece_rate())
         spread = f"{np.median(depths):.2f}", f"{max(depths):.2f}"
         counts = str(len(each.measured)), str(sum(scene.objects for scene in each.measured))
-        table.add_row(sanitize_line(each.method, 40), *counts, *rates, *spread)
-    Console(markup=False).print(table)
+        table.add_row(_one_line(each.method, 40), *counts, *rates, *spread)
+    print_table(table, title)
     for each in methods:
         if each.dropped:
-            print(
-                f"{sanitize_line(each.method, 40)}: {each.dropped} scenes that the factory dropped are not among them"
-            )
+            print(_one_line(f"{each.method}: without {each.dropped} scenes that the factory dropped"))
         _print_first(
-            f"not measured: {sanitize_line(each.method, 40)}: {sanitize_line(scene.name, 80)}: {sanitize_line(scene.error)}"
+            _one_line(f"not measured: {each.method}: {scene.name}: {scene.error}")
             for scene in each.scenes
             if scene.error
         )
@@ -124,76 +116,71 @@ def evaluate_gpt_score(
     rounds: Rounds = 1,
     seed: Seed = 0,
     cell: Cell = 448,
-    grids_only: Annotated[bool, typer.Option("--grids-only", help="Write the grids and ask nobody.")] = False,
+    grids_only: Annotated[bool, typer.Option("--grids-only", help="Write the grids without asking the judge.")] = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Let a model mark every method's scenes against the real picture, columns shuffled.
+    """Let a model mark the scenes of every method against the real picture, columns shuffled.
 
-    Writes grids/, answers/ (which `curate.judge=replay` reads again) and gpt-score.json. Only scenes that all methods
-    have are asked about. Exit code 1 if a question got no valid answer.
+    Writes grids/, answers/ (for `curate.judge=replay`) and gpt-score.json, for the scenes that all methods have. Exit
+    code 1 if a question got no valid answer.
 
     Example: `tableverse evaluate gpt-score --method ours=out --method midi=midi/ --reference pictures --out score
     --rounds 2 --set curate.judge=gemini --set curate.model=gemini-2.5-pro --set curate.key_env=GEMINI_API_KEY`
     """
-    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.core.config import load_config
-    from tableverse_factory.evaluation.methods.comparison import check_shared, compare
-    from tableverse_factory.evaluation.methods.grid_judges import grid_judge
-    from tableverse_factory.evaluation.methods.methods import named_methods
+    from tableverse_factory.evaluation.methods.comparison import check_shared_scenes, match_methods
+    from tableverse_factory.evaluation.methods.grid_judges import make_grid_judge
+    from tableverse_factory.evaluation.methods.methods import parse_methods
     from tableverse_factory.evaluation.methods.score import ask_all, write_grids
     from tableverse_factory.models.services import Services
 
-    comparison = compare(named_methods(paths or [], method or []), reference, cell)
-    check_shared(comparison)
+    comparison = match_methods(parse_methods(paths or [], method or []), reference, cell)
+    check_shared_scenes(comparison)
     for lacking, names in comparison.missing.items():
         print(f"{lacking} lacks {len(names)} scenes, e.g. {names[0]}: left out for all", file=sys.stderr)
     if grids_only:
         print(f"{write_grids(comparison, rounds, seed, out)} grids in {out / 'grids'}")
         return
     settings = load_config(config, overrides or [])
-    judge = grid_judge(settings.curate, Services(cache_folder(), settings.asking))
-    election = ask_all(comparison, judge, rounds, seed, out, lambda asked: _watched(asked, "judge"))
-    _report_score(election, seed, out, as_json)
-    if election.refused or not election.ballots:
+    judge = make_grid_judge(settings.curate, Services(get_cache_dir(), settings.asking))
+    votes = ask_all(comparison, judge, rounds, seed, out, lambda asked: _track(asked, "judge"))
+    _report_score(votes, seed, out, as_json)
+    if votes.refused or not votes.votes:
         raise typer.Exit(1)
 
 
-def _report_score(election: "VoteResults", seed: int, out: Path, as_json: bool) -> None:
+def _report_score(votes: "VoteResults", seed: int, out: Path, as_json: bool) -> None:
     import json
 
     from tableverse_factory.core.storage.files import write_atomic
-    from tableverse_factory.evaluation.methods.score import as_json as score_as_json
+    from tableverse_factory.evaluation.methods.score import results_to_json as score_as_json
 
-    text = json.dumps(score_as_json(election, seed), indent=1)
+    text = json.dumps(score_as_json(votes, seed), indent=1)
     write_atomic(out / "gpt-score.json", f"{text}\n".encode())
     if as_json:
         print(text)
     else:
-        _show_score(election, seed)
+        _show_score(votes, seed)
 
 
-def _show_score(election: "VoteResults", seed: int) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from tableverse_factory.core.text import sanitize_line
-    from tableverse_factory.evaluation.methods.score import interval_text, rank_by_column, results
+def _show_score(votes: "VoteResults", seed: int) -> None:
+    from tableverse_factory.cli.tables import make_figures_table, print_table
+    from tableverse_factory.evaluation.methods.score import compute_rank_by_column, compute_results, format_interval
     from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
-    title = f"marks of 1 to 10 and mean rank, with 95 % intervals, from {len(election.ballots)} answers"
-    table = Table("method", box=None, pad_edge=False, title=title, title_justify="left")
-    for name in METRICS:
-        table.add_column(name.replace("_", " "), justify="right")
-    for method, by_metric in results(election, seed).items():
-        table.add_row(sanitize_line(method, 40), *(interval_text(by_metric[metric]) for metric in METRICS))
-    Console(markup=False).print(table)
-    places = (f"{letter} {rank:.2f}" for letter, rank in rank_by_column(election).items())
-    print(f"mean rank by column, whoever stood there: {', '.join(places)}")
+    title = f"marks of 1 to 10 and mean rank, with 95 % intervals, from {len(votes.votes)} answers"
+    table = make_figures_table("method", *(name.replace("_", " ") for name in METRICS))
+    for method, by_metric in compute_results(votes, seed).items():
+        table.add_row(_one_line(method, 40), *(format_interval(by_metric[metric]) for metric in METRICS))
+    print_table(table, title)
+    places = (f"{letter} {rank:.2f}" for letter, rank in compute_rank_by_column(votes).items())
+    print(f"mean rank by column over all methods: {', '.join(places)}")
     _print_first(
-        f"no valid answer: {sanitize_line(refused.scene, 80)}, round {refused.round}: {sanitize_line(refused.reason)}"
-        for refused in election.refused
+        _one_line(f"no valid answer: {refused.scene}, round {refused.round}: {refused.reason}")
+        for refused in votes.refused
     )
 
 
@@ -207,31 +194,31 @@ def evaluate_layout(
     method: Methods = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare layouts with the truth: positions, sizes, headings, support and containment kept.
+    """Compare layouts with the truth: positions, sizes, headings, support and containment.
 
-    Exit code 1 if a scene that has a truth could not be compared.
+    Exit code 1 if a scene with a truth could not be compared.
 
     Example: `tableverse evaluate layout layouts --truth layouts/truth`, or `… layout out --truth captures`
     """
-    import json
     from dataclasses import asdict
 
-    from tableverse_factory.cli.cache import cache_folder
-    from tableverse_factory.evaluation.methods.comparison import shared_names
-    from tableverse_factory.evaluation.methods.layout import compare_layouts, summary
-    from tableverse_factory.evaluation.methods.methods import named_methods
+    from tableverse_factory.cli.tables import print_json
+    from tableverse_factory.core.cache_dir import get_cache_dir
+    from tableverse_factory.evaluation.methods.comparison import index_by_shared_name
+    from tableverse_factory.evaluation.methods.layout import compare_layouts, summarize_layouts
+    from tableverse_factory.evaluation.methods.methods import parse_methods
     from tableverse_factory.evaluation.methods.sources import find_scenes
     from tableverse_factory.evaluation.methods.truth import find_truths
 
     truths = find_truths(truth)
     compared = {
-        name: compare_layouts(shared_names(find_scenes(path)), truths, cache_folder())
-        for name, path in named_methods(paths or [], method or []).items()
+        name: compare_layouts(index_by_shared_name(find_scenes(path)), truths, get_cache_dir())
+        for name, path in parse_methods(paths or [], method or []).items()
     }
-    summaries = {name: summary(scenes) for name, scenes in compared.items()}
+    summaries = {name: summarize_layouts(scenes) for name, scenes in compared.items()}
     if as_json:
         found = {name: {"summary": its, "scenes": [*map(asdict, compared[name])]} for name, its in summaries.items()}
-        print(json.dumps(_without_nan(found), indent=1))
+        print_json(found, indent=1)
     else:
         _show_layouts(summaries, compared)
     if any(scene.error for scenes in compared.values() for scene in scenes):
@@ -241,22 +228,18 @@ def evaluate_layout(
 def _show_layouts(
     summaries: "dict[str, dict[str, float | None]]", compared: "Mapping[str, Sequence[SceneLayout]]"
 ) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from tableverse_factory.cli.tables import make_figures_table, print_table
+    from tableverse_factory.evaluation.methods.layout import NO_RESULT
 
-    from tableverse_factory.evaluation.methods.layout import NOT_THERE
-
-    table = Table("", box=None, pad_edge=False)
-    for name in summaries:
-        table.add_column(_one_line(name), justify="right")
+    table = make_figures_table("", *map(_one_line, summaries))
     for row in next(iter(summaries.values())):
         cells = (its[row] for its in summaries.values())
         table.add_row(row, *("–" if cell is None else f"{cell:.4g}" for cell in cells))
-    Console(markup=False).print(table)
+    print_table(table)
     for name, scenes in compared.items():
         _print_first(
             _one_line(f"not compared: {name}: {scene.name}: {scene.error}")
-            for scene in sorted(scenes, key=lambda its: its.error == NOT_THERE)
+            for scene in sorted(scenes, key=lambda its: its.error == NO_RESULT)
             if scene.error
         )
 
@@ -272,23 +255,23 @@ def evaluate_tables(
         typer.Option(help="Answers that `evaluate gpt-score` recorded, if elsewhere.", exists=True, file_okay=False),
     ] = None,
     epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="Depth that is no collision yet [m].")
+        float, typer.Option("--epsilon", min=0.0, help="Depth beyond which objects collide [m].")
     ] = 0.0001,
-    pieces: Annotated[bool, typer.Option("--pieces", help="Also rates on convex pieces, in tables.json.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
+    pieces: Annotated[bool, typer.Option("--pieces", help="Add rates on convex pieces to tables.json.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the bootstrap.")] = 0,
 ) -> None:
-    """Write the paper's tables: methods against one another, and what each step of the factory leaves of collisions.
+    """Write the paper's tables: methods compared, and the collisions left after each step of the factory.
 
-    The second is about methods that are datasets of ours, whose scenes keep their poses of every step. No model is
-    asked: the judge's columns come from recorded answers. Exit code 1 if a scene could not be measured, or a recorded
-    answer does not count.
+    The second table is of methods that are datasets of ours, whose scenes hold their poses of every step. No model is
+    asked: the marks come from recorded answers. Exit code 1 if a scene could not be measured, or a recorded answer is
+    invalid.
 
     Example: `tableverse evaluate tables results --out results/tables`
     """
-    from tableverse_factory.cli.cache import cache_folder
+    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.evaluation.methods.tables import make_tables, write_tables
 
-    tables = make_tables(folder, epsilon_m, seed, answers, cache_folder() if pieces else None)
+    tables = make_tables(folder, epsilon_m, seed, answers, get_cache_dir() if pieces else None)
     for path in write_tables(tables, out):
         print(path)
         if path.suffix == ".md":
@@ -297,18 +280,18 @@ def evaluate_tables(
         raise typer.Exit(1)
 
 
-def _watched(items: Sequence[T], name: str) -> Iterator[T]:
-    """The items one by one, counted on stderr."""
-    from tableverse_factory.cli.progress_bar import counter
+def _track(items: Sequence[T], name: str) -> Iterator[T]:
+    """Yield the items with a progress bar on stderr."""
+    from tableverse_factory.cli.progress_bar import count_progress
 
-    with counter(_one_line(name), len(items)) as done:
+    with count_progress(_one_line(name), len(items)) as done:
         for item in items:
             yield item
             done()
 
 
 def _print_first(lines: Iterable[str]) -> None:
-    """The first lines, then how many more there are: a wrong folder would print one for each of its scenes."""
+    """Print the first lines and the number of the others: a wrong folder would print one per scene."""
     found = list(lines)
     for line in found[:_SHOWN_LINES]:
         print(line)
@@ -316,16 +299,7 @@ def _print_first(lines: Iterable[str]) -> None:
         print(f"… and {len(found) - _SHOWN_LINES} more like this; --json names all")
 
 
-def _without_nan(value: Any) -> Any:
-    """What is not finite becomes null: JSON knows no other word."""
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _one_line(text: str) -> str:
+def _one_line(text: str, most: int = 300) -> str:
     from tableverse_factory.core.text import sanitize_line
 
-    return sanitize_line(text, 300)
+    return sanitize_line(text, most)

@@ -1,4 +1,4 @@
-"""`tableverse report`: a gallery that opens from disk."""
+"""`tableverse report`: a gallery of a dataset as static HTML."""
 
 import sys
 from collections.abc import Iterable
@@ -14,27 +14,27 @@ def report(
     out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, finished or not.")],
     dest: Annotated[
         Path | None,
-        typer.Option(help="Folder of the gallery; OUT-gallery, beside the dataset, by default; of s3://… in this one."),
+        typer.Option(help="Folder of the gallery; by default OUT-gallery beside the dataset, or here for s3://…."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes that draw; one per CPU by default.")] = None,
     renders: Annotated[
         int | None,
         typer.Option(
             min=0,
-            help="Draw so many scenes from every side, the first ones; all by default, of more than 60 the first 6.",
+            help="Scenes to draw from every side, the first ones; by default all, or 6 of more than 60.",
         ),
     ] = None,
     films: Annotated[
         int | None,
-        typer.Option(min=0, help="At most so many of each drawn scene; 6 by default, none of more than 60 scenes."),
+        typer.Option(min=0, help="Most films per drawn scene; by default 6, or none for more than 60 scenes."),
     ] = None,
     robot: Annotated[
         str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
     ] = None,
 ) -> None:
-    """Write a gallery as static HTML.
+    """Write a gallery of a dataset as static HTML.
 
-    The funnel, statistics, and every scene beside its photograph.
+    It shows the funnel, statistics, and every scene beside its photograph.
 
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
@@ -57,21 +57,21 @@ def report(
             films=films,
             robot=robot,
         )
-    _say_what_is_damaged(out, dataset.shards)
+    _report_damage(out, dataset.shards)
     print(index)
 
 
-def _say_what_is_damaged(out: str, shards: Iterable[int]) -> None:
-    """Why scenes have no pictures, where it is their shard: the gallery says it on the page of each alone."""
+def _report_damage(out: str, shards: Iterable[int]) -> None:
+    """Report damaged shards on stderr, which the gallery states only on the pages of their scenes."""
     from tableverse_factory.core.errors import BuildError
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.integrity import check_tars
 
     if "://" in out and not out.startswith(("s3://", "file:///")):
-        return  # `open_dataset` reads more kinds of places than builds write
+        return  # `open_dataset` reads other places too, which builds do not write
     try:
         check_tars(parse_path(out), shards)
     except FileNotFoundError:
-        return  # a shard is being written again just now, so its lengths say nothing
+        return  # a shard is being rewritten just now
     except BuildError as error:
         print(f"scenes could not be opened: {error}", file=sys.stderr)

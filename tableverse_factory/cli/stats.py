@@ -1,4 +1,4 @@
-"""`tableverse stats`: what a dataset holds, as one figure and as JSON."""
+"""`tableverse stats`: statistics of a dataset as one figure and as JSON."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ def stats(
             "--out",
             metavar="FOLDER",
             callback=require_local_path,
-            help="For the files; OUT-statistics, beside the dataset, by default.",
+            help="Folder of the files; by default OUT-statistics beside the dataset.",
         ),
     ] = None,
     as_json: AsJson = False,

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-def make_table(first: str, *columns: str) -> "Table":
+def make_figures_table(first: str, *columns: str) -> "Table":
     """Make a table with a column of names and right-aligned columns of figures, none of which is cut."""
     from rich.table import Table
 

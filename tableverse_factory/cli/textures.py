@@ -1,4 +1,4 @@
-"""`tableverse textures`: table-tops, from a repository of PBR maps or from a seed."""
+"""`tableverse textures`: table textures from a repository of PBR maps or from a seed."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli import completions
-from tableverse_factory.cli.options import AsJson, on_this_machine
+from tableverse_factory.cli.options import AsJson, require_local_path
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-textures = typer.Typer(no_args_is_help=True, help="Make table-tops, or index a repository of PBR maps.")
+textures = typer.Typer(no_args_is_help=True, help="Make table textures, or index a repository of PBR maps.")
 
 _SHOWN_REJECTIONS = 20
 
@@ -19,17 +19,19 @@ _SHOWN_REJECTIONS = 20
 @textures.command("index")
 def index(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="The repository, unpacked; searched through, links not followed.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Unpacked repository, searched recursively without links."),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", callback=on_this_machine, help="The Parquet file to write.")
+        Path,
+        typer.Option("--out", "-o", metavar="FILE", callback=require_local_path, help="The Parquet file to write."),
     ],
     source: Annotated[
-        str, typer.Option(help="Where it comes from, if no source.json says: ambientcg, sharetextures, cc0-textures.")
+        str, typer.Option(help="Source if there is no source.json: ambientcg, sharetextures, cc0-textures.")
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """List sets of PBR maps with category, source and licence; what cannot be used is a row with its reason.
+    """List sets of PBR maps with category, source and licence, unusable ones with their reason.
 
     Example: `tableverse textures index ambientcg/ --out textures.parquet`
     """
@@ -61,29 +63,31 @@ def make(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="NAME", autocompletion=completions.textures, help="A seed, or family and number as marble-12."
+            metavar="NAME",
+            autocompletion=completions.complete_textures,
+            help="A seed, or family and number as marble-12.",
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="FILE", callback=on_this_machine, help="The PNG file to write.")
+        Path, typer.Option("--out", "-o", metavar="FILE", callback=require_local_path, help="The PNG file to write.")
     ],
-    size: Annotated[int, typer.Option(metavar="PX", help="Of a side.")] = 512,
+    size: Annotated[int, typer.Option(metavar="PX", help="Side of the picture.")] = 512,
 ) -> None:
-    """Make a procedural table-top, which repeats without a seam.
+    """Make a procedural table texture, which tiles without seams.
 
     Example: `tableverse textures make terrazzo-4 --out terrazzo.png --size 1024`
     """
-    from tableverse_factory.core.png import png_bytes
+    from tableverse_factory.core.png import encode_png
     from tableverse_factory.core.storage.files import write_atomic
-    from tableverse_factory.sources.textures.catalogue import texture, texture_name, texture_seed
+    from tableverse_factory.sources.textures.catalogue import make_texture, name_texture, parse_texture_seed
 
-    seed = texture_seed(name)
-    write_atomic(out, png_bytes(texture(seed, size)))
-    print(f"{texture_name(seed)}, {size} x {size} px, in {out}")
+    seed = parse_texture_seed(name)
+    write_atomic(out, encode_png(make_texture(seed, size)))
+    print(f"{name_texture(seed)}, {size} x {size} px, in {out}")
 
 
 def _counts(table: "pa.Table") -> dict[str, int]:
-    """Usable sets by licence, the others by reason; largest first."""
+    """Count usable sets by licence, the others by reason; largest first."""
     counts: dict[str, int] = {}
     for row in table.select(["rejected", "licence"]).to_pylist():
         what = f"rejected: {row['rejected']}" if row["rejected"] else f"licence {row['licence'] or 'not stated'}"

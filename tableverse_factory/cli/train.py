@@ -1,64 +1,66 @@
-"""`tableverse train`: nets that are made from nothing but our own synthetic scenes."""
+"""`tableverse train`: training of networks on synthetic scenes."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from tableverse_factory.cli.options import on_this_machine
+from tableverse_factory.cli.options import require_local_path
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.training.train import TrainProgress
 
-train = typer.Typer(name="train", help="Train nets on synthetic scenes of your own.", no_args_is_help=True)
+train = typer.Typer(name="train", help="Train networks on synthetic scenes.", no_args_is_help=True)
 
 
 @train.command("segmenter")
 def train_segmenter(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="DIR", callback=on_this_machine, help="A new folder, or one to go on with."),
+        typer.Argument(metavar="DIR", callback=require_local_path, help="New folder, or one to continue."),
     ],
-    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, max=1_000_000, help="To learn from.")] = 2000,
-    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Of --batch views each.")] = 20_000,
+    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, max=1_000_000, help="Training scenes.")] = 2000,
+    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps, of --batch views each.")] = 20_000,
     batch: Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")] = 16,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same scenes, order and first weights.")] = 0,
-    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Where it is trained.")] = "auto",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of scenes, order and first weights.")] = 0,
+    device: Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device to train on.")] = "auto",
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", "-j", min=0, help="Processes that make and vary views; one per CPU by default."),
+        typer.Option("--jobs", "-j", min=0, help="Processes that make and augment views; one per CPU by default."),
     ] = None,
 ) -> None:
-    """Train the net of the detector `learned` on depth images of synthetic scenes.
+    """Train the network of the detector `learned` on depth images of synthetic scenes.
 
-    DIR/views holds the images, six of each scene; DIR/checkpoint.safetensors where it stands, DIR/segmenter.onnx what
-    came out. The same command again goes on where it stopped.
+    Writes DIR/views (six images of each scene), DIR/checkpoint.safetensors and DIR/segmenter.onnx. The same command
+    again continues from the checkpoint.
 
     Example: `tableverse train segmenter net --scenes 240 --steps 800 --batch 4 --device cpu`
     """
     from schemas.config import ModelsConfig
-    from tableverse_factory.cli.progress_bar import counter
-    from tableverse_factory.core.optional_imports import require_extra
-    from tableverse_factory.core.process_pool import available_cpus
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.optional_imports import import_extra
+    from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.evaluation.training.onnx_file import write_onnx
-    from tableverse_factory.evaluation.training.train import Settings, train
+    from tableverse_factory.evaluation.training.train import TrainSettings, train_network
     from tableverse_factory.evaluation.training.views import make_views
-    from tableverse_factory.models.local.device import device_of
+    from tableverse_factory.models.local.device import select_device
 
     for module in ("torch", "safetensors", "onnx", "onnxruntime"):
-        require_extra(module, "training", "models")  # before anything is made that could not be used
-    processes = available_cpus() if jobs is None else jobs
-    where = device_of(ModelsConfig(device=device, precision="float32"))
-    with counter("scenes", scenes) as made:
+        import_extra(module, "training", "models")  # fail before any work
+    processes = count_available_cpus() if jobs is None else jobs
+    where = select_device(ModelsConfig(device=device, precision="float32"))
+    with count_progress("scenes", scenes) as made:
         views = make_views(folder / "views", scenes, seed, made, processes)
     recent: list[TrainProgress] = []
-    with counter("steps", steps) as done:
+    with count_progress("steps", steps) as done:
 
         def on_step(progress: "TrainProgress") -> None:
             recent[:] = [*recent[-99:], progress]
-            done.at(progress.step, steps)
+            done.update(progress.step, steps)
 
-        network = train(views, folder, Settings(scenes, steps, seed, batch), where, on_step, jobs=processes)
+        network = train_network(
+            views, folder, TrainSettings(scenes, steps, seed, batch), where, on_step, jobs=processes
+        )
     path = folder / "segmenter.onnx"
     difference = write_onnx(network, path)
     if recent:

@@ -1,4 +1,4 @@
-"""`tableverse verify`: the certificates, measured again; the trajectories, executed again."""
+"""`tableverse verify`: measure certificates again, and replay trajectories."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tableverse_factory.cli.arm import check_arm
+from tableverse_factory.cli.arm import check_robot_option
 from tableverse_factory.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluation.scene_audit import Audit
+    from tableverse_factory.evaluation.scene_audit import SceneAudit
 
 EPSILON_M = 0.001
 
@@ -31,17 +31,19 @@ def verify(
             "--epsilon",
             min=0.0,
             metavar="M",
-            help="For MJCF files: depth that is no collision yet [m]; 0.001 without it. A dataset says its own.",
+            help="For MJCF files: depth beyond which objects collide [m]; 0.001 by default. A dataset states its own.",
         ),
     ] = None,
     root: Annotated[
         Path | None,
         typer.Option(
-            help="For MJCF files: the folder that all they name must lie in, if not PATH.", exists=True, file_okay=False
+            help="For MJCF files: folder that contains all files they name, if not PATH.",
+            exists=True,
+            file_okay=False,
         ),
     ] = None,
     trajectories: Annotated[
-        bool, typer.Option("--trajectories", help="Of a dataset: replay every trajectory from its arrays too.")
+        bool, typer.Option("--trajectories", help="Of a dataset: also replay every trajectory from its arrays.")
     ] = False,
     robot: Annotated[
         str | None,
@@ -55,30 +57,30 @@ def verify(
 ) -> None:
     """Measure every certificate again; replay trajectories.
 
-    Penetrations, drift and falls are compared with the certificate, byte and figure. With --trajectories each motion
-    is executed again in physics, from its saved arrays alone: what its row calls a success has to succeed, all has to
-    move as it was recorded, and rows have to fit tasks and configuration.
+    Files, penetrations, drift and falls are compared with the certificate. With --trajectories each trajectory is
+    executed again in physics from its saved arrays: successes must succeed, all must move as recorded, and rows must
+    match tasks and configuration.
 
     Exit code 0 only if every scene is whole, at rest, free of collisions and as certified, and every trajectory as
     recorded.
 
     Example: `tableverse verify out`, `tableverse verify out --trajectories`, `tableverse verify their/scene.xml --json`
     """
-    from tableverse_factory.core.process_pool import available_cpus
+    from tableverse_factory.core.process_pool import count_available_cpus
 
     if robot is not None and not trajectories:
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
     if epsilon_m is not None and _is_dataset(path):
-        raise typer.BadParameter("--epsilon is for MJCF files: the certificates of a dataset say what was no collision")
+        raise typer.BadParameter("--epsilon is for MJCF files: the certificates of a dataset state theirs")
     if trajectories and _is_dataset(path):
-        check_arm(path, robot, needed=True)
+        check_robot_option(path, robot, needed=True)
     audits = []
-    for audit in _audits(
-        path, EPSILON_M if epsilon_m is None else epsilon_m, root, jobs or available_cpus(), trajectories, robot
+    for audit in _run_audits(
+        path, EPSILON_M if epsilon_m is None else epsilon_m, root, jobs or count_available_cpus(), trajectories, robot
     ):
         audits.append(audit)
         if not as_json:
-            _print_line(audit, first=len(audits) == 1)
+            _print_audit(audit, first=len(audits) == 1)
     good = sum(audit.ok for audit in audits)
     if as_json:
         scenes = [{"scene_id": a.scene_id, "ok": a.ok, "problems": a.problems, **a.measured} for a in audits]
@@ -94,24 +96,24 @@ def _is_dataset(path: str) -> bool:
     return "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet"))
 
 
-def _audits(
+def _run_audits(
     path: str, epsilon_m: float, root: Path | None, jobs: int, trajectories: bool, robot: str | None
-) -> Iterator["Audit"]:
+) -> Iterator["SceneAudit"]:
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.delivery.formats.folders import mjcf_file, scene_folders
+    from tableverse_factory.delivery.formats.folders import find_mjcf, list_scene_folders
     from tableverse_factory.evaluation.verify import verify_scenes
 
     folder = Path(path)
     if trajectories and not _is_dataset(path):
-        raise InputError(f"{path}: trajectories are replayed from a dataset, where their rows are; give OUT of a build")
+        raise InputError(f"{path}: --trajectories needs a dataset; give OUT of a build")
     if path.endswith(".xml") and folder.is_file():
         yield _audit_file(folder, epsilon_m, root or folder.parent)
-    elif mjcf_file(folder) is not None:
+    elif find_mjcf(folder) is not None:
         yield _audit_folder(folder, epsilon_m, root or folder)
     elif _is_dataset(path):
         yield from verify_scenes(path, jobs, trajectories, robot)
-    elif folder.is_dir() and scene_folders(folder):
-        for name, _ in scene_folders(folder):
+    elif folder.is_dir() and list_scene_folders(folder):
+        for name, _ in list_scene_folders(folder):
             yield _audit_folder(folder / name, epsilon_m, root or folder)
     else:
         found = "nothing there can be verified" if folder.exists() else "no such file or folder"
@@ -121,19 +123,19 @@ def _audits(
         )
 
 
-def _audit_file(path: Path, epsilon_m: float, root: Path) -> "Audit":
+def _audit_file(path: Path, epsilon_m: float, root: Path) -> "SceneAudit":
     from tableverse_factory.evaluation.scene_audit import audit_model
     from tableverse_factory.physics.mjcf.file_check import load_mjcf
 
     return audit_model(path.name, load_mjcf(path, root), epsilon_m)
 
 
-def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
+def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "SceneAudit":
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.delivery.formats.folders import SCENE_GLB, mjcf_file
-    from tableverse_factory.evaluation.scene_audit import Audit, audit_scene, read_scene_folder
+    from tableverse_factory.delivery.formats.folders import SCENE_GLB, find_mjcf
+    from tableverse_factory.evaluation.scene_audit import SceneAudit, audit_scene, read_scene_folder
 
-    document = mjcf_file(folder)
+    document = find_mjcf(folder)
     try:
         if (folder / "meta.json").is_file():
             return audit_scene(folder.name, read_scene_folder(folder, {SCENE_GLB}))
@@ -141,10 +143,10 @@ def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "Audit":
             raise InputError(f"{folder}: no MJCF in it", "no_mjcf")
         return replace(_audit_file(document, epsilon_m, root), scene_id=folder.name)
     except InputError as error:
-        return Audit(folder.name, {}, (str(error),))
+        return SceneAudit(folder.name, {}, (str(error),))
 
 
-def _print_line(audit: "Audit", first: bool) -> None:
+def _print_audit(audit: "SceneAudit", first: bool) -> None:
     from tableverse_factory.core.text import sanitize_line
 
     if first:

@@ -1,4 +1,4 @@
-"""A scene's files against what they claim: measured again, byte by byte and metre by metre."""
+"""Audit of a scene: check its files and measure its certificate again."""
 
 import os
 from collections.abc import Collection, Mapping
@@ -11,27 +11,28 @@ import mujoco
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.scene_meta import SceneMeta, read_meta
-from tableverse_factory.dataset.trajectory_files import without_motions
+from tableverse_factory.dataset.trajectory_files import strip_motions
 from tableverse_factory.physics.mjcf.load import load_model
 from tableverse_factory.physics.mjcf.validate_model import check_time_step
-from tableverse_factory.physics.simulate.certificate import Measurement, certify, measure
-from tableverse_factory.stages.export.meta import file_digests
+from tableverse_factory.physics.simulate.certificate import Measurement, certify, measure_model
+from tableverse_factory.stages.export.meta import compute_file_digests
 
 MAX_SCENE_FILES = 20_000
 MAX_SCENE_BYTES = 2 * 1024**3
 LENGTH_TOLERANCE_M = 5e-5
-"""What another machine's arithmetic may change; on the machine that built the scene the figures are equal."""
+"""Tolerance for the arithmetic of other machines; on the building machine the figures are equal [m]."""
 
 ANGLE_TOLERANCE_RAD = 2e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Audit:
-    """What was found in one scene.
+class SceneAudit:
+    """Audit of one scene.
 
     Attributes:
-        measured: Figures of the files as they are now, by the names of `Certificate`.
-        problems: One line each; empty when all is well.
+        scene_id: Id of the scene.
+        measured: Measured figures by the names of `Certificate`.
+        problems: Problems, one line each.
     """
 
     scene_id: str
@@ -40,37 +41,37 @@ class Audit:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether the audit found no problem."""
         return not self.problems
 
 
-def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any] | None = None) -> Audit:
-    """Measures one of our scenes again and compares it with its meta.json, and with its row of scenes/ if given."""
+def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any] | None = None) -> SceneAudit:
+    """Measure a scene of ours again and compare it with its meta.json, and with its row of scenes/ if given."""
     try:
         meta = read_meta(files.get("meta.json", b"null"))
         model = load_model(files)
         check_time_step(model)
     except InputError as error:
-        return Audit(scene_id, {}, (str(error),))
+        return SceneAudit(scene_id, {}, (str(error),))
     certificate, measured = certify(model, meta.history, meta.certificate.epsilon_m)
     problems = [
-        *_integrity(files, meta),
-        *_state(measured, certificate.epsilon_m),
-        *_differences(meta.certificate, certificate),
-        *_row_differences(certificate, row or {}),
+        *_check_files(files, meta),
+        *_check_state(measured, certificate.epsilon_m),
+        *_compare_certificates(meta.certificate, certificate),
+        *_compare_row(certificate, row or {}),
     ]
     if missing := sorted(set(meta.history.rectified) ^ set(measured.bodies)):
         problems.append(f"bodies and meta.json disagree on {', '.join(missing[:5])}")
-    return Audit(scene_id, _figures(certificate), tuple(problems))
+    return SceneAudit(scene_id, _to_dict(certificate), tuple(problems))
 
 
-def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
-    """Measures anybody's model: its free bodies against one another and against what stands still."""
+def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> SceneAudit:
+    """Measure any model: its free bodies against one another and against static ones."""
     try:
         check_time_step(model)
     except InputError as error:
-        return Audit(name, {}, (str(error),))
-    measured = measure(model)
+        return SceneAudit(name, {}, (str(error),))
+    measured = measure_model(model)
     figures = {
         "epsilon_m": epsilon_m,
         "bodies": len(measured.bodies),
@@ -83,18 +84,18 @@ def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> Audit:
         "at_rest": measured.at_rest,
         "colliding": measured.colliding(epsilon_m),
     }
-    return Audit(name, figures, tuple(_state(measured, epsilon_m)))
+    return SceneAudit(name, figures, tuple(_check_state(measured, epsilon_m)))
 
 
 def read_scene_folder(folder: Path, without: Collection[str] = ()) -> dict[str, bytes]:
-    """The files of a scene's folder by their path in it, within bounds; links are not followed out of it.
+    """Read the files of a scene folder by relative path, within limits; links out of it are not followed.
 
     Args:
-        folder: As `tableverse extract` wrote it.
-        without: Paths that are left alone.
+        folder: Folder, as `tableverse extract` writes it.
+        without: Paths to skip.
 
     Raises:
-        InputError: `too_many_files` or `file_too_large` if it is no scene's folder by its size.
+        InputError: `too_many_files` or `file_too_large` if it exceeds the limits.
     """
     home, files, size = folder.resolve(), dict[str, bytes](), 0
     for root, folders, names in os.walk(folder):
@@ -112,15 +113,15 @@ def read_scene_folder(folder: Path, without: Collection[str] = ()) -> dict[str, 
     return files
 
 
-def _integrity(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
-    exported = dict(without_motions(tuple(files.items())))
-    found = file_digests({name: data for name, data in exported.items() if name != "meta.json"})
+def _check_files(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
+    exported = dict(strip_motions(tuple(files.items())))
+    found = compute_file_digests({name: data for name, data in exported.items() if name != "meta.json"})
     names = sorted(set(found) | set(meta.files))
     changed = [name for name in names if found.get(name) != meta.files.get(name)]
     return [f"{len(changed)} files are not those that were exported: {', '.join(changed[:3])}"] if changed else []
 
 
-def _state(measured: Measurement, epsilon_m: float) -> list[str]:
+def _check_state(measured: Measurement, epsilon_m: float) -> list[str]:
     problems = [] if measured.bodies else ["nothing to certify: no body has a free joint"]
     for kind, (depth, pair) in (("pieces", measured.pieces), ("meshes", measured.meshes)):
         if depth > epsilon_m:
@@ -134,7 +135,7 @@ def _state(measured: Measurement, epsilon_m: float) -> list[str]:
     return problems
 
 
-def _differences(stored: Certificate, now: Certificate) -> list[str]:
+def _compare_certificates(stored: Certificate, now: Certificate) -> list[str]:
     problems = []
     for key in (f.name for f in fields(Certificate)):
         old, new = getattr(stored, key), getattr(now, key)
@@ -143,7 +144,7 @@ def _differences(stored: Certificate, now: Certificate) -> list[str]:
     return problems
 
 
-def _row_differences(now: Certificate, row: Mapping[str, Any]) -> list[str]:
+def _compare_row(now: Certificate, row: Mapping[str, Any]) -> list[str]:
     shared = [f.name for f in fields(Certificate) if f.name in row]
     return [
         f"{key}: scenes/ says {row[key]!r:.80}, measured {getattr(now, key)!r:.80}"
@@ -162,5 +163,5 @@ def _equal(key: str, old: Any, new: Any) -> bool:
     return bool(old == new)
 
 
-def _figures(certificate: Certificate) -> dict[str, Any]:
+def _to_dict(certificate: Certificate) -> dict[str, Any]:
     return {f.name: getattr(certificate, f.name) for f in fields(Certificate)}

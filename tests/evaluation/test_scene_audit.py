@@ -14,7 +14,8 @@ from schemas.outcome import Done
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard
 from tableverse_factory.evaluation import scene_audit
 from tableverse_factory.evaluation.scene_audit import audit_scene, read_scene_folder
 from tableverse_factory.models.services import Services
@@ -43,7 +44,7 @@ def dataset_of(scene: ExportedScene, out: Path, **changes: object) -> None:
     row = {**scene.scene_row, "status": "done", "shard": 0, "tar_offset": offset, "tar_size": size, **changes}
     rows = {"scenes": [row], "objects": scene.object_rows, "tasks": scene.task_rows}
     for name, schema in TABLES.items():
-        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows.get(name, []), schema)))
+        (out / name / "shard-00000.parquet").write_bytes(encode_parquet(build_table(rows.get(name, []), schema)))
 
 
 def test_an_untouched_scene_passes_with_equal_figures(scene: ExportedScene) -> None:

@@ -11,7 +11,7 @@ import time
 import psutil
 import pytest
 
-from tableverse_factory.core.process_pool import available_cpus
+from tableverse_factory.core.process_pool import count_available_cpus
 from tableverse_factory.evaluation.verify import verify_scenes
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
@@ -74,10 +74,10 @@ def test_a_stop_is_said_by_the_parent_alone(dataset) -> None:
 
 
 def test_a_job_with_less_than_the_machine_starts_no_more_processes(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("tableverse_factory.core.process_pool.CPU_MAX", tmp_path / "cpu.max")
-    everything = available_cpus()
+    monkeypatch.setattr("tableverse_factory.core.process_pool.CGROUP_CPU_MAX", tmp_path / "cpu.max")
+    everything = count_available_cpus()
     assert everything == len(os.sched_getaffinity(0))
     (tmp_path / "cpu.max").write_text("50000 100000\n")
-    assert available_cpus() == 1
+    assert count_available_cpus() == 1
     (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert available_cpus() == everything
+    assert count_available_cpus() == everything

@@ -1,10 +1,10 @@
-"""The work of a line written with Ray Data, the natural way: what `tableverse bench factory` compares with.
+"""A pipeline written with Ray Data, the baseline of `tableverse bench factory`.
 
-`python -m workers.bench.ray_data_baseline MANIFEST OUT WORKERS PIPELINE`. Every stage is one `map_batches`, records travel between
-them as bytes of the same codec, the last one writes a tar and the rows of objects and tasks for each batch, and
-`write_parquet` writes the rows of scenes. Ray Data fuses the chain into one task per block, so nothing crosses a
-process boundary between stages. What it does not do is what a factory is for: no sandbox, no deadline, no row for a
-scene that fails, no plan, no resume, no flush to the disk, and names that differ from run to run.
+`python -m workers.bench.ray_data_baseline MANIFEST OUT WORKERS PIPELINE`. Every stage is one `map_batches`, records
+travel between stages as bytes of the same codec, the last one writes a tar and the rows of objects and tasks per batch,
+and `write_parquet` writes the rows of scenes. Ray Data fuses the chain into one task per block, so nothing crosses a
+process boundary between stages. It has no sandbox, no deadline, no row for a failed scene, no plan, no resume and no
+flush to the disk, and its file names differ from run to run.
 """
 
 import sys
@@ -23,8 +23,9 @@ from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
-from tableverse_factory.core.seeding import rng_for
-from tableverse_factory.dataset.shards import TarShard, check_exported, parquet_bytes, rows_to_table, tar_order
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard, check_exported, tar_sort_key
 from tableverse_factory.models.services import Services
 from tableverse_factory.stage import Stage
 from workers.executors.ray_cluster import OBJECT_STORE_BYTES
@@ -36,7 +37,7 @@ _ITEMS = pa.schema([("scene_id", pa.string()), ("item", pa.large_binary())])
 
 
 def main() -> None:
-    """Runs it; writes the monotonic time when Ray is there, and that of the end, with the number of scenes."""
+    """Run the pipeline; write the monotonic time and the number of scenes after the start of Ray and at the end."""
     manifest, out, workers, pipeline = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
     ray.init(
         num_cpus=workers,
@@ -46,47 +47,47 @@ def main() -> None:
         log_to_driver=False,
     )
     ray.data.DataContext.get_current().enable_progress_bars = False
-    _say(0)
+    _report(0)
     scenes = run(manifest, out, workers, load_pipelines(pipeline)[SceneKind.CAPTURE])
-    _say(scenes)
+    _report(scenes)
 
 
-def run(manifest: str, out: Path, workers: int, line: Any) -> int:
-    """Builds; returns how many scenes there are."""
+def run(manifest: str, out: Path, workers: int, stages: Any) -> int:
+    """Run the pipeline on a manifest; return the number of scenes."""
     for folder in ("mjcf", "objects", "tasks"):
         (out / folder).mkdir(parents=True)
     rows = ray.data.read_parquet(manifest, override_num_blocks=_BLOCKS_PER_WORKER * workers)
-    items = rows.map_batches(_enter, batch_size=BATCH, batch_format="pyarrow")
-    for stage in line:
-        items = items.map_batches(_step(stage), batch_size=BATCH, batch_format="pyarrow")
-    items.map_batches(_writer(out), batch_size=BATCH, batch_format="pyarrow").write_parquet(str(out / "scenes"))
+    items = rows.map_batches(_read_items, batch_size=BATCH, batch_format="pyarrow")
+    for stage in stages:
+        items = items.map_batches(_make_step(stage), batch_size=BATCH, batch_format="pyarrow")
+    items.map_batches(_make_writer(out), batch_size=BATCH, batch_format="pyarrow").write_parquet(str(out / "scenes"))
     return sum(pq.read_metadata(path).num_rows for path in (out / "scenes").glob("*.parquet"))
 
 
-def _enter(batch: Any) -> Any:
+def _read_items(batch: Any) -> Any:
     rows = [ImageRow.model_validate({k: v for k, v in row.items() if v is not None}) for row in batch.to_pylist()]
-    return _table([row.scene_id for row in rows], [encode(row) for row in rows])
+    return _make_table([row.scene_id for row in rows], [encode(row) for row in rows])
 
 
-def _step(stage: Stage) -> Callable[[Any], Any]:
+def _make_step(stage: Stage) -> Callable[[Any], Any]:
     config, services = Config(), Services(cache_dir=Path())
 
     def run_stage(batch: Any) -> Any:
         ids, items = batch.column("scene_id").to_pylist(), []
         for scene_id, item in zip(ids, batch.column("item").to_pylist(), strict=True):
-            answer = stage.run(decode(item), config, rng_for(config.run.seed, scene_id, stage.name), services)
+            answer = stage.run(decode(item), config, make_rng(config.run.seed, scene_id, stage.name), services)
             if not isinstance(answer, Done):
                 raise TypeError(f"{scene_id}: {stage.name} answered {answer}: this comparison is of scenes that pass")
             items.append(encode(answer.value))
-        return _table(ids, items)
+        return _make_table(ids, items)
 
     return run_stage
 
 
-def _writer(out: Path) -> Callable[[Any], Any]:
+def _make_writer(out: Path) -> Callable[[Any], Any]:
     def write(batch: Any) -> Any:
         scenes = sorted(
-            (decode(item) for item in batch.column("item").to_pylist()), key=lambda s: tar_order(s.scene_id)
+            (decode(item) for item in batch.column("item").to_pylist()), key=lambda s: tar_sort_key(s.scene_id)
         )
         name, rows = scenes[0].scene_id, []
         with (out / "mjcf" / f"{name}.tar").open("wb") as file:
@@ -97,20 +98,20 @@ def _writer(out: Path) -> Callable[[Any], Any]:
                 known = {"scene_id": scene.scene_id, "status": "done", "tar_offset": offset, "tar_size": size}
                 rows.append({**scene.scene_row, **known})
             tar.close()
-        objects = rows_to_table((row for scene in scenes for row in scene.object_rows), OBJECTS)
-        tasks = rows_to_table((row for scene in scenes for row in scene.task_rows), TASKS)
-        (out / "objects" / f"{name}.parquet").write_bytes(parquet_bytes(objects))
-        (out / "tasks" / f"{name}.parquet").write_bytes(parquet_bytes(tasks))
-        return rows_to_table(rows, SCENES)
+        objects = build_table((row for scene in scenes for row in scene.object_rows), OBJECTS)
+        tasks = build_table((row for scene in scenes for row in scene.task_rows), TASKS)
+        (out / "objects" / f"{name}.parquet").write_bytes(encode_parquet(objects))
+        (out / "tasks" / f"{name}.parquet").write_bytes(encode_parquet(tasks))
+        return build_table(rows, SCENES)
 
     return write
 
 
-def _table(ids: list[str], items: list[bytes]) -> Any:
+def _make_table(ids: list[str], items: list[bytes]) -> Any:
     return pa.Table.from_pydict({"scene_id": ids, "item": items}, schema=_ITEMS)
 
 
-def _say(scenes: int) -> None:
+def _report(scenes: int) -> None:
     sys.stdout.write(f"{time.monotonic():.3f} {scenes}\n")
     sys.stdout.flush()
 

@@ -1,7 +1,7 @@
-"""A build of any line in a process of its own that says on stdout how far it is: what `tableverse bench factory` runs.
+"""A build of any pipeline in a process of its own with progress on stdout, for `tableverse bench factory`.
 
-`python -m workers.bench.run_build MANIFEST OUT EXECUTOR WORKERS PIPELINE`; a line `seconds scenes` about once a second, then one
-at the end. Seconds are those of the monotonic clock, which all processes of a machine share.
+`python -m workers.bench.run_build MANIFEST OUT EXECUTOR WORKERS PIPELINE` writes a line `seconds scenes` about once a
+second, and one at the end. Seconds are of the monotonic clock, which all processes of a machine share.
 """
 
 import sys
@@ -16,32 +16,32 @@ from workers.run import BuildRequest, run_build
 _EVERY_S = 1.0
 
 
-class Pace:
-    """A display that writes down how many scenes are accounted for, and when."""
+class StdoutProgress:
+    """Progress display that writes lines of time and number of finished scenes."""
 
     def __init__(self) -> None:
         self._next = 0.0
-        self._said = -1
+        self._written = -1
 
     def show(self, tally: Tally) -> None:
-        """Writes a line, about once a second and where something has changed."""
-        if time.monotonic() >= self._next and tally.accounted != self._said:
+        """Write a line after a change, about once a second."""
+        if time.monotonic() >= self._next and tally.accounted != self._written:
             self._next = time.monotonic() + _EVERY_S
-            self.say(tally.accounted)
+            self.write(tally.accounted)
 
     def note(self, line: str) -> None:
-        """Goes to stderr."""
+        """Write a note to stderr."""
         sys.stderr.write(f"{line}\n")
 
-    def say(self, scenes: int) -> None:
-        """Writes a line."""
-        self._said = scenes
+    def write(self, scenes: int) -> None:
+        """Write a line."""
+        self._written = scenes
         sys.stdout.write(f"{time.monotonic():.3f} {scenes}\n")
         sys.stdout.flush()
 
 
 def main() -> None:
-    """Runs the build; exit code 0 where it is complete."""
+    """Run the build; exit code 0 if it completes."""
     manifest, out, executor, workers, pipeline = sys.argv[1:]
     request = BuildRequest(
         manifest=Path(manifest),
@@ -52,9 +52,9 @@ def main() -> None:
         workers=int(workers) if executor == "ray" else None,
         pipeline=pipeline,
     )
-    pace = Pace()
-    summary = run_build(request, pace, StopSignals())
-    pace.say(summary.tally.accounted)
+    progress = StdoutProgress()
+    summary = run_build(request, progress, StopSignals())
+    progress.write(summary.tally.accounted)
     sys.exit(128 + summary.signal if summary.signal else 0)
 
 

@@ -14,7 +14,7 @@ from tableverse_factory.evaluation.bench.layouts import read_case
 from tableverse_factory.evaluation.bench.rectifiers import RECTIFICATION_METHODS
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.mesh.meshes import place_mesh
-from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, make_scenery
+from tableverse_factory.physics.mjcf.scenery import Rgb, Scenery, make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.views import RenderQuality, make_front_camera, render_pictures
 

@@ -15,8 +15,9 @@ from tableverse_factory.evaluation.bench.measurement import sample_evenly
 from tableverse_factory.geometry.convex.coacd import load_coacd
 from tableverse_factory.geometry.convex.decompose import decompose_shape
 from tableverse_factory.geometry.convex.metrics import add_metrics
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import make_bounded_hull
-from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, bounds, read_mesh
+from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, read_mesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid
 
 
@@ -149,5 +150,5 @@ def find_meshes(folder: Path, most: int | None) -> list[Path]:
 
 
 def _scale_to_unit(mesh: TriangleMesh) -> TriangleMesh:
-    low, high = bounds(mesh)
+    low, high = aabb(mesh.vertices)
     return TriangleMesh((mesh.vertices - (low + high) / 2) / float((high - low).max()), mesh.faces)

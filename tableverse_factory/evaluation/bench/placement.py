@@ -17,7 +17,7 @@ from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.methods.heading import heading_error, symmetric_turns
+from tableverse_factory.evaluation.methods.heading import compute_heading_error, find_symmetric_turns
 from tableverse_factory.geometry.math.transforms import (
     matrix_from_pose,
     normalize_quaternion,
@@ -134,7 +134,7 @@ def read_placement_truth(capture: Path) -> PlacementTruth:
 def _read_true_object(capture: Path, entry: dict[str, Any]) -> PlacedTruth:
     mesh = read_mesh((capture / entry["mesh"]).read_bytes(), entry["mesh"])
     standing = place_mesh(mesh, _parse_pose(entry["pose"]))
-    turns = symmetric_turns(standing)
+    turns = find_symmetric_turns(standing)
     seen = float(entry["visible_fraction"])
     return PlacedTruth(entry["instance_id"], entry["label"], seen, mesh, standing, 0 if turns is None else len(turns))
 
@@ -185,7 +185,7 @@ def _compare_object(
     our_box, true_box = _compute_box(standing.vertices), _compute_box(item.standing.vertices)
     shift = our_box.mean(axis=0) - true_box.mean(axis=0)
     sizes = np.ptp(our_box, axis=0) / np.ptp(true_box, axis=0)
-    heading = heading_error(standing, item.standing) if item.symmetry else None
+    heading = compute_heading_error(standing, item.standing) if item.symmetry else None
     stated = ours.uncertainty or FitUncertainty(np.nan, None, 1, np.nan)
     return PlacementError(
         scene=scene,

@@ -19,11 +19,11 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.execution.execute import execute_and_check
 from tableverse_factory.robotics.execution.goal import Goal, load_goal
 from tableverse_factory.robotics.execution.perturbations import PERTURBATIONS, find_survived_perturbations
-from tableverse_factory.robotics.motion.blend import blend_path, compute_arc_lengths
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.phases import plan_motion
 from tableverse_factory.robotics.motion.retime import retime_curve
 from tableverse_factory.robotics.motion.rrt import RrtConnect
+from tableverse_factory.robotics.motion.segments import blend_path, compute_arc_lengths
 from tableverse_factory.robotics.motion.validate import validate_motion
 from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 from tableverse_factory.robotics.placements.sampling import sample_placements

@@ -13,7 +13,7 @@ from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
 from tableverse_factory.geometry.math.transforms import homogeneous_matrix, identity_pose
 from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
 from tableverse_factory.geometry.mesh.meshes import MAX_FACES, MAX_FILE_BYTES, MAX_PIXELS, check_mesh
-from tableverse_factory.physics.mjcf.drawables import Rgb
+from tableverse_factory.physics.mjcf.scenery import Rgb
 
 GREY: Rgb = (178, 178, 184)
 

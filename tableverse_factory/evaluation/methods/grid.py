@@ -15,7 +15,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.evaluation.methods.scenes import MethodScene
 from tableverse_factory.geometry.mesh.meshes import place_mesh
-from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery
+from tableverse_factory.physics.mjcf.scenery import Rgb, Scenery
 from tableverse_factory.physics.render.views import FINE, make_front_camera, render_pictures
 
 OBLIQUE = float(np.deg2rad(25.0))

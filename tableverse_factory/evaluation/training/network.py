@@ -1,34 +1,33 @@
-"""The net: a small encoder and decoder that says of each pixel whether it is a thing, and where its thing's middle is.
+"""The segmentation network: a small encoder and decoder for objectness and offset to the object centre per pixel.
 
-Described as a list of convolutions, from which both the torch module and the ONNX graph are made: what is trained is
-what is exported, and no exporter is needed.
+It is a list of convolutions from which both the torch module and the ONNX graph are made, so no exporter is needed.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tableverse_factory.models.local.device import Tensor, torch_here
+from tableverse_factory.models.local.device import Tensor, import_torch
 from tableverse_factory.stages.perceive.learned.features import CHANNELS, OUTPUTS
 
 WIDTHS = (32, 64, 128, 224)
-"""Channels at one half, a quarter, an eighth and a sixteenth of the input's height and width."""
+"""Channels at 1/2, 1/4, 1/8 and 1/16 of the height and width of the input."""
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
-    """A convolution, normalised and rectified unless it is `plain`.
+class ConvLayer:
+    """A convolution with batch norm and ReLU unless it is `plain`.
 
     Attributes:
-        name: Of its weights.
-        source: Which result it reads.
-        inputs: Channels in.
-        outputs: Channels out.
+        name: Name of its weights and its result.
+        source: Name of its input.
+        inputs: Input channels.
+        outputs: Output channels.
         kernel: Side of the kernel [px].
-        stride: 2 halves height and width.
+        stride: Stride [px].
         dilation: Spacing of the kernel's taps [px].
-        plain: Neither normalised nor rectified.
-        onto: A coarser result that is added, each pixel of it to four, before the rectifier.
+        plain: Without batch norm and ReLU.
+        onto: A coarser result that is upsampled and added before the ReLU.
     """
 
     name: str
@@ -43,49 +42,49 @@ class Layer:
 
     @property
     def padding(self) -> int:
-        """That keeps the size at stride 1 [px]."""
+        """Padding that keeps the size at stride 1 [px]."""
         return self.dilation * (self.kernel // 2)
 
 
-def layers() -> tuple[Layer, ...]:
-    """All convolutions in the order in which they are computed; the first reads `input`, the last gives `output`."""
+def list_layers() -> tuple[ConvLayer, ...]:
+    """List the convolutions in the order of computation; the first reads `input`, the last gives `output`."""
     a, b, c, d = WIDTHS
     return (
-        Layer("half_in", "input", CHANNELS, a, stride=2),
-        Layer("halves", "half_in", a, a),
-        Layer("quarter_in", "halves", a, b, stride=2),
-        Layer("quarters", "quarter_in", b, b),
-        Layer("eighth_in", "quarters", b, c, stride=2),
-        Layer("eighths", "eighth_in", c, c),
-        Layer("sixteenth_in", "eighths", c, d, stride=2),
-        Layer("sixteenths", "sixteenth_in", d, d),
-        Layer("wide", "sixteenths", d, d, dilation=2),
-        Layer("wider", "wide", d, d, dilation=4),
-        Layer("to_eighth", "wider", d, c, 1, plain=True),
-        Layer("eighth_up", "eighths", c, c, onto="to_eighth"),
-        Layer("to_quarter", "eighth_up", c, b, 1, plain=True),
-        Layer("quarter_up", "quarters", b, b, onto="to_quarter"),
-        Layer("quarter_out", "quarter_up", b, b),
-        Layer("to_half", "quarter_out", b, a, 1, plain=True),
-        Layer("half_up", "halves", a, a, onto="to_half"),
-        Layer("half_out", "half_up", a, a),
-        Layer("output", "half_out", a, OUTPUTS, 1, plain=True),
+        ConvLayer("half_in", "input", CHANNELS, a, stride=2),
+        ConvLayer("halves", "half_in", a, a),
+        ConvLayer("quarter_in", "halves", a, b, stride=2),
+        ConvLayer("quarters", "quarter_in", b, b),
+        ConvLayer("eighth_in", "quarters", b, c, stride=2),
+        ConvLayer("eighths", "eighth_in", c, c),
+        ConvLayer("sixteenth_in", "eighths", c, d, stride=2),
+        ConvLayer("sixteenths", "sixteenth_in", d, d),
+        ConvLayer("wide", "sixteenths", d, d, dilation=2),
+        ConvLayer("wider", "wide", d, d, dilation=4),
+        ConvLayer("to_eighth", "wider", d, c, 1, plain=True),
+        ConvLayer("eighth_up", "eighths", c, c, onto="to_eighth"),
+        ConvLayer("to_quarter", "eighth_up", c, b, 1, plain=True),
+        ConvLayer("quarter_up", "quarters", b, b, onto="to_quarter"),
+        ConvLayer("quarter_out", "quarter_up", b, b),
+        ConvLayer("to_half", "quarter_out", b, a, 1, plain=True),
+        ConvLayer("half_up", "halves", a, a, onto="to_half"),
+        ConvLayer("half_out", "half_up", a, a),
+        ConvLayer("output", "half_out", a, OUTPUTS, 1, plain=True),
     )
 
 
-def multiply_adds(height: int, width: int) -> int:
-    """Of one forward pass over an input of this size."""
+def count_multiply_adds(height: int, width: int) -> int:
+    """Count the multiply-adds of one forward pass over an input of this size [px]."""
     scale, total = {"input": 1}, 0
-    for layer in layers():
+    for layer in list_layers():
         scale[layer.name] = scale[layer.source] * layer.stride
         pixels = (height // scale[layer.name]) * (width // scale[layer.name])
         total += pixels * layer.inputs * layer.outputs * layer.kernel**2
     return total
 
 
-def new_network(seed: int) -> Any:
-    """The net with weights drawn from the seed, on the CPU: a `torch.nn.ModuleDict` for `forward`."""
-    torch = torch_here()
+def make_network(seed: int) -> Any:
+    """Make the network with weights from a seed, on the CPU: a `torch.nn.ModuleDict` for `forward`."""
+    torch = import_torch()
     nn = torch.nn
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -105,16 +104,16 @@ def new_network(seed: int) -> Any:
                         *([] if layer.plain else [nn.BatchNorm2d(layer.outputs)]),
                     ]
                 )
-                for layer in layers()
+                for layer in list_layers()
             }
         )
 
 
 def forward(network: Any, inputs: Tensor) -> Tensor:
-    """Inputs of shape (b, 7, h, w) to outputs of shape (b, 4, h/2, w/2)."""
-    functional = torch_here().nn.functional
+    """Map inputs of shape (b, 7, h, w) to outputs of shape (b, 4, h/2, w/2)."""
+    functional = import_torch().nn.functional
     results = {"input": inputs}
-    for layer in layers():
+    for layer in list_layers():
         result = results[layer.source]
         for part in network[layer.name]:
             result = part(result)
@@ -124,10 +123,10 @@ def forward(network: Any, inputs: Tensor) -> Tensor:
     return results["output"]
 
 
-def folded(network: Any) -> Mapping[str, tuple[Any, Any]]:
-    """Kernel and bias of each layer as numpy arrays, the normalisation of a trained net taken into them."""
+def fold_batch_norm(network: Any) -> Mapping[str, tuple[Any, Any]]:
+    """Return kernel and bias of each layer as numpy arrays with the batch norm folded in."""
     result = {}
-    for layer in layers():
+    for layer in list_layers():
         parts = list(network[layer.name])
         weight = parts[0].weight.detach().cpu().double()
         if layer.plain:

@@ -1,4 +1,4 @@
-"""The trained net as an ONNX file, written from the same list of layers that torch runs."""
+"""ONNX file of the trained network, from the same list of layers that torch runs."""
 
 from pathlib import Path
 from typing import Any
@@ -6,39 +6,39 @@ from typing import Any
 import numpy as np
 
 from tableverse_factory.core.errors import ModelError
-from tableverse_factory.core.optional_imports import require_extra
-from tableverse_factory.evaluation.training.network import Layer, folded, forward, layers
-from tableverse_factory.models.local.device import torch_here
+from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.evaluation.training.network import ConvLayer, fold_batch_norm, forward, list_layers
+from tableverse_factory.models.local.device import import_torch
 from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS
-from tableverse_factory.stages.perceive.learned.onnx import Net
+from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet
 
 OPSET = 17
 IR_VERSION = 9
 TOLERANCE = 1e-3
-"""Largest difference that is float32's, relative to the largest output."""
+"""Largest allowed difference from float32 arithmetic, relative to the largest output."""
 
 
 def write_onnx(network: Any, path: Path) -> float:
-    """Writes the net and compares what both say of noise.
+    """Write the network and compare its outputs in onnxruntime and torch on noise.
 
     Returns:
         The largest difference, relative to the largest output.
 
     Raises:
-        InputError: `no_extra`, without the package onnx.
-        ModelError: if onnxruntime says something else than torch.
+        InputError: `no_extra` without the package onnx.
+        ModelError: if the outputs differ.
     """
-    onnx: Any = require_extra("onnx", "training", "models")
-    weights = folded(network)
+    onnx: Any = import_extra("onnx", "training", "models")
+    weights = fold_batch_norm(network)
     nodes: list[Any] = []
     constants = [onnx.numpy_helper.from_array(np.array([1, 1, 2, 2], dtype=np.float32), "twice")]
-    for layer in layers():
+    for layer in list_layers():
         kernel, bias = weights[layer.name]
         constants += [
             onnx.numpy_helper.from_array(kernel, f"{layer.name}.kernel"),
             onnx.numpy_helper.from_array(bias, f"{layer.name}.bias"),
         ]
-        nodes += _nodes(onnx, layer)
+        nodes += _make_nodes(onnx, layer)
     value = onnx.helper.make_tensor_value_info
     graph = onnx.helper.make_graph(
         nodes,
@@ -54,24 +54,24 @@ def write_onnx(network: Any, path: Path) -> float:
     onnx.checker.check_model(model)
     partial = path.with_suffix(".partial")
     partial.write_bytes(model.SerializeToString(deterministic=True))
-    difference = _difference(network, Net(partial))
+    difference = _measure_difference(network, SegmentationNet(partial))
     if difference > TOLERANCE:
         partial.unlink()
-        raise ModelError(f"the ONNX file differs from the net by {difference:.1e} of its largest output")
+        raise ModelError(f"the ONNX file differs from the network by {difference:.1e} of its largest output")
     partial.rename(path)
     return difference
 
 
-def _nodes(onnx: Any, layer: Layer) -> list[Any]:
-    """The operators of one layer; the last writes the layer's name."""
+def _make_nodes(onnx: Any, layer: ConvLayer) -> list[Any]:
+    """Make the operators of one layer; the last one writes the result of that name."""
     make = onnx.helper.make_node
     raw = layer.name if layer.plain else f"{layer.name}.raw"
-    folds = f"{layer.name}.folds" if layer.onto else raw
+    convolved = f"{layer.name}.convolved" if layer.onto else raw
     nodes = [
         make(
             "Conv",
             [layer.source, f"{layer.name}.kernel", f"{layer.name}.bias"],
-            [folds],
+            [convolved],
             kernel_shape=[layer.kernel] * 2,
             strides=[layer.stride] * 2,
             dilations=[layer.dilation] * 2,
@@ -82,15 +82,15 @@ def _nodes(onnx: Any, layer: Layer) -> list[Any]:
         larger = f"{layer.name}.larger"
         nearest = {"mode": "nearest", "coordinate_transformation_mode": "asymmetric", "nearest_mode": "floor"}
         nodes.append(make("Resize", [layer.onto, "", "twice"], [larger], **nearest))
-        nodes.append(make("Add", [folds, larger], [raw]))
+        nodes.append(make("Add", [convolved, larger], [raw]))
     if not layer.plain:
         nodes.append(make("Relu", [raw], [layer.name]))
     return nodes
 
 
-def _difference(network: Any, net: Net) -> float:
-    torch = torch_here()
+def _measure_difference(network: Any, net: SegmentationNet) -> float:
+    torch = import_torch()
     inputs = np.random.default_rng(0).standard_normal((CHANNELS, 48, 80)).astype(np.float32)
     with torch.inference_mode():
-        said = forward(network.eval(), torch.tensor(inputs[None]))[0].numpy()
-    return float(np.abs(net(inputs) - said).max() / max(float(np.abs(said).max()), 1e-6))
+        expected = forward(network.eval(), torch.tensor(inputs[None]))[0].numpy()
+    return float(np.abs(net(inputs) - expected).max() / max(float(np.abs(expected).max()), 1e-6))

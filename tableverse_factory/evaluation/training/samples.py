@@ -1,4 +1,4 @@
-"""Views as input and wanted output of the net, each time a little different: noise, lost readings, tilt, scale."""
+"""Training samples: inputs and targets of the network from augmented views (noise, lost pixels, tilt, scale)."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from schemas.geometry import Frozen, IdImage, Mask
 from tableverse_factory.evaluation.training.views import TrainingView
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
-from tableverse_factory.stages.perceive.learned.features import OFFSET_UNIT_M, THINNING, features
+from tableverse_factory.stages.perceive.learned.features import OFFSET_UNIT_M, THINNING, compute_features
 
 TILT_RAD = 0.012
 LIFT_M = 0.002
@@ -23,15 +23,15 @@ MAX_HOLES = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Batch(Frozen):
+class TrainingBatch(Frozen):
     """Samples of one step.
 
     Attributes:
-        inputs: Features of `learned_input`.
-        is_object: Whether the output's pixel belongs to an object.
-        offsets: From the pixel's point to the middle of its object's visible points [OFFSET_UNIT_M]; 0 elsewhere.
-        counted: Weight of each output pixel in being an object: 0 where there is no reading.
-        share: Weight of each output pixel in its offset; those of one object sum to 1.
+        inputs: Features of `learned.features`.
+        is_object: Whether the output pixel belongs to an object.
+        offsets: From the point of the pixel to the mean of its object's visible points [OFFSET_UNIT_M]; 0 elsewhere.
+        counted: Weight of each output pixel in the objectness loss: 0 without a reading.
+        share: Weight of each output pixel in the offset loss; those of one object sum to 1.
     """
 
     inputs: Float32[np.ndarray, "b 7 h w"]
@@ -41,30 +41,30 @@ class Batch(Frozen):
     share: Float32[np.ndarray, "b h2 w2"]
 
 
-def batch_of(views: list[TrainingView], rng: np.random.Generator) -> Batch:
-    """The views, each varied."""
-    samples = [_sample(view, rng) for view in views]
-    return Batch(*(np.stack(arrays) for arrays in zip(*samples, strict=True)))
+def make_batch(views: list[TrainingView], rng: np.random.Generator) -> TrainingBatch:
+    """Make a batch of augmented views."""
+    samples = [_make_sample(view, rng) for view in views]
+    return TrainingBatch(*(np.stack(arrays) for arrays in zip(*samples, strict=True)))
 
 
-def _sample(view: TrainingView, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def _make_sample(view: TrainingView, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     flipped = bool(rng.random() < 0.5)
-    depth, points = _varied(view, rng)
+    depth, points = _augment_view(view, rng)
     valid, ids = depth > 0, view.ids.astype(np.int32)
     on_objects = points[valid & (ids > 0)]
     center = np.median(on_objects[:, :2], axis=0) if len(on_objects) else np.zeros(2)
     points[..., :2] -= center
     if flipped:
         points, valid, ids = points[:, ::-1] * [-1.0, 1.0, 1.0], valid[:, ::-1], ids[:, ::-1]
-    inputs = features(points, valid, rng.normal(0.0, SHIFT_M, 2))
+    inputs = compute_features(points, valid, rng.normal(0.0, SHIFT_M, 2))
     thin = np.s_[::THINNING, ::THINNING]
-    return (inputs, *_wanted(points[thin], valid[thin], ids[thin]))
+    return (inputs, *_make_targets(points[thin], valid[thin], ids[thin]))
 
 
-def _wanted(
+def _make_targets(
     points: Float64[np.ndarray, "h w 3"], valid: Mask, ids: IdImage
 ) -> tuple[Float32[np.ndarray, "*shape"], ...]:
-    """Being an object, offsets, and both weights, as in `Batch`."""
+    """Make objectness, offsets, and both weights, as in `TrainingBatch`."""
     seen = np.where(valid, ids, 0)
     sizes = np.bincount(seen.ravel())
     sums = np.stack([np.bincount(seen.ravel(), points[..., k].ravel()) for k in range(3)], axis=1)
@@ -75,19 +75,19 @@ def _wanted(
     return tuple(np.asarray(array, dtype=np.float32) for array in wanted)
 
 
-def _varied(
+def _augment_view(
     view: TrainingView, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "h w"], Float64[np.ndarray, "h w 3"]]:
-    """Depth [m] with more noise and fewer readings, and its points about a plane that was not found exactly [m]."""
+    """Add noise and lost pixels to the depth [m], and a plane error, bend and scale to its points [m]."""
     depth = view.depth * view.depth_scale
     noise = ndimage.gaussian_filter(rng.standard_normal(depth.shape), 1.0) * 3.5 + rng.standard_normal(depth.shape)
     depth = np.where(depth > 0, depth + rng.uniform(0.0, NOISE) * depth**2 * noise, 0.0)
     if rng.random() < LOST_SHARE:
-        depth[_lost(rng, depth.shape)] = 0.0
+        depth[_choose_lost_pixels(rng, depth.shape)] = 0.0
     to_table = view.camera_to_table
     points = backproject(depth, view.camera) @ to_table[:3, :3].T + to_table[:3, 3]
     tilt = rotation_matrix(quaternion_from_rotation_vector(np.append(rng.normal(0.0, TILT_RAD, 2), 0.0)))
-    turned = rotation_matrix(quaternion_from_rotation_vector(np.array([0.0, 0.0, _heading(to_table)])))
+    turned = rotation_matrix(quaternion_from_rotation_vector(np.array([0.0, 0.0, _compute_heading(to_table)])))
     points = points @ (tilt @ turned).T
     reach = points[..., :2] / 0.5
     bend = rng.normal(0.0, BEND_M, 3)
@@ -96,14 +96,14 @@ def _varied(
     return depth, points * rng.uniform(*SCALE_RANGE)
 
 
-def _heading(camera_to_table: Float64[np.ndarray, "4 4"]) -> float:
-    """Turn about z that brings the camera's right to x, as `perceive` has it [rad]."""
+def _compute_heading(camera_to_table: Float64[np.ndarray, "4 4"]) -> float:
+    """Compute the turn about z that aligns the right of the camera with x, as in `perceive` [rad]."""
     right = camera_to_table[:2, 0]
     return -float(np.arctan2(right[1], right[0]))
 
 
-def _lost(rng: np.random.Generator, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
-    """A few patches and single pixels."""
+def _choose_lost_pixels(rng: np.random.Generator, shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:
+    """Choose a few patches and single pixels."""
     lost: Bool[np.ndarray, "h w"] = rng.random(shape) < rng.uniform(0.0, 0.05)
     for _ in range(int(rng.integers(MAX_HOLES + 1))):
         row, column = (int(rng.integers(size)) for size in shape)

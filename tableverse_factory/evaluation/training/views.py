@@ -1,4 +1,4 @@
-"""What the segmenter is trained with: depth images of our own synthetic scenes, several of each, on the disk."""
+"""Training views: depth images of synthetic scenes with their object ids, several per scene, on the disk."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -35,13 +35,13 @@ WALL_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingView(Frozen):
-    """One depth image with its truth.
+    """A depth image with its truth.
 
     Attributes:
-        depth: In units of `depth_scale`, 0 for no reading.
-        ids: Number of the object at each pixel from 1, 0 elsewhere.
+        depth: Depth in units of `depth_scale`; 0 without a reading.
+        ids: Object id at each pixel from 1; 0 elsewhere.
         focal: fx, fy, cx, cy [px].
-        camera_to_table: 4 × 4, metres.
+        camera_to_table: Pose of the camera as a 4 × 4 matrix [m].
         depth_scale: Metres per unit of depth.
     """
 
@@ -58,7 +58,7 @@ class TrainingView(Frozen):
         return Camera(fx, fy, cx, cy, self.depth.shape[1], self.depth.shape[0])
 
     def write(self, path: Path) -> None:
-        """Writes it whole or not at all."""
+        """Write the view atomically."""
         partial = path.with_suffix(".partial")
         with partial.open("wb") as file:
             np.savez_compressed(
@@ -73,10 +73,10 @@ class TrainingView(Frozen):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Reads what `write` wrote.
+        """Read a view that `write` wrote.
 
         Raises:
-            InputError: if the file holds anything else.
+            InputError: if the file is not a view.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -84,21 +84,21 @@ class TrainingView(Frozen):
                 return cls(file["depth"], file["ids"], file["focal"], file["camera_to_table"], scale)
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise InputError(
-                f"{path} is no view to train with ({type(error).__name__}): remove it, and it is made again"
+                f"{path} is not a training view ({type(error).__name__}): remove it, and it is made again"
             ) from error
 
 
 def make_views(
     folder: Path, scenes: int, seed: int, on_scene: Callable[[], object] = lambda: None, jobs: int = 1
 ) -> list[Path]:
-    """Files of the views of so many scenes, in order; those that are there already are kept.
+    """Make the views of scenes and return their files in order; existing ones are kept.
 
     Args:
-        folder: Made if it is not there.
-        scenes: 1 to `MAX_SCENES`; scene k is the same whatever the number.
-        seed: Of all that is drawn.
+        folder: Folder of the views, created if it is absent.
+        scenes: Number of scenes, 1 to `MAX_SCENES`; scene k does not depend on it.
+        seed: Seed of everything random.
         on_scene: Called after each scene.
-        jobs: Processes that make them.
+        jobs: Number of processes.
 
     Raises:
         GeometryError: if a scene cannot be arranged.
@@ -106,36 +106,36 @@ def make_views(
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    make = partial(_scene_files, folder, seed)
+    make = partial(_make_scene_files, folder, seed)
     for own in parallel_map(make, range(scenes), jobs, "makes views", SCENES_AT_A_TIME):
         paths += own
         on_scene()
     return paths
 
 
-def _scene_files(folder: Path, seed: int, index: int) -> list[Path]:
+def _make_scene_files(folder: Path, seed: int, index: int) -> list[Path]:
     name = f"train_{seed}_{index:06d}"
     own = [folder / f"{name}_{k}.npz" for k in range(VIEWS_PER_SCENE)]
     if not all(path.is_file() for path in own):
-        for path, view in zip(own, scene_views(seed, name), strict=True):
+        for path, view in zip(own, render_scene_views(seed, name), strict=True):
             view.write(path)
     return own
 
 
-def scene_views(seed: int, scene_id: str) -> list[TrainingView]:
-    """A settled scene, seen from all around by as many cameras and sensors."""
+def render_scene_views(seed: int, scene_id: str) -> list[TrainingView]:
+    """Render a settled scene from several random directions, each with its own camera and sensor."""
     rng = make_rng(seed, scene_id, "train")
     placed, half_xy = arrange_scene(rng, scene_id)
     objects = [place_mesh(item.model.mesh, item.pose) for item in placed]
     views = []
     for _ in range(VIEWS_PER_SCENE):
         azimuth = float(rng.uniform(0.0, 2 * np.pi))
-        caster = Raycaster([*objects, *_surroundings(rng, half_xy, azimuth)])
-        views.append(_view(rng, caster, placed, objects, azimuth))
+        caster = Raycaster([*objects, *_make_surroundings(rng, half_xy, azimuth)])
+        views.append(_render_view(rng, caster, placed, objects, azimuth))
     return views
 
 
-def _view(
+def _render_view(
     rng: np.random.Generator,
     caster: Raycaster,
     placed: Sequence[PlacedModel],
@@ -149,7 +149,7 @@ def _view(
     focal = np.array([full.fx, full.fy, full.cx, full.cy]) / COARSER
     fx, fy, cx, cy = (float(v) for v in focal)
     camera = Camera(fx, fy, cx, cy, full.width // COARSER, full.height // COARSER)
-    depth, facing, shiny, ids = _seen(caster, camera, pose, np.array([item.model.shiny for item in placed]))
+    depth, facing, shiny, ids = _cast_view(caster, camera, pose, np.array([item.model.shiny for item in placed]))
     sensor = make_sensor(rng)
     sensor = replace(
         sensor,
@@ -161,10 +161,10 @@ def _view(
     return TrainingView(sensed, ids, focal, matrix_from_pose(pose), sensor.depth_scale)
 
 
-def _seen(
+def _cast_view(
     caster: Raycaster, camera: Camera, pose: Pose, shininess: Float64[np.ndarray, " n"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, UInt8[np.ndarray, "h w"]]:
-    """True depth [m], cosine between normal and line of sight, shininess and ids, pixel by pixel."""
+    """Cast true depth [m], cosine between normal and line of sight, shininess and ids per pixel."""
     hits = caster.cast(camera, pose)
     depth, facing, shiny = (np.zeros(camera.height * camera.width, dtype=np.float64) for _ in range(3))
     ids = np.zeros(camera.height * camera.width, dtype=np.uint8)
@@ -178,8 +178,8 @@ def _seen(
     return depth.reshape(shape), facing.reshape(shape), shiny.reshape(shape), ids.reshape(shape)
 
 
-def _surroundings(rng: np.random.Generator, half_xy: tuple[float, float], azimuth: float) -> list[TriangleMesh]:
-    """Table, floor, and often a wall behind the table."""
+def _make_surroundings(rng: np.random.Generator, half_xy: tuple[float, float], azimuth: float) -> list[TriangleMesh]:
+    """Make table, floor, and often a wall behind the table."""
     top = make_block((2 * half_xy[0], 2 * half_xy[1], TABLE_THICKNESS_M)).translate((0.0, 0.0, -TABLE_THICKNESS_M))
     floor = make_block((6.0, 6.0, 0.02)).translate((0.0, 0.0, studio.FLOOR_M - 0.02))
     meshes = [top.to_mesh(), floor.to_mesh()]

@@ -52,7 +52,7 @@ def write_scene(site: Site, films: int, robot: str | None, job: SceneJob) -> Sce
     facts, pictures, motions, problem = _draw_scene(site, films, robot, job)
     card = SceneCard(job.scene.scene_id, pictures, problem, facts.reason_codes)
     name = f"scenes/{card.scene_id}.html"
-    listed = {"scene": job.scene, "order": job, "commands": list_commands(site.named, card.scene_id)}
+    listed = {"scene": job.scene, "job": job, "commands": list_commands(site.named, card.scene_id)}
     try:
         site.write(name, "scene.html", card=card, facts=facts, motions=motions, **listed)
     except Exception as error:  # noqa: BLE001 - a bad scene must not stop the others

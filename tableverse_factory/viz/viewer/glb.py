@@ -11,7 +11,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.delivery.formats.model_contents import VisualMesh
-from tableverse_factory.physics.mjcf.drawables import Rgb
+from tableverse_factory.physics.mjcf.scenery import Rgb
 from tableverse_factory.physics.render.normals import compute_corner_normals
 
 ROUGHNESS = 0.8

@@ -81,7 +81,7 @@ def test_the_dataset_written_for_queries_is_one_and_is_measured(tmp_path):
     write_query_dataset(tmp_path / "again", 130, 64)
     dataset = open_dataset(tmp_path / "out")
     assert dataset.objects.to_table().equals(open_dataset(tmp_path / "again").objects.to_table())
-    assert {dataset.scene(i).model().nbody for i in dataset._shard_of} == {2}
+    assert {dataset.scene(i).model().nbody for i in dataset.scenes.to_table()["scene_id"].to_pylist()} == {2}
     times = bench_query(tmp_path / "out", "small")
     assert (times.shards, times.scenes, times.objects) == (3, 130, 130 * OBJECTS_PER_SCENE)
     label = dataset.objects.head(1)["label"][0].as_py()

@@ -6,7 +6,7 @@ import pytest
 from schemas.config import Config, PerceiveConfig
 from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
 from tableverse_factory.evaluation.bench.placement import bench_placement
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
 
 @pytest.mark.shared
@@ -20,7 +20,7 @@ def test_objects_of_real_captures_are_found_without_weights(shared_dir):
 @pytest.mark.slow
 @pytest.mark.parametrize("meshes", ["carved", "replay"])
 def test_placed_objects_of_synthetic_captures_are_where_and_as_large_as_they_are(tmp_path, meshes):
-    synthesize(tmp_path / "captures", 3, seed=21)
+    synthesize_captures(tmp_path / "captures", 3, seed=21)
     way = ("replay", meshes)
     placements = [entry for found in bench_placement(tmp_path / "captures", Config(), (way,)) for entry in found[way]]
     placed = [entry for entry in placements if entry.completion]

@@ -167,7 +167,7 @@ def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
 @pytest.fixture
 def bowl_of_balls(folder: Path) -> Path:
     """A layout of a bowl in which one ball was seen, and three were counted."""
-    bowl = vessels.bowl(np.random.default_rng(0)).mesh
+    bowl = vessels.make_bowl(np.random.default_rng(0)).mesh
     ball = from_trimesh(trimesh.creation.icosphere(subdivisions=1, radius=0.011))
     for name, mesh in (("bowl", bowl), ("ball", ball)):
         (folder.parent / "meshes" / f"{name}.obj").write_bytes(encode_obj(mesh))

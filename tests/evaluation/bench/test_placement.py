@@ -7,13 +7,13 @@ import pytest
 from schemas.config import Config
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.bench.placement import bench_placement
-from tableverse_factory.sources.synthetic.synthesize import synthesize
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
 WAY = ("replay", "replay")
 
 
 def test_a_true_mesh_is_placed_where_and_as_large_as_it_is(tmp_path: Path) -> None:
-    (capture,) = synthesize(tmp_path, 1, seed=3)
+    (capture,) = synthesize_captures(tmp_path, 1, seed=3)
     content = json.loads((capture / "truth.json").read_text())
     content["objects"] = [max(content["objects"], key=lambda entry: entry["visible_fraction"])]
     (capture / "truth.json").write_text(json.dumps(content))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from schemas.config import Config
 from tableverse_factory.cli.main import app
 from tableverse_factory.evaluation.bench.lccr import bench_lccr
-from tableverse_factory.evaluation.methods.collisions import measure_method, wilson
+from tableverse_factory.evaluation.methods.collisions import compute_wilson_interval, measure_method
 from tableverse_factory.evaluation.methods.sources import find_scenes
 from tests.helpers.planted import DEPTHS_MM, INNER, ORDER, WRITERS, glb_scene, write_glbs, write_layouts
 
@@ -44,8 +44,8 @@ def test_the_rate_follows_epsilon(epsilon, rate, tmp_path):
 
 
 def test_wilson_at_the_ends():
-    assert wilson(0.0, 60) == (0.0, pytest.approx(0.0602, abs=1e-3))
-    assert wilson(1.0, 60) == (pytest.approx(0.9398, abs=1e-3), 1.0)
+    assert compute_wilson_interval(0.0, 60) == (0.0, pytest.approx(0.0602, abs=1e-3))
+    assert compute_wilson_interval(1.0, 60) == (pytest.approx(0.9398, abs=1e-3), 1.0)
 
 
 def test_the_command_compares_methods_and_says_what_it_could_not_read(tmp_path):

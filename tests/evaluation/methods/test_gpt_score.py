@@ -19,11 +19,16 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import AnswerInvalidError, ConfigError, InputError
-from tableverse_factory.evaluation.methods.comparison import compare
-from tableverse_factory.evaluation.methods.grid import HEADER, letters, method_views, read_reference
-from tableverse_factory.evaluation.methods.score import VoteResults, interval_text, rank_by_column, results
+from tableverse_factory.evaluation.methods.comparison import match_methods
+from tableverse_factory.evaluation.methods.grid import HEADER, make_letters, read_reference, render_method
+from tableverse_factory.evaluation.methods.score import (
+    VoteResults,
+    compute_rank_by_column,
+    compute_results,
+    format_interval,
+)
 from tableverse_factory.evaluation.methods.sources import find_scenes
-from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, prompt, questions, read_answer
+from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, build_vote_prompt, make_questions, parse_vote
 from tests.helpers.model_server import Scripted, chat, gemini
 
 CELL = 96
@@ -69,7 +74,7 @@ def seen_colors(grid: Image.Image) -> list[str]:
 
 def answer(columns: list[str]) -> dict:
     marks = {c: {"layout_fidelity": MARK[c], "visual_quality": MARK[c], "geometry_quality": MARK[c]} for c in columns}
-    return {"columns": {letters(3)[i]: {**marks[c], "rank": RANK[c], "reason": c} for i, c in enumerate(columns)}}
+    return {"columns": {make_letters(3)[i]: {**marks[c], "rank": RANK[c], "reason": c} for i, c in enumerate(columns)}}
 
 
 def look(question: dict) -> Scripted:
@@ -126,8 +131,8 @@ def test_marks_reach_the_method_that_stood_in_the_column(folder, server, monkeyp
 
 
 def test_the_grid_is_as_the_paper_has_it(folder):
-    comparison = compare({m: folder / m for m in METHODS}, folder / "pictures", CELL)
-    (question,) = questions("lunch", METHODS, 1, 0)
+    comparison = match_methods({m: folder / m for m in METHODS}, folder / "pictures", CELL)
+    (question,) = make_questions("lunch", METHODS, 1, 0)
     grid = Image.open(io.BytesIO(comparison.grid(question)))
     assert grid.size == (CELL * 4, HEADER + 2 * CELL)
     pixels = np.asarray(grid)
@@ -140,7 +145,7 @@ def test_the_grid_is_as_the_paper_has_it(folder):
 def test_the_lower_row_is_level_with_the_table(tmp_path):
     """A flat sheet is a line from straight ahead, and a surface from slightly above."""
     trimesh.Scene({"sheet": trimesh.creation.box((0.4, 0.012, 0.4))}).export(tmp_path / "sheet.glb")
-    oblique, front = method_views(find_scenes(tmp_path / "sheet.glb")[0].read(), CELL)
+    oblique, front = render_method(find_scenes(tmp_path / "sheet.glb")[0].read(), CELL)
     covered = [
         (np.ptp(view.astype(int), axis=2) + np.abs(view.astype(int) - view[0, 0]).sum(axis=2) > 30).mean()
         for view in (oblique, front)
@@ -150,11 +155,11 @@ def test_the_lower_row_is_level_with_the_table(tmp_path):
 
 def test_columns_are_shuffled_and_balanced():
     for scene in ("a", "b", "c"):
-        asked = questions(scene, tuple("vwxyz"), 5, seed=3)
+        asked = make_questions(scene, tuple("vwxyz"), 5, seed=3)
         for place in range(5):
             assert sorted(question.columns[place] for question in asked) == list("vwxyz")
-        assert asked == questions(scene, tuple("vwxyz"), 5, seed=3)
-    firsts = {questions(f"scene {k}", tuple("vwxyz"), 1, seed=3)[0].columns for k in range(40)}
+        assert asked == make_questions(scene, tuple("vwxyz"), 5, seed=3)
+    firsts = {make_questions(f"scene {k}", tuple("vwxyz"), 1, seed=3)[0].columns for k in range(40)}
     assert len(firsts) > 20
 
 
@@ -162,12 +167,12 @@ def test_a_judge_who_only_likes_places_ranks_nobody():
     """After as many rounds as methods, liking the first column gives all methods the same mean rank."""
     ballots = []
     for scene in ("a", "b"):
-        for question in questions(scene, METHODS, 3, seed=0):
+        for question in make_questions(scene, METHODS, 3, seed=0):
             marks = {m: _marks(rank=place + 1) for place, m in enumerate(question.columns)}
             ballots.append(Vote(scene, question.round, question.columns, marks))
     election = VoteResults(METHODS, tuple(ballots), ())
-    assert {its["rank"].mean for its in results(election, 0).values()} == {2.0}
-    assert rank_by_column(election) == {"A": 1.0, "B": 2.0, "C": 3.0}
+    assert {its["rank"].mean for its in compute_results(election, 0).values()} == {2.0}
+    assert compute_rank_by_column(election) == {"A": 1.0, "B": 2.0, "C": 3.0}
 
 
 def _marks(rank: int, mark: int = 5) -> Marks:
@@ -183,8 +188,8 @@ def test_intervals_cover_the_mean_and_narrow_with_scenes():
             first = bool(rng.random() < 0.7)
             marks = {"a": _marks(1 if first else 2, 7), "b": _marks(2 if first else 1, int(rng.integers(3, 9)))}
             ballots.append(Vote(str(scene), 0, ("a", "b"), marks))
-        found = results(VoteResults(("a", "b"), tuple(ballots), ()), seed=1)
-        assert found == results(VoteResults(("a", "b"), tuple(ballots), ()), seed=1)
+        found = compute_results(VoteResults(("a", "b"), tuple(ballots), ()), seed=1)
+        assert found == compute_results(VoteResults(("a", "b"), tuple(ballots), ()), seed=1)
         its = found["a"]["rank"]
         assert its.low <= its.mean <= its.high
         assert found["a"]["layout_fidelity"].low == found["a"]["layout_fidelity"].high == 7.0
@@ -195,15 +200,15 @@ def test_intervals_cover_the_mean_and_narrow_with_scenes():
 
 def test_few_scenes_have_no_interval():
     ballots = tuple(Vote(str(scene), 0, ("a",), {"a": _marks(1, 5 + scene)}) for scene in range(4))
-    found = results(VoteResults(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
+    found = compute_results(VoteResults(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
     assert (found.mean, found.low, found.high) == (6.5, None, None)
-    assert interval_text(found) == "6.50"
+    assert format_interval(found) == "6.50"
 
 
 def test_many_scenes_take_little_memory():
     ballots = tuple(Vote(str(scene), 0, ("a",), {"a": _marks(1, 1 + scene % 10)}) for scene in range(1500))
     tracemalloc.start()
-    found = results(VoteResults(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
+    found = compute_results(VoteResults(("a",), ballots, ()), seed=0)["a"]["layout_fidelity"]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert found.low < 5.5 < found.high
@@ -212,7 +217,7 @@ def test_many_scenes_take_little_memory():
 
 def test_no_grid_is_asked_about_twice():
     with pytest.raises(InputError, match="at most 2"):
-        questions("a", ("x", "y"), 3, seed=0)
+        make_questions("a", ("x", "y"), 3, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -235,18 +240,18 @@ def test_answers_that_do_not_count(spoil, says):
     value = answer(["red", "green", "blue"])
     spoil(value["columns"])
     with pytest.raises(AnswerInvalidError, match=says):
-        read_answer(json.dumps(value), 3)
+        parse_vote(json.dumps(value), 3)
 
 
 @pytest.mark.parametrize("text", ["", "I would say A.", "[1, 2]", '{"columns": 3}', "{" * 5000])
 def test_texts_that_are_no_answers(text):
     with pytest.raises(AnswerInvalidError):
-        read_answer(text, 3)
+        parse_vote(text, 3)
 
 
 def test_fences_and_prose_around_an_answer_do_no_harm():
     text = f"Here you are:\n```json\n{json.dumps(answer(['blue', 'red', 'green']))}\n```\nDone."
-    assert read_answer(text, 3).columns["B"].rank == 1
+    assert parse_vote(text, 3).columns["B"].rank == 1
 
 
 def test_a_bad_answer_is_asked_for_again_and_then_refused(folder, server, monkeypatch, tmp_path):
@@ -310,11 +315,11 @@ def test_methods_without_a_scene_in_common_are_said(folder):
 
 
 def test_the_prompt_names_no_method_and_every_column():
-    text = prompt(4)
+    text = build_vote_prompt(4)
     assert all(f'"{letter}"' in text for letter in "ABCD")
     assert not any(name in text for name in ("MIDI", "SAM3D", "SceneMaker", "TableVerse"))
 
 
 def test_a_reference_that_is_no_picture():
-    with pytest.raises(InputError, match="is no picture"):
+    with pytest.raises(InputError, match="is not a readable picture"):
         read_reference(b"<html>", "lunch")

@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.cli.main import app
 from tableverse_factory.delivery.formats.model_contents import VisualMesh
-from tableverse_factory.evaluation.methods.heading import heading_error, heading_error_of_same
-from tableverse_factory.evaluation.methods.layout import compare_layouts, compare_scene, summary
-from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, Source
+from tableverse_factory.evaluation.methods.heading import compute_heading_error, compute_heading_error_of_same
+from tableverse_factory.evaluation.methods.layout import compare_layouts, compare_scene, summarize_layouts
+from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, SceneSource
 from tableverse_factory.evaluation.methods.sources import find_scenes
 from tableverse_factory.evaluation.methods.truth import find_truths
-from tableverse_factory.geometry.math.transforms import compose, quaternion_about_z
-from tableverse_factory.geometry.mesh.meshes import from_trimesh, placed_mesh
+from tableverse_factory.geometry.math.transforms import compose_poses, quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
 from tableverse_factory.geometry.relations.preserved import PreservedRelations
 from tableverse_factory.physics.render.render import look_at
 
@@ -56,8 +56,8 @@ def solid(kind: str) -> TriangleMesh:
 )
 def test_headings_up_to_the_symmetries_of_the_shape(kind, degrees, error):
     mesh = solid(kind)
-    by_shape = heading_error(placed_mesh(mesh, turned(degrees, (0.3, 0.1, 0.0)), 1.02), mesh)
-    by_pose = heading_error_of_same(mesh, np.deg2rad(degrees))
+    by_shape = compute_heading_error(place_mesh(mesh, turned(degrees, (0.3, 0.1, 0.0)), 1.02), mesh)
+    by_pose = compute_heading_error_of_same(mesh, np.deg2rad(degrees))
     if error is None:
         assert by_shape is None
         assert by_pose is None
@@ -129,7 +129,7 @@ def test_planted_errors_come_out(layouts):
     assert above.position_error_m == pytest.approx(0.045, abs=1e-6)
     assert beside.found == ""
     assert compared(layouts).kept == PreservedRelations(1, 0, 0, 0), "the upper box is in the air"
-    found = summary([compared(layouts)])
+    found = summarize_layouts([compared(layouts)])
     assert found["found [%]"] == pytest.approx(200 / 3)
     assert found["support kept [%]"] == 0.0
     assert found["containment kept [%]"] is None
@@ -176,18 +176,20 @@ def test_the_camera_joins_the_frames_of_a_capture_and_its_result(tmp_path):
         trimesh.Trimesh(mesh.vertices, mesh.faces).export(home / "truth" / f"{index}.obj")
         at = {"position": pose.position.tolist(), "quaternion_wxyz": pose.quaternion_wxyz.tolist()}
         entries.append({"instance_id": index, "label": kind, "mesh": f"truth/{index}.obj", "pose": at})
-        items.append(MethodObject(f"obj_{7 - index}", mesh, (VisualMesh(mesh, (0, 0, 0)),), compose(to_result, pose)))
+        items.append(
+            MethodObject(f"obj_{7 - index}", mesh, (VisualMesh(mesh, (0, 0, 0)),), compose_poses(to_result, pose))
+        )
     eye = {"position": camera.position.tolist(), "quaternion_wxyz": camera.quaternion_wxyz.tolist()}
     (home / "truth.json").write_text(json.dumps({"camera_to_table": eye, "objects": entries}))
     stranger = replace(items[0], name="stranger", pose=turned(0, (-2.0, 0.0, 0.0)))
-    result = MethodScene((stranger, *items), (), compose(to_result, camera))
+    result = MethodScene((stranger, *items), (), compose_poses(to_result, camera))
     scene = compare_scene("kitchen", result, find_truths(tmp_path)["kitchen"](result), tmp_path / "cache")
     assert [match.found for match in scene.matches] == ["obj_6", "obj_5"]
     assert scene.extra == ("stranger",)
     for match in scene.matches:
         assert match.position_error_m == pytest.approx(0.0, abs=1e-6)
         assert np.rad2deg(match.heading_error_rad) == pytest.approx(0.0, abs=0.6)
-    lost = replace(result, camera_to_scene=compose(to_result, compose(turned(180), camera)))
+    lost = replace(result, camera_to_scene=compose_poses(to_result, compose_poses(turned(180), camera)))
     assert not all(m.found for m in compare_scene("k", lost, find_truths(tmp_path)["kitchen"](lost), tmp_path).matches)
 
 
@@ -240,7 +242,7 @@ def test_a_broken_truth_is_said(entry, tmp_path):
     trimesh.creation.box().export(tmp_path / "box.obj")
     (tmp_path / "a" / "truth.json").write_text(json.dumps({"camera_to_table": AT, "objects": [entry]}))
     (row,) = compare_layouts(
-        {"a": Source("a", "glb", lambda: MethodScene(()))}, find_truths(tmp_path), tmp_path / "cache"
+        {"a": SceneSource("a", "glb", lambda: MethodScene(()))}, find_truths(tmp_path), tmp_path / "cache"
     )
     assert row.error
     assert row.matches == ()

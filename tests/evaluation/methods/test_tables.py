@@ -18,14 +18,15 @@ from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene, SettledScene
 from tableverse_factory.cli.main import app
-from tableverse_factory.dataset.shards import TarShard, parquet_bytes, rows_to_table
-from tableverse_factory.evaluation.methods.ablation import CONFIGURATIONS, ablation_sources, configurations
+from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.dataset.shards import TarShard
+from tableverse_factory.evaluation.methods.ablation import CONFIGURATIONS, find_ablation_scenes, list_configurations
 from tableverse_factory.evaluation.methods.collisions import measure_method
-from tableverse_factory.evaluation.methods.comparison import compare
+from tableverse_factory.evaluation.methods.comparison import match_methods
 from tableverse_factory.evaluation.methods.grid import HEADER
-from tableverse_factory.evaluation.methods.grid_judges import record
+from tableverse_factory.evaluation.methods.grid_judges import record_vote
 from tableverse_factory.evaluation.methods.sources import find_scenes
-from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, questions
+from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, make_questions
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tests.helpers.planted import write_glbs
@@ -64,7 +65,7 @@ def write_dataset(out: Path, scenes: list[ExportedScene]) -> Path:
         rows["scenes"].append({"scene_id": "lost", "status": "dropped", "stage": "settle", "shard": 0})
         tar.close()
     for name, schema in TABLES.items():
-        (out / name / "shard-00000.parquet").write_bytes(parquet_bytes(rows_to_table(rows.get(name, []), schema)))
+        (out / name / "shard-00000.parquet").write_bytes(encode_parquet(build_table(rows.get(name, []), schema)))
     return out
 
 
@@ -75,7 +76,7 @@ def results(tmp_path_factory) -> Path:
     write_glbs(folder / "their|s")
     for scene, rank in (("clean", 1), ("two", 2)):
         marks = {"ours": _marks(8, rank), "their|s": _marks(4, 3 - rank)}
-        record(Vote(scene, 0, ("their|s", "ours"), marks), folder / "answers")
+        record_vote(Vote(scene, 0, ("their|s", "ours"), marks), folder / "answers")
     return folder
 
 
@@ -85,7 +86,7 @@ def _marks(mark: int, rank: int) -> Marks:
 
 def test_the_ablation_is_read_from_the_poses_of_every_step(results):
     depths = {
-        row: measure_method(row, ablation_sources(results / "ours", poses), 1e-3, None).scenes[0].depth_m
+        row: measure_method(row, find_ablation_scenes(results / "ours", poses), 1e-3, None).scenes[0].depth_m
         for row, poses in CONFIGURATIONS.items()
     }
     assert depths["Direct"] == pytest.approx(PLACED_DEPTH, abs=1e-6)
@@ -94,8 +95,8 @@ def test_the_ablation_is_read_from_the_poses_of_every_step(results):
 
 def test_what_was_rectified_by_another_method_is_not_called_lccr(results, tmp_path):
     (tmp_path / "run.json").write_text('{"config": {"rectify": {"method": "joint"}}}')
-    assert list(configurations(tmp_path)) == ["Direct", "Direct + joint", "Direct + joint + Simulation"]
-    assert list(configurations(results / "ours")) == list(CONFIGURATIONS)
+    assert list(list_configurations(tmp_path)) == ["Direct", "Direct + joint", "Direct + joint + Simulation"]
+    assert list(list_configurations(results / "ours")) == list(CONFIGURATIONS)
 
 
 @pytest.mark.parametrize("spoil", [{"scale": "x", "poses": 3}, {"scale": 0}, {"scale": None, "poses": {"placed": [1]}}])
@@ -106,9 +107,9 @@ def test_a_meta_that_makes_no_sense_is_a_row_with_its_reason(spoil, tmp_path):
     meta["objects"] = [{**entry, "poses": {}, **spoil} for entry in meta["objects"]]
     files["meta.json"] = json.dumps(meta).encode()
     out = write_dataset(tmp_path / "ours", [replace(scene, files=tuple(sorted(files.items())))])
-    for sources in (find_scenes(out), ablation_sources(out, "placed")):
+    for sources in (find_scenes(out), find_ablation_scenes(out, "placed")):
         (measured,) = measure_method("x", sources, 1e-3, None).scenes
-        assert "meta.json" in measured.error or "is no pose" in measured.error
+        assert "meta.json" in measured.error or "is not a pose" in measured.error
 
 
 def test_both_tables_are_written(results, tmp_path):
@@ -159,7 +160,7 @@ def test_answers_that_do_not_count_are_said(results, tmp_path):
     (answers / "clean-0.json").write_text("no answer")
     code, text = run_tables(tmp_path / "results", tmp_path / "broken")
     assert code == 1
-    assert "1 answers of the judge do not count, the first: clean, round 0: clean-0.json is no JSON" in text
+    assert "1 answers of the judge do not count, the first: clean, round 0: clean-0.json is not JSON" in text
     shutil.rmtree(tmp_path / "results" / "their|s")
     code, text = run_tables(tmp_path / "results", tmp_path / "gone")
     assert code == 1
@@ -169,7 +170,7 @@ def test_answers_that_do_not_count_are_said(results, tmp_path):
 def test_what_the_factory_dropped_is_said(results):
     answer = CliRunner().invoke(app, ["evaluate", "collisions", str(results / "ours"), "--meshes-only"])
     assert answer.exit_code == 0
-    assert "ours: 1 scenes that the factory dropped are not among them" in answer.stdout
+    assert "ours: without 1 scenes that the factory dropped" in answer.stdout
 
 
 def test_without_answers_the_judge_s_columns_are_empty(results, tmp_path):
@@ -196,8 +197,8 @@ def test_a_dataset_brings_the_real_pictures_along(tmp_path):
     Image.new("RGB", (64, 48), (10, 200, 30)).save(picture, "JPEG")
     files = tuple(sorted({**dict(scene.files), "observation/color.jpg": picture.getvalue()}.items()))
     write_dataset(tmp_path / "ours", [replace(scene, files=files)])
-    comparison = compare({"ours": tmp_path / "ours", "again": tmp_path / "ours"}, side=64)
+    comparison = match_methods({"ours": tmp_path / "ours", "again": tmp_path / "ours"}, side=64)
     assert comparison.scenes == ("lunch",)
-    (question,) = questions("lunch", comparison.methods, 1, 0)
+    (question,) = make_questions("lunch", comparison.methods, 1, 0)
     grid = np.asarray(Image.open(io.BytesIO(comparison.grid(question))))
     assert grid[HEADER + 32, 32] == pytest.approx([10, 200, 30], abs=4)

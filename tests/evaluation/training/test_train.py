@@ -15,25 +15,25 @@ from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.training.network import forward, multiply_adds, new_network
+from tableverse_factory.evaluation.training.network import count_multiply_adds, forward, make_network
 from tableverse_factory.evaluation.training.onnx_file import write_onnx
-from tableverse_factory.evaluation.training.samples import batch_of
-from tableverse_factory.evaluation.training.train import CHECKPOINT, Settings, TrainProgress, train
-from tableverse_factory.evaluation.training.views import VIEWS_PER_SCENE, TrainingView, make_views, scene_views
+from tableverse_factory.evaluation.training.samples import make_batch
+from tableverse_factory.evaluation.training.train import CHECKPOINT, TrainProgress, TrainSettings, train_network
+from tableverse_factory.evaluation.training.views import VIEWS_PER_SCENE, TrainingView, make_views, render_scene_views
 from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.learned.onnx import Net
+from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet
 from tableverse_factory.stages.perceive.perceive import perceive
 
 torch = pytest.importorskip("torch")
 CPU = Device("cpu", "float32")
-SHORT = Settings(scenes=1, steps=4, batch=1)
+SHORT = TrainSettings(scenes=1, steps=4, batch=1)
 
 
 @pytest.fixture(scope="module")
 def scene() -> list[TrainingView]:
     """Every view of one scene."""
-    return scene_views(0, "train_0_000000")
+    return render_scene_views(0, "train_0_000000")
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_the_same_scene_gives_the_same_views_and_every_view_shows_things(
 
 def test_offsets_lead_from_every_pixel_to_one_middle_of_its_thing(views: list[Path]) -> None:
     view = TrainingView.read(views[0])
-    batch = batch_of([view], np.random.default_rng(0))
+    batch = make_batch([view], np.random.default_rng(0))
     assert batch.inputs[0, 6].mean() > 0.7
     assert np.isclose(batch.share.sum(), len(np.unique(view.ids[(view.depth > 0) & (view.ids > 0)])), atol=1.01)
     assert np.all(batch.offsets[0][:, batch.is_object[0] == 0] == 0)
@@ -79,8 +79,8 @@ def test_offsets_lead_from_every_pixel_to_one_middle_of_its_thing(views: list[Pa
 def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[object, list[TrainProgress]]:
     """A net after a few seconds, and what it said of itself."""
     told: list[TrainProgress] = []
-    settings = Settings(scenes=1, steps=40, batch=1)
-    return train(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
+    settings = TrainSettings(scenes=1, steps=40, batch=1)
+    return train_network(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
 
 
 def test_it_learns(learnt: tuple[object, list[TrainProgress]]) -> None:
@@ -114,11 +114,11 @@ def test_stopped_and_resumed_gives_the_weights_of_one_go(views: list[Path], tmp_
 
     (tmp_path / "whole").mkdir()
     (tmp_path / "parts").mkdir()
-    whole = train(views, tmp_path / "whole", SHORT, CPU, checkpoint_every=2)
+    whole = train_network(views, tmp_path / "whole", SHORT, CPU, checkpoint_every=2)
     with pytest.raises(StoppedError):
-        train(views, tmp_path / "parts", SHORT, CPU, stop, checkpoint_every=2)
+        train_network(views, tmp_path / "parts", SHORT, CPU, stop, checkpoint_every=2)
     done: list[TrainProgress] = []
-    parts = train(views, tmp_path / "parts", SHORT, CPU, done.append, checkpoint_every=2)
+    parts = train_network(views, tmp_path / "parts", SHORT, CPU, done.append, checkpoint_every=2)
     assert [p.step for p in done] == [3, 4]
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, parts.state_dict()[name]), name
@@ -130,23 +130,25 @@ def test_processes_beside_it_change_no_weight(views: list[Path], tmp_path: Path)
     for jobs in (0, 2):
         folder = tmp_path / str(jobs)
         folder.mkdir()
-        weights.append(train(views, folder, SHORT, CPU, jobs=jobs).state_dict())
+        weights.append(train_network(views, folder, SHORT, CPU, jobs=jobs).state_dict())
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
 
 
 def test_a_checkpoint_of_another_training_or_net_or_of_nothing_is_refused(
     views: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    train(views, tmp_path, replace(SHORT, steps=1), CPU)
+    train_network(views, tmp_path, replace(SHORT, steps=1), CPU)
     with pytest.raises(InputError, match="another training"):
-        train(views, tmp_path, replace(SHORT, steps=1, seed=1), CPU)
+        train_network(views, tmp_path, replace(SHORT, steps=1, seed=1), CPU)
     with monkeypatch.context() as older:
         older.setattr("tableverse_factory.evaluation.training.network.WIDTHS", (16, 32, 64, 128))
-        with pytest.raises(InputError, match=rf"{CHECKPOINT} is of another net .* remove it, or give another folder"):
-            train(views, tmp_path, replace(SHORT, steps=1), CPU)
+        with pytest.raises(
+            InputError, match=rf"{CHECKPOINT} is of another network .* remove it, or give another folder"
+        ):
+            train_network(views, tmp_path, replace(SHORT, steps=1), CPU)
     (tmp_path / CHECKPOINT).write_bytes(b"\x80\x04 no safetensors")
     with pytest.raises(InputError, match="no checkpoint"):
-        train(views, tmp_path, SHORT, CPU)
+        train_network(views, tmp_path, SHORT, CPU)
 
 
 def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path: Path) -> None:
@@ -158,14 +160,14 @@ def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path
         TrainingView.read(tmp_path / "a.npz")
     assert "pickle" not in str(told.value), "numpy advises to load it unsafely"
     with pytest.raises(InputError, match=r"a\.npz"):
-        train([tmp_path / "a.npz"], tmp_path, SHORT, CPU)
+        train_network([tmp_path / "a.npz"], tmp_path, SHORT, CPU)
 
 
 @pytest.mark.slow
 def test_a_view_that_is_none_is_named_in_one_line_by_a_process_too(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(b"no view")
     with pytest.raises(InputError, match=r"a\.npz is no view") as told:
-        train([tmp_path / "a.npz"], tmp_path, SHORT, CPU, jobs=1)
+        train_network([tmp_path / "a.npz"], tmp_path, SHORT, CPU, jobs=1)
     assert "\n" not in str(told.value)
 
 
@@ -181,14 +183,14 @@ def test_a_process_that_dies_beside_it_ends_in_one_line(views: list[Path], tmp_p
 
     killer = threading.Thread(target=kill)
     killer.start()
-    with pytest.raises(InputError, match="a process that varies views died") as told:
-        train(views, tmp_path, SHORT, CPU, jobs=1)
+    with pytest.raises(InputError, match="a process that augments views died") as told:
+        train_network(views, tmp_path, SHORT, CPU, jobs=1)
     killer.join()
     assert "\n" not in str(told.value)
 
 
 def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> None:
-    network = new_network(1)
+    network = make_network(1)
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():  # as after training: the normalisation does something
         for name, tensor in network.named_buffers():
@@ -201,14 +203,14 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
     write_onnx(network, path)
     assert path.read_bytes() == first
     assert len(first) < 10_000_000
-    net = Net(path)
+    net = SegmentationNet(path)
     for height, width in ((32, 48), (64, 16)):
         inputs = np.random.default_rng(0).standard_normal((7, height, width)).astype(np.float32)
         with torch.inference_mode():
             said = forward(network, torch.tensor(inputs[None]))[0].numpy()
         assert np.allclose(net(inputs), said, atol=1e-3 * np.abs(said).max())
     assert sum(p.numel() for p in network.parameters()) < 2_500_000
-    assert 2e9 < multiply_adds(240, 320) < 2.5e9
+    assert 2e9 < count_multiply_adds(240, 320) < 2.5e9
 
 
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,7 @@ def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
     assert "not_at_rest" not in text
     listed = json.loads(run("failures", out, "--json", "--reason", "not_at_rest")[1])
     assert [row["scene_id"] for row in listed] == ["scene_003"]
-    assert "not_at_rest: the objects would not come" in run("failures", out, "--reason", "not_at_rest")[1]
+    assert "not_at_rest: the objects did not come" in run("failures", out, "--reason", "not_at_rest")[1]
     assert json.loads(run("failures", out, "--json", "--stage", "look")[1])[0]["why"] == "nothing_there"
     assert json.loads(run("failures", out, "--json", "--stage", "pack")[1]) == []
 
@@ -124,4 +124,5 @@ def test_an_address_is_checked_before_anything_is_said_of_it(run, tmp_path, monk
 def test_a_file_above_out_is_named(run, tmp_path):
     write_manifest(tmp_path / "m.parquet", ["fine"])
     code, _, errors = run("build", tmp_path / "m.parquet", tmp_path / "m.parquet" / "a" / "out", "--executor", "local")
-    assert (code, " ".join(errors.split())) == (1, f"error: {tmp_path}/m.parquet is a file: give another OUT")
+    assert code == 1
+    assert " ".join(errors.split()).startswith(f"error: {tmp_path}/m.parquet is a file: give another OUT help: ")

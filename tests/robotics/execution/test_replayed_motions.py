@@ -254,7 +254,7 @@ def test_a_dataset_that_does_not_say_what_made_it_is_not_verified(good: RolloutR
 def test_verify_replays_nothing_but_datasets(tmp_path: Path, run) -> None:
     (tmp_path / "scene.xml").write_bytes(scene_files()["scene.xml"])
     code, _, err = run("verify", tmp_path, "--trajectories")
-    assert (code, "trajectories are replayed from a dataset" in err) == (1, True)
+    assert (code, "--trajectories needs a dataset" in err) == (1, True)
     code, _, err = run("verify", dataset_of(tmp_path / "without", [], {}), "--trajectories")
     assert (code, "no trajectories in it to replay" in err) == (1, True)
 

@@ -2,10 +2,6 @@
 
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -134,21 +130,3 @@ def test_a_dataset_elsewhere_is_named_by_its_address(tmp_path):
     site = Site(tmp_path, "tables", "hf://datasets/me/tables", 1, 0, 0)
     assert list_commands(site.named, "a")[0][1] == "tableverse view hf://datasets/me/tables a"
     assert find_local_folder("hf://datasets/me/tables") is find_local_folder("s3://bucket/tables") is None
-
-
-def test_a_stopped_measurement_takes_its_copies_away(tmp_path):
-    source = write_dataset(tmp_path / "out", {"scene": scene_members("scene", photographed=False)}, [])
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    command = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
-    command += ["bench", "gallery", str(source), "--scenes", "100000"]
-    process = subprocess.Popen(
-        command, env={**os.environ, "TMPDIR": str(scratch)}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 60
-    while not list(scratch.glob("*/out/mjcf/*.tar")) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert list(scratch.glob("*/out/mjcf/*.tar"))
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 143
-    assert list(scratch.iterdir()) == []
