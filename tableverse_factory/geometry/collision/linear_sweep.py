@@ -70,7 +70,9 @@ class LinearSweep:
         self._pose = coal.Transform3s()
         self._still = coal.Transform3s()
 
-    def first_clear(self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float) -> float:
+    def find_first_clear(
+        self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float
+    ) -> float:
         """Find the smallest d >= 0 [m] at which every moving body, moved by d, is clear of every fixed body.
 
         Clear means at least `clearance_m` apart, and further by what either mesh sticks out of its pieces.

@@ -15,8 +15,8 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.fast_obj import read_plain_obj
 from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
+from tableverse_factory.geometry.mesh.plain_obj import read_plain_obj
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 MAX_FILE_BYTES = 512 * 1024 * 1024

@@ -11,7 +11,7 @@ from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.geometry.mesh.hulls import compute_face_heights, make_hull_mesh
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
-from tableverse_factory.physics.mjcf.fast_text import format_decimal_lines, format_integer_lines
+from tableverse_factory.physics.mjcf.number_format import format_decimal_lines, format_integer_lines
 
 MAX_PIECE_VERTICES = 64
 MIN_MESH_VERTICES = 4

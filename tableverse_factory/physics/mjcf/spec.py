@@ -19,9 +19,9 @@ from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.mjcf.inertia import MassProperties
 from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
+from tableverse_factory.physics.mjcf.portable_xml import make_portable_xml
 from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import THICKNESS_M, Slab
-from tableverse_factory.physics.mjcf.xml_compat import make_portable_xml
 
 ASSETS = "assets"
 TABLE = "table"

@@ -13,8 +13,8 @@ import numpy as np
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, normalize_quaternion
+from tableverse_factory.physics.mjcf.portable_xml import find_or_add_child
 from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
-from tableverse_factory.physics.mjcf.xml_compat import find_or_add_child
 
 MAX_XML_BYTES = 64 * 1024 * 1024
 CAMERA = "observation"

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.physics.mjcf.drawables import Scenery
+from tableverse_factory.physics.mjcf.scenery import Scenery
 from tableverse_factory.physics.render.preview import PreviewRenderer
 from tableverse_factory.physics.render.render import Rendering, look_at, render_views
 

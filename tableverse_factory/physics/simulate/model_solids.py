@@ -26,9 +26,9 @@ from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volum
 from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, from_trimesh, place_mesh
 from tableverse_factory.geometry.mesh.repair import MIN_FILL_SHARE, make_closed_solid, mesh_to_solid
 from tableverse_factory.geometry.mesh.shells import is_one_shell
-from tableverse_factory.physics.mjcf.drawables import read_mesh
-from tableverse_factory.physics.mjcf.hidden_geoms import find_geoms_without_visual
 from tableverse_factory.physics.mjcf.inertia import is_closed
+from tableverse_factory.physics.mjcf.scenery import read_mesh
+from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies
 
 _MIN_CROPPED_FACES = 500
@@ -111,7 +111,7 @@ def load_bodies(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody
     """Load the free bodies of the model in its order, and the static geometry, with their visible shapes.
 
     Visible are the geoms that do not collide (a body's visual meshes) and colliding ones that no such geom represents
-    (`find_geoms_without_visual`); where all geoms of a body collide, all of them.
+    (`find_undrawn_geoms`); where all geoms of a body collide, all of them.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -195,7 +195,7 @@ def _select_shape_geoms(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.nd
         own = [int(geom) for geom in geoms if model.body_rootid[model.geom_bodyid[geom]] == root]
         solid = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
         drawn = [geom for geom in own if geom not in solid] or own
-        chosen += [*drawn, *find_geoms_without_visual(model, data, drawn, solid)]
+        chosen += [*drawn, *find_undrawn_geoms(model, data, drawn, solid)]
     return chosen
 
 

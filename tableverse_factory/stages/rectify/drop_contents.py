@@ -89,7 +89,7 @@ class Surroundings:
     def freed(self, member: CompositeMember, direction: Vector3) -> tuple[CompositeMember, float]:
         """Push an object clear in a direction (unit vector); returns it and the distance [m]."""
         self._budget.comparisons -= len(member.body.hulls) * self._pieces
-        way = LinearSweep(direction).first_clear([member.solid], self._fixed, self._clearance_m)
+        way = LinearSweep(direction).find_first_clear([member.solid], self._fixed, self._clearance_m)
         return member.at(translate_pose(member.pose, way * direction)), way
 
     @property

@@ -165,7 +165,7 @@ def _lift_parts(
     for group in groups:
         settled: list[int] = []
         for i in (i for i in order if (i,) in group):
-            height = ray.first_clear([lifted[i].body], [lifted[k].body for k in settled], clearance_m)
+            height = ray.find_first_clear([lifted[i].body], [lifted[k].body for k in settled], clearance_m)
             lifted[i] = lifted[i].moved(height * UP)
             settled.append(i)
     return lifted

@@ -36,7 +36,7 @@ def spread_groups(parts: Sequence[RigidPart], ordered: Sequence[Group], clearanc
     for group in ordered[1:]:
         mine = list_members(moved, group)
         direction = compute_outward(mine, origin)
-        distance = LinearSweep(direction).first_clear(
+        distance = LinearSweep(direction).find_first_clear(
             [part.body for part in mine], [part.body for part in anchors], clearance_m
         )
         for entity in group:

@@ -129,7 +129,7 @@ class _Reader:
     def _off(self, i: int, j: int) -> float:
         """Measure how far a part must rise or sink to lie upon another one [m]."""
         upper, lower = self._parts[i].body, self._parts[j].body
-        rise = self._up.first_clear([upper], [lower], 0.0)
+        rise = self._up.find_first_clear([upper], [lower], 0.0)
         return rise if rise > 0.0 else self._down.room([upper], [lower], 0.0, np.inf)
 
     def _is_over(self, i: int, j: int) -> bool:

@@ -36,7 +36,7 @@ def _list_ways_out(
     others = [part.body for i, part in enumerate(parts) if i != k]
     ways = []
     for direction in _list_directions(parts[k], support.standing[k]):
-        distance = LinearSweep(direction).first_clear([parts[k].body], others, clearance_m)
+        distance = LinearSweep(direction).find_first_clear([parts[k].body], others, clearance_m)
         ways.append((distance * (UPWARD_COST if direction[2] > 0.0 else 1.0), distance * direction))
     return ways
 

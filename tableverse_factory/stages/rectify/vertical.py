@@ -55,7 +55,7 @@ def _raise_in_turn(
     settled = list(order[0])
     for entity in order[1:]:
         fixed = [parts[i].body for i in (*settled, *obstacles)]
-        height = ray.first_clear([parts[i].body for i in entity], fixed, clearance_m)
+        height = ray.find_first_clear([parts[i].body for i in entity], fixed, clearance_m)
         for i in entity:
             parts[i] = parts[i].moved(height * UP)
         settled.extend(entity)

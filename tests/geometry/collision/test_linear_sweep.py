@@ -46,7 +46,7 @@ def test_no_smaller_distance_is_clear(seed: int) -> None:
     moving, fixed = body(rng, int(rng.integers(1, 5))), body(rng, int(rng.integers(1, 5)))
     direction = UP if rng.random() < 0.3 else np.append(rng.normal(size=2), 0.0)
     direction = direction / np.linalg.norm(direction)
-    d = LinearSweep(direction).first_clear([moving], [fixed], CLEARANCE)
+    d = LinearSweep(direction).find_first_clear([moving], [fixed], CLEARANCE)
     assert gap_at(moving, fixed, d * direction) >= CLEARANCE - 1e-6
     earlier = np.append(np.arange(0.0, d, STEP), max(d - 2e-6, 0.0)) if d > 0.0 else np.zeros(0)
     assert all(gap_at(moving, fixed, smaller * direction) < CLEARANCE + 1e-6 for smaller in earlier)
@@ -58,8 +58,8 @@ def test_from_the_answer_on_nothing_is_to_do(seed: int) -> None:
     rng = np.random.default_rng(seed)
     moving, fixed = body(rng, 3), body(rng, 3)
     direction = complete_basis(rng.normal(size=3))[:, 1]
-    d = LinearSweep(direction).first_clear([moving], [fixed], CLEARANCE)
-    assert LinearSweep(direction).first_clear([moving.moved(d * direction)], [fixed], CLEARANCE) <= 1e-6
+    d = LinearSweep(direction).find_first_clear([moving], [fixed], CLEARANCE)
+    assert LinearSweep(direction).find_first_clear([moving.moved(d * direction)], [fixed], CLEARANCE) <= 1e-6
 
 
 def test_the_first_gap_is_taken_and_not_a_later_one() -> None:
@@ -69,13 +69,13 @@ def test_the_first_gap_is_taken_and_not_a_later_one() -> None:
     fixed = MovingSolid(place_pieces(ConvexPieces(tuple(row), 1.0, 0.0, "cut"), identity_pose(), 1.0), np.zeros(3))
     thin = ConvexPieces((make_hull_mesh(slab * [0.5, 1.0, 1.0]),), 1.0, 0.0, "cut")
     moving = MovingSolid(place_pieces(thin, identity_pose(), 1.0), np.zeros(3))
-    d = LinearSweep(np.array([1.0, 0.0, 0.0])).first_clear([moving], [fixed], CLEARANCE)
+    d = LinearSweep(np.array([1.0, 0.0, 0.0])).find_first_clear([moving], [fixed], CLEARANCE)
     assert d == pytest.approx(0.015 + CLEARANCE, abs=1e-6)
     wide = ConvexPieces(
         (make_hull_mesh(slab * [1.5, 1.0, 1.0]),), 1.0, 0.0, "cut"
     )  # 30 mm: too wide for the gaps of 30 mm
     moving = MovingSolid(place_pieces(wide, identity_pose(), 1.0), np.zeros(3))
-    d = LinearSweep(np.array([1.0, 0.0, 0.0])).first_clear([moving], [fixed], CLEARANCE)
+    d = LinearSweep(np.array([1.0, 0.0, 0.0])).find_first_clear([moving], [fixed], CLEARANCE)
     assert d == pytest.approx(0.1 + 0.01 + 0.015 + CLEARANCE, abs=1e-6)
 
 
@@ -87,14 +87,14 @@ def test_two_spheres_as_fine_polyhedra_part_at_the_known_distance() -> None:
     )
     solids = place_pieces(sphere, identity_pose(), 1.0)
     moving, fixed = MovingSolid(solids, np.array([0.01, 0.02, 0.0])), MovingSolid(solids, np.zeros(3))
-    d = LinearSweep(np.array([1.0, 0.0, 0.0])).first_clear([moving], [fixed], 0.0)
+    d = LinearSweep(np.array([1.0, 0.0, 0.0])).find_first_clear([moving], [fixed], 0.0)
     assert d == pytest.approx(np.sqrt(0.06**2 - 0.02**2) - 0.01, abs=3e-4)
 
 
 def test_uncovered_meshes_are_kept_further_apart() -> None:
     cube = make_hull_mesh(np.array([[x, y, z] for x in (0.0, 0.1) for y in (0.0, 0.1) for z in (0.0, 0.1)]))
     solids = place_pieces(ConvexPieces((cube,), 1.0, 0.0, "convex"), identity_pose(), 1.0)
-    d = LinearSweep(UP).first_clear(
+    d = LinearSweep(UP).find_first_clear(
         [MovingSolid(solids, np.zeros(3), 0.001)], [MovingSolid(solids, np.zeros(3), 0.002)], CLEARANCE
     )
     assert d == pytest.approx(0.103 + CLEARANCE, abs=1e-6)
@@ -106,7 +106,7 @@ def test_what_moves_away_or_past_is_clear_at_once() -> None:
     fixed = MovingSolid(solids, np.zeros(3))
     for offset in ([0.1005, 0.0, 0.0], [-0.3, 0.1005, 0.0], [0.0, 0.0, 0.2], [-0.3, 0.0, 0.0]):
         ray = LinearSweep(np.array([1.0, 0.0, 0.0]))
-        assert ray.first_clear([MovingSolid(solids, np.array(offset))], [fixed], CLEARANCE) == 0.0
+        assert ray.find_first_clear([MovingSolid(solids, np.array(offset))], [fixed], CLEARANCE) == 0.0
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.001, 0.0099])

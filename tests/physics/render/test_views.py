@@ -10,8 +10,8 @@ from PIL import ImageColor
 
 from schemas.geometry import Camera, Texture, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
-from tableverse_factory.physics.mjcf.drawables import load_scenery, make_box_mesh, make_scenery
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj, scale_and_quantize
+from tableverse_factory.physics.mjcf.scenery import load_scenery, make_box_mesh, make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.preview import PreviewRenderer
 from tableverse_factory.physics.render.views import (

@@ -38,7 +38,9 @@ from tableverse_factory.stages.rectify.rigid_part import make_rigid_part
 from tableverse_factory.stages.rectify.vertical import lift_contents
 
 TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
-MUG, BOWL, SPOON = (make(np.random.default_rng(0)) for make in (vessels.make_mug, vessels.make_bowl, utensils.make_spoon))
+MUG, BOWL, SPOON = (
+    make(np.random.default_rng(0)) for make in (vessels.make_mug, vessels.make_bowl, utensils.make_spoon)
+)
 
 
 def pieces_of(model: GeneratedObject) -> ConvexPieces:
@@ -293,7 +295,9 @@ def filling(
     root: PlacedObject = MUG_AT_HOME, fall_time_s: float = 1.0, budget: SimulationBudget | None = None
 ) -> ContainerFilling:
     config = Config(rectify=RectifyConfig().model_copy(update={"fall_time_s": fall_time_s}))
-    return ContainerFilling(member(root, MUG_PIECES), config, make_rng(0, "scene", "rectify"), budget or SimulationBudget())
+    return ContainerFilling(
+        member(root, MUG_PIECES), config, make_rng(0, "scene", "rectify"), budget or SimulationBudget()
+    )
 
 
 def marble_at(name: str, x: float, z: float) -> CompositeMember:

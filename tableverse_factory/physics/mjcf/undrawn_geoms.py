@@ -15,7 +15,7 @@ The emptiest convex piece around 33 scanned meshes is filled to 0.93; a sticker 
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def find_geoms_without_visual(
+def find_undrawn_geoms(
     model: mujoco.MjModel, data: mujoco.MjData, drawn: Sequence[int], solid: Sequence[int]
 ) -> list[int]:
     """Find the geoms among `solid` that no geom of `drawn` represents: they belong to the shape, though unseen.

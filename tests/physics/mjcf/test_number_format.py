@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.physics.mjcf.fast_text import format_decimal_lines, format_integer_lines
+from tableverse_factory.physics.mjcf.number_format import format_decimal_lines, format_integer_lines
 
 REPEATS = 300
 """Tables so long that they are not left to Python."""

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.mesh import fast_obj, meshes
-from tableverse_factory.geometry.mesh.fast_obj import read_plain_obj
+from tableverse_factory.geometry.mesh import meshes, plain_obj
 from tableverse_factory.geometry.mesh.meshes import read_mesh
+from tableverse_factory.geometry.mesh.plain_obj import read_plain_obj
 
 CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1e-1 0\nv 0 0 -1\n"
 FACES = b"f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -92,11 +92,11 @@ def obj_files(draw: st.DrawFn) -> bytes:
     return (end.join(lines) + draw(st.sampled_from([end, ""]))).encode()
 
 
-@pytest.mark.parametrize("few_bytes", [fast_obj._FEW_BYTES, 0], ids=["numpy", "arrow"])
+@pytest.mark.parametrize("few_bytes", [plain_obj._FEW_BYTES, 0], ids=["numpy", "arrow"])
 @given(data=obj_files())
 def test_any_small_file_is_read_alike_or_left_alone(few_bytes: int, data: bytes) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fast_obj, "_FEW_BYTES", few_bytes)
+        patch.setattr(plain_obj, "_FEW_BYTES", few_bytes)
         if read_plain_obj(data) is not None:
             assert_read_alike(data)
 
