@@ -9,7 +9,7 @@ from schemas.curation import AnswerOrigin
 from tableverse_factory.models.remote.client import ModelClient
 from tableverse_factory.models.remote.endpoint import read_endpoint
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.drawables import make_scenery
+from tableverse_factory.physics.mjcf.scenery import make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.views import draw_judge_sheet
 from tableverse_factory.stages.curate.interfaces import Judgement
