@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from tableverse_factory.core.errors import ModelAccessError
-from tableverse_factory.models.local.model_daemon import main
+from tableverse_factory.models.local.model_daemon import run_daemon
 
 
 def make(spec):
@@ -26,4 +26,4 @@ def make(spec):
 
 
 if __name__ == "__main__":
-    main(make)
+    run_daemon(make)

@@ -15,10 +15,10 @@ from PIL import Image
 
 from schemas.arrow import TABLES
 from schemas.geometry import Camera, Pose, TriangleMesh
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_body, make_scene_files
-from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.physics.render.render import look_at
 from tableverse_factory.stages.export.texture import bake_texture
 

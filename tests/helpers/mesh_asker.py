@@ -21,7 +21,10 @@ def scene_of(name, seeds):
 
 
 def hashes(maker, name, seeds):
-    return [getattr(answer, "data", b"") and content_hash(answer.data) for answer in maker.make(*scene_of(name, seeds))]
+    return [
+        getattr(answer, "data", b"") and content_hash(answer.data)
+        for answer in maker.make_meshes(*scene_of(name, seeds))
+    ]
 
 
 def main():

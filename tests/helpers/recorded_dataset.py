@@ -15,6 +15,7 @@ from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shards import TarShard, shard_path
 from tableverse_factory.dataset.trajectory_files import add_digests
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import (
     compose_poses,
     identity_pose,
@@ -24,7 +25,6 @@ from tableverse_factory.geometry.math.transforms import (
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_files
-from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.physics.render.render import look_at
 from tableverse_factory.robotics.execution.arrays import Recording, encode_recording
 from tableverse_factory.robotics.robots.arm import Arm

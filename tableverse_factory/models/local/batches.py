@@ -1,4 +1,4 @@
-"""Items through a model in batches of one shape, smaller ones where the memory does not do."""
+"""Inference in batches of one shape, with smaller batches where memory is short."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -16,22 +16,21 @@ _NO_MEMORY = (
     "CUBLAS_STATUS_ALLOC_FAILED",
     "CUDNN_STATUS_ALLOC_FAILED",
 )
-"""How torch says so, besides by the class of its error: allocators of its own, the driver, and CUDA's libraries."""
+"""Messages of torch's allocators, the driver and CUDA's libraries when memory is short."""
 
 
-def in_batches(
+def run_in_batches(
     run: Callable[[Sequence[_Item], int], Sequence[_Result]], items: Sequence[_Item], size: int
 ) -> tuple[list[_Result], int]:
-    """What a model says of each item, in their order, and the size of batch that fitted.
+    """Run a model on items; return the results in order, and the batch size that fitted.
 
-    Every forward is to have the same shape: kernels are chosen by it, so a result does not depend on how many others
-    were there. Where the memory is not enough, the size is halved for what is left; only then may the last digits
-    differ.
+    Every forward pass has the same shape: kernels are chosen by it, so a result does not depend on the number of other
+    items. Where memory is short, the size is halved for the remaining items; only then may the last digits differ.
 
     Args:
-        run: Answers a batch, one result for each item; its tensors are to be filled up to the size, which is given.
-        items: Any number of them.
-        size: Items in a batch, at least 1.
+        run: Computes one result for each item of a batch; it pads its tensors to the size that it is given.
+        items: Items in any number.
+        size: Batch size, at least 1.
 
     Raises:
         ModelError: if not even one item fits.
@@ -45,7 +44,7 @@ def in_batches(
             if not is_out_of_memory(error):
                 raise
             if size == 1:
-                raise ModelError(f"one item is too much for the memory of the model: {first_line(error)}") from None
+                raise ModelError(f"one item is too much for the memory of the model: {get_first_line(error)}") from None
             answers = None
         if answers is None:  # outside of `except`, where the error would keep the failed forward's tensors alive
             size = max(1, size // 2)
@@ -58,25 +57,25 @@ def in_batches(
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether torch found no memory, on a GPU or on the CPU."""
+    """Whether an error says that memory is short, on a GPU or on the CPU."""
     torch = sys.modules.get("torch")
     if isinstance(error, MemoryError) or (torch is not None and isinstance(error, torch.OutOfMemoryError)):
         return True
     return any(words in str(error) for words in _NO_MEMORY)
 
 
-def is_broken(error: BaseException) -> bool:
-    """Whether CUDA itself failed: whatever this process asks of the GPU from now on fails, too."""
+def is_cuda_failure(error: BaseException) -> bool:
+    """Whether CUDA itself failed, so that every further call of this process fails too."""
     return "CUDA error" in str(error) and not is_out_of_memory(error)
 
 
 def empty_cache() -> None:
-    """Gives back what torch keeps on a GPU for the next tensor of the same size."""
+    """Return the GPU memory that torch caches."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_available():
         torch.cuda.empty_cache()
 
 
-def first_line(error: BaseException) -> str:
-    """What an error says at first, at most 200 characters."""
+def get_first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, at most 200 characters."""
     return str(error).strip().partition("\n")[0][:200]

@@ -1,16 +1,16 @@
-"""A model's forward as one launch: a GPU replays what it did the first time, instead of being told kernel by kernel."""
+"""CUDA graph of a model's forward pass: one launch replays all kernels."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from tableverse_factory.models.local.device import Device, Tensor, torch_here
+from tableverse_factory.models.local.device import Device, Tensor, import_torch
 
 Forward = Callable[..., tuple[Tensor, ...]]
-"""Tensors to tensors, of shapes that follow from theirs, all on the device; nothing waits for it inside."""
+"""Tensors to tensors on the device; output shapes follow from input shapes, and it does not synchronize."""
 
 WARM_UPS = 2
-"""Calls before it is recorded: libraries make their handles and choose their kernels in the first."""
+"""Calls before recording, in which libraries create their handles and choose their kernels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,19 +21,17 @@ class _Recording:
 
 
 class CudaGraphRunner:
-    """A forward, recorded once for each set of shapes; the same kernels in the same order give the same numbers.
+    """A forward pass recorded once for each set of shapes; the same kernels in the same order give the same numbers.
 
-    Telling a GPU of two thousand kernels costs the CPU 50 to 90 ms however few pictures they are for. A CPU has nothing
-    to record, and is asked anew each time.
+    Launching two thousand kernels costs the CPU 50 to 90 ms whatever the batch size. On a CPU nothing is recorded.
     """
 
     def __init__(self, forward: Forward, device: Device) -> None:
-        """Takes what is to be recorded when it is first called."""
         self._forward, self._on_gpu = forward, device.kind == "cuda"
         self._recordings: dict[tuple[tuple[int, ...], ...], _Recording] = {}
 
     def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Its answer, in tensors that the next call with such shapes writes anew."""
+        """Run the forward pass; the next call with the same shapes overwrites the returned tensors."""
         if not self._on_gpu:
             return self._forward(*inputs)
         shapes = tuple(tuple(tensor.shape) for tensor in inputs)
@@ -45,14 +43,14 @@ class CudaGraphRunner:
         recording.graph.replay()
         return recording.outputs
 
-    def forget(self) -> None:
-        """Lets go of every recording and its memory: as much as its forward needs, for as long as it is kept."""
+    def reset(self) -> None:
+        """Drop every recording and its memory, as much as its forward pass needs."""
         if self._recordings:
-            torch_here().cuda.synchronize()
+            import_torch().cuda.synchronize()
         self._recordings.clear()
 
     def _record(self, inputs: tuple[Tensor, ...]) -> _Recording:
-        cuda = torch_here().cuda
+        cuda = import_torch().cuda
         own = tuple(tensor.clone() for tensor in inputs)
         aside = cuda.Stream()
         aside.wait_stream(cuda.current_stream())

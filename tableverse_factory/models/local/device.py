@@ -1,4 +1,4 @@
-"""Where models with weights run, and in which precision; torch is imported here and nowhere earlier."""
+"""Processor and precision of models with weights; the only place that imports torch."""
 
 import os
 from dataclasses import dataclass
@@ -6,50 +6,45 @@ from typing import Any, Literal
 
 from schemas.config import ModelsConfig
 from tableverse_factory.core.errors import InputError, ModelAccessError
-from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.optional_imports import import_extra
 
 Tensor = Any
-"""A `torch.Tensor`; torch is an extra, and not there for whoever checks types without it."""
+"""A `torch.Tensor`; torch is an extra, and type checks must pass without it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A processor and a precision.
-
-    Attributes:
-        kind: Which processor.
-        precision: Of weights and activations.
-    """
+    """Processor and precision of a model; `precision` is that of weights and activations."""
 
     kind: Literal["cpu", "cuda"]
     precision: Literal["float32", "bfloat16"]
 
     @property
-    def where(self) -> Any:
-        """As torch calls it."""
-        return torch_here().device(self.kind)
+    def torch_device(self) -> Any:
+        """The `torch.device`."""
+        return import_torch().device(self.kind)
 
     @property
     def dtype(self) -> Any:
-        """As torch calls it."""
-        return getattr(torch_here(), self.precision)
+        """The `torch.dtype`."""
+        return getattr(import_torch(), self.precision)
 
 
-def device_of(config: ModelsConfig, said: str = "models.device") -> Device:
-    """What `models.device` and `models.precision` mean on this machine.
+def select_device(config: ModelsConfig, key: str = "models.device") -> Device:
+    """Resolve `models.device` and `models.precision` on this machine.
 
     Args:
-        config: What is asked for.
-        said: Where the user said so, for the error.
+        config: Configuration of models.
+        key: Option or key that sets the device, for the error.
 
     Raises:
-        ModelAccessError: without torch, or where a GPU is asked for and torch sees none.
+        ModelAccessError: without torch, or if a GPU is required and torch sees none.
     """
-    sees_gpu = torch_here().cuda.is_available() if config.device != "cpu" else False
+    sees_gpu = import_torch().cuda.is_available() if config.device != "cpu" else False
     if config.device == "cuda" and not sees_gpu:
         raise ModelAccessError(
-            f"{said} is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, on a "
-            "cluster give the pool a GPU (docs/cluster.md), or say 'auto' or 'cpu'"
+            f"{key} is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, on a "
+            "cluster give the pool a GPU (docs/cluster.md), or set 'auto' or 'cpu'"
         )
     kind: Literal["cpu", "cuda"] = "cuda" if sees_gpu else "cpu"
     if config.precision != "auto":
@@ -57,17 +52,17 @@ def device_of(config: ModelsConfig, said: str = "models.device") -> Device:
     return Device(kind, "bfloat16" if kind == "cuda" else "float32")
 
 
-def torch_here() -> Any:
-    """The module torch, set up for the same bytes every time.
+def import_torch() -> Any:
+    """Import torch, set up for reproducible bytes.
 
-    One thread on a CPU; on a GPU cuDNN's deterministic kernels, none chosen by a race, and float32 that is no TF32.
+    One thread on a CPU; on a GPU cuDNN's deterministic kernels, no kernel benchmarks, and no TF32.
 
     Raises:
-        ModelAccessError: where it is not installed.
+        ModelAccessError: if it is not installed.
     """
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # before the first CUDA call, or it is not heard
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # must be set before the first CUDA call
     try:
-        torch: Any = require_extra("torch", "a model with weights", "models")
+        torch: Any = import_extra("torch", "a model with weights", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     if torch.get_num_threads() != 1:

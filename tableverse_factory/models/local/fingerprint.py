@@ -1,4 +1,4 @@
-"""What a model with weights is, for run.json: another one under the same name would give other bytes."""
+"""Identity of a model with weights for run.json: versions of its packages and a hash of its files."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ from typing import Any
 from schemas.config import ModelsConfig
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import ModelAccessError
-from tableverse_factory.models.local.device import device_of
+from tableverse_factory.models.local.device import select_device
 
 PACKAGES = ("torch", "transformers")
 DISTRIBUTED_BY = {
@@ -17,73 +17,73 @@ DISTRIBUTED_BY = {
     "depth_anything_3_nested": "depth-anything-3",
     "moge_2": "moge",
 }
-"""The package on git of each depth model that has one."""
-_READ = ("*.safetensors", "*.json", "*.pt")
+"""Distributions that are installed from git, by depth model."""
+_WEIGHT_FILES = ("*.safetensors", "*.json", "*.pt")
 
 
-def identity(weights: str, config: ModelsConfig, package: str | None = None) -> dict[str, Any]:
-    """The versions of what runs the model here, where it runs, and the bytes of its weights where they are a path.
+def identify_model(weights: str, config: ModelsConfig, package: str | None = None) -> dict[str, Any]:
+    """Collect the versions of a model's packages, its device, and the hash of its weights if they are a path.
 
     Args:
         weights: Folder, file, or name on the hub.
-        config: Where models run; what `auto` means is looked up on this machine.
-        package: What else runs it, besides `PACKAGES`.
+        config: Device of models; `auto` is resolved on this machine.
+        package: Package that runs the model, besides `PACKAGES`.
     """
-    found: dict[str, Any] = {name: _version(name) for name in PACKAGES}
+    found: dict[str, Any] = {name: _read_version(name) for name in PACKAGES}
     if package:
-        found[package] = _version(package) + _commit(package)
+        found[package] = _read_version(package) + _read_commit(package)
     if config.device == "auto":
-        found["device"] = _automatic()
-    files = _files(weights)
+        found["device"] = _find_auto_device()
+    files = _list_files(weights)
     if files:
-        found["sha256"] = content_hash(*(f"{path.name} {_digest(path)}".encode() for path in files))
+        found["sha256"] = content_hash(*(f"{path.name} {_hash_file(path)}".encode() for path in files))
     return found
 
 
-def stamp(weights: str) -> str:
-    """Changes wherever the weights on the disk do, without reading them: for this machine, and for now."""
-    stats = ((path.name, path.stat()) for path in _files(weights))
+def stat_weights(weights: str) -> str:
+    """Describe weights on disk by inode, size and time, which change with them, without reading them."""
+    stats = ((path.name, path.stat()) for path in _list_files(weights))
     return " ".join(f"{name} {found.st_ino} {found.st_size} {found.st_mtime_ns}" for name, found in stats)
 
 
-def _files(weights: str) -> list[Path]:
+def _list_files(weights: str) -> list[Path]:
     path = Path(weights)
     if weights and path.is_dir():
-        return sorted(found for pattern in _READ for found in path.glob(pattern) if found.is_file())
+        return sorted(found for pattern in _WEIGHT_FILES for found in path.glob(pattern) if found.is_file())
     return [path] if weights and path.is_file() else []
 
 
-def _automatic() -> str:
-    """The device that `auto` is here; without torch there is none."""
+def _find_auto_device() -> str:
+    """Return the device that `auto` means here; `none` without torch."""
     try:
-        return device_of(ModelsConfig()).kind
+        return select_device(ModelsConfig()).kind
     except ModelAccessError:
         return "none"
 
 
-def _commit(package: str) -> str:
-    """The commit that was installed, after a blank; nothing where it came from elsewhere."""
+def _read_commit(package: str) -> str:
+    """Return the installed commit after a blank; nothing if the package was not installed from git."""
     try:
-        said = json.loads(distribution(package).read_text("direct_url.json") or "{}")
+        origin = json.loads(distribution(package).read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):
         return ""
-    commit = said.get("vcs_info", {}).get("commit_id", "")
+    commit = origin.get("vcs_info", {}).get("commit_id", "")
     return f" {commit}" if commit else ""
 
 
-def onnx_identity(weights: str) -> dict[str, Any]:
-    """The version of what runs an ONNX file here, and its bytes; none where there is no such file."""
+def identify_onnx_model(weights: str) -> dict[str, Any]:
+    """Collect the version of onnxruntime, and the hash of an ONNX file if it exists."""
     path = Path(weights)
-    found: dict[str, Any] = {"onnxruntime": _version("onnxruntime")}
-    return {**found, "sha256": _digest(path)} if path.is_file() else found
+    found: dict[str, Any] = {"onnxruntime": _read_version("onnxruntime")}
+    return {**found, "sha256": _hash_file(path)} if path.is_file() else found
 
 
-def _digest(path: Path) -> str:
+def _hash_file(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _version(name: str) -> str:
+def _read_version(name: str) -> str:
     try:
         return version(name)
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Names of weights: what a path is and what a repository of the hub, and which of its commits is meant."""
+"""Names of weights: paths, or repositories on the Hugging Face Hub with a revision."""
 
 import re
 from dataclasses import dataclass
@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelAccessError
-from tableverse_factory.core.optional_imports import require_extra
+from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.timeouts import call_with_timeout
 
-PUBLISHED = {
+DEFAULT_WEIGHTS = {
     "sam2": "facebook/sam2.1-hiera-large",
     "sam3": "facebook/sam3",
     "depth_anything_2": "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf",
@@ -18,15 +18,15 @@ PUBLISHED = {
     "depth_anything_3_nested": "depth-anything/DA3NESTED-GIANT-LARGE-1.1",
     "moge_2": "Ruicheng/moge-2-vitl",
 }
-"""Weights by the name of the backend that takes them where none are named."""
+"""Default weights by backend."""
 
-PATIENCE_S = 60.0
-"""For the hub to say which commit is meant [s]."""
+HUB_TIMEOUT_S = 60.0
+"""Limit for the hub to resolve a revision [s]."""
 
 _NAME = re.compile(r"(?P<name>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _MAX_WORDS = 300
-_OUT_OF_REACH = frozenset(
+_UNREACHABLE = frozenset(
     {
         "LocalEntryNotFoundError",
         "OfflineModeIsEnabled",
@@ -41,8 +41,8 @@ _OUT_OF_REACH = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class OnHub:
-    """A repository of the hub.
+class HubWeights:
+    """A repository on the hub.
 
     Attributes:
         name: `owner/name`.
@@ -53,26 +53,25 @@ class OnHub:
     revision: str
 
 
-def hub_name(weights: str) -> OnHub | None:
-    """The repository that weights name; None where they are a path: `.`, `/` or `~` first, or no `owner/name`."""
+def parse_hub_name(weights: str) -> HubWeights | None:
+    """Parse `owner/name[@revision]`; None for a path, which starts with `.`, `/` or `~` or is no such name."""
     found = None if weights.startswith((".", "/", "~")) else _NAME.fullmatch(weights)
-    return found and OnHub(found["name"], found["revision"] or "")
+    return found and HubWeights(found["name"], found["revision"] or "")
 
 
-def on_hub(weights: str, key: str) -> OnHub | None:
-    """The repository that weights name, see `hub_name`.
+def resolve_hub_name(weights: str, key: str) -> HubWeights | None:
+    """Parse the repository that weights name, see `parse_hub_name`.
 
-    What a configuration means must not hang on the folder that a command is run in, so a name that could be either is
-    refused.
+    The meaning of a configuration must not depend on the working directory, so an ambiguous name is refused.
 
     Args:
         weights: A folder or file, or `owner/name`, which may be followed by `@` and a revision.
-        key: The configuration's key, for what is said.
+        key: Key of the configuration, for messages.
 
     Raises:
         ModelAccessError: if a folder or file here has the same name.
     """
-    found = hub_name(weights)
+    found = parse_hub_name(weights)
     if found is None:
         return None
     here = next((name for name in (weights, found.name) if Path(name).exists()), "")
@@ -84,13 +83,13 @@ def on_hub(weights: str, key: str) -> OnHub | None:
     return found
 
 
-def source(weights: str, key: str) -> tuple[str, dict[str, str]]:
-    """What a `from_pretrained` is given: a path, or a name on the hub and its revision.
+def resolve_source(weights: str, key: str) -> tuple[str, dict[str, str]]:
+    """Return the arguments of `from_pretrained`: a path, or a name on the hub and its revision.
 
     Raises:
-        ModelAccessError: if there is no such path, or as `on_hub`.
+        ModelAccessError: if there is no such path, or as `resolve_hub_name`.
     """
-    hub = on_hub(weights, key)
+    hub = resolve_hub_name(weights, key)
     if hub is not None:
         return hub.name, {"revision": hub.revision} if hub.revision else {}
     if not Path(weights).exists():
@@ -100,17 +99,17 @@ def source(weights: str, key: str) -> tuple[str, dict[str, str]]:
     return weights, {}
 
 
-def at_commit(weights: str, key: str) -> str:
-    """`owner/name@COMMIT` of weights on the hub: by the hub's cache where that knows the revision, else by the hub.
+def pin_commit(weights: str, key: str) -> str:
+    """Return `owner/name@COMMIT` of weights on the hub, from the local cache if it knows the revision.
 
     Raises:
-        ModelAccessError: if the hub knows none such, is needed and out of reach, or its client is too old to ask.
+        ModelAccessError: if the hub has no such weights or cannot be reached, or its client is too old.
     """
-    hub = on_hub(weights, key)
+    hub = resolve_hub_name(weights, key)
     if hub is None or _COMMIT.fullmatch(hub.revision):
         return weights
     try:
-        module: Any = require_extra("huggingface_hub", f"{key} = {weights!r}", "models")
+        module: Any = import_extra("huggingface_hub", f"{key} = {weights!r}", "models")
     except InputError as error:
         raise ModelAccessError(str(error)) from None
     if not hasattr(module.HfApi, "resolve_revision"):
@@ -124,15 +123,15 @@ def at_commit(weights: str, key: str) -> str:
         try:
             commit = resolve(local_files_only=True)
         except module.errors.RevisionResolutionError:
-            commit = call_with_timeout(PATIENCE_S, resolve, TimeoutError())
+            commit = call_with_timeout(HUB_TIMEOUT_S, resolve, TimeoutError())
     except Exception as error:
-        raise ModelAccessError(why(error, weights, key)) from error
+        raise ModelAccessError(describe_load_error(error, weights, key)) from error
     return f"{hub.name}@{commit.resolved}"
 
 
-def why(error: BaseException, weights: str, key: str) -> str:
-    """One line: what is wrong with weights of the hub, and what to do."""
-    causes = {type(cause).__name__ for cause in _chain(error)}
+def describe_load_error(error: BaseException, weights: str, key: str) -> str:
+    """Describe in one line why weights cannot be loaded, and what to do."""
+    causes = {type(cause).__name__ for cause in _list_causes(error)}
     head = f"{key} = {weights!r}"
     name, _, revision = weights.partition("@")
     if "GatedRepoError" in causes:
@@ -146,22 +145,22 @@ def why(error: BaseException, weights: str, key: str) -> str:
             f"{head}: the hub knows no such model, or shows it only to a token (HF_TOKEN); a folder here is written "
             f"'./{name}'"
         )
-    if causes & _OUT_OF_REACH:
+    if causes & _UNREACHABLE:
         at = f" --revision {revision}" if revision else ""
         return (
             f"{head} is not on this machine and the hub cannot be reached: fetch it once with a network "
             f"(`hf download {name}{at}`), or name a folder that holds it"
         )
-    return f"{head} cannot be loaded: {short(error)}"
+    return f"{head} cannot be loaded: {shorten_error(error)}"
 
 
-def short(error: BaseException) -> str:
-    """Kind and first words of an error."""
+def shorten_error(error: BaseException) -> str:
+    """Return the type and the start of the message of an error."""
     words = " ".join(str(error).split())
     return f"{type(error).__name__}: {words[:_MAX_WORDS]}"
 
 
-def _chain(error: BaseException | None) -> list[BaseException]:
+def _list_causes(error: BaseException | None) -> list[BaseException]:
     found: list[BaseException] = []
     while error is not None and len(found) < 20:
         found.append(error)

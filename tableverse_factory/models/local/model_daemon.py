@@ -1,4 +1,4 @@
-"""One process for one model on a machine: started by the first who asks, asked by all, gone after the last."""
+"""Daemon that holds one model for all processes of a machine: started by the first client, ended after the last."""
 
 import contextlib
 import fcntl
@@ -19,106 +19,106 @@ import numpy as np
 
 import tableverse_factory
 from tableverse_factory.core.errors import ModelAccessError, ModelError
-from tableverse_factory.core.source_hash import source_hash
-from tableverse_factory.models.local.batch_server import Answer, Heartbeat, serve
-from tableverse_factory.models.local.fingerprint import stamp
-from tableverse_factory.models.local.wire import WireError, read_words, receive, send
+from tableverse_factory.core.source_hash import compute_source_hash
+from tableverse_factory.models.local.batch_server import BatchModel, Heartbeat, serve_batches
+from tableverse_factory.models.local.fingerprint import stat_weights
+from tableverse_factory.models.local.wire import WireError, decode_error, receive_arrays, send_arrays
 
 Spec = dict[str, str | int]
-"""Which model, in words and numbers."""
+"""Description of a model."""
 
 START_S = 60.0
-"""Until the process listens; its weights are read after that [s]."""
+"""Limit until the daemon listens; it loads its weights after that [s]."""
 TRIES = 2
-"""A process that dies is started once more for the same question."""
+"""Attempts at one question; a daemon that dies is started again."""
 DYING_S = 0.5
-"""A process that dies closes its connections before the socket that others connect to [s]."""
+"""Time in which a dying daemon closes its listening socket after its connections [s]."""
 _POLL_S = 0.02
 _MAX_FOLDER = 85
-"""Of our folder's path [bytes]: a socket's own may have 107."""
+"""Maximum length of the folder's path; that of a socket may have 107 [bytes]."""
 _LOG = "a .log in the folder tableverse-UID of $XDG_RUNTIME_DIR, or of the temporary files where that is not set"
-"""Where a process says what went wrong; the path itself is another on each machine, and messages go into datasets."""
-_OPEN: dict[Path, socket.socket] = {}
+"""Place of the log in messages, which go into datasets and must not hold paths of this machine."""
+_CONNECTIONS: dict[Path, socket.socket] = {}
 
 
-def ask(module: str, spec: Spec, question: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The answer of the process that holds this model.
+def ask_daemon(module: str, spec: Spec, question: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Ask the daemon of a model, which is started if none listens.
 
     Args:
-        module: Run as the process where there is none yet; it calls `main`.
-        spec: Which model, for `main`; equal ones share a process, on the same GPU.
+        module: Module to run as the daemon; it calls `run_daemon`.
+        spec: Description of the model; equal ones share a daemon, on the same GPU.
         question: Arrays that the model understands.
 
     Raises:
-        ModelAccessError: if the model cannot be had before a person acts.
-        ModelError: if it gives no answer, or its process dies again and again.
+        ModelAccessError: if a person must act before the model can be used.
+        ModelError: if the model fails, or the daemon dies at every attempt.
     """
-    path = _address(module, spec)
+    path = compute_socket_path(module, spec)
     for _ in range(TRIES):
         try:
-            end = _OPEN.get(path) or _OPEN.setdefault(path, _connected(path, module, spec))
-            send(end, question)
-            fine, *answer = receive(end)
-        except BaseException as error:  # whatever it is: the next question must not get this one's answer
-            hang_up(path)
+            end = _CONNECTIONS.get(path) or _CONNECTIONS.setdefault(path, _connect(path, module, spec))
+            send_arrays(end, question)
+            fine, *answer = receive_arrays(end)
+        except BaseException as error:  # the next question must not get this one's answer
+            close_connections(path)
             if not isinstance(error, WireError):
                 raise
             time.sleep(DYING_S)
             continue
         if fine.tolist() == [1]:
             return answer
-        kind, message = read_words(answer[0])
+        kind, message = decode_error(answer[0])
         raise ModelAccessError(message) if kind == ModelAccessError.__name__ else ModelError(message)
     raise ModelError(f"the process of the model died {TRIES} times; its last words are in {_LOG}")
 
 
-def hang_up(path: Path | None = None) -> None:
-    """Closes the connection to a process, or to all of them."""
-    for key in [path] if path else list(_OPEN):
-        if end := _OPEN.pop(key, None):
+def close_connections(path: Path | None = None) -> None:
+    """Close the connection to one daemon, or to all."""
+    for key in [path] if path else list(_CONNECTIONS):
+        if end := _CONNECTIONS.pop(key, None):
             end.close()
 
 
-def main(make: Callable[[Spec], tuple[int, Callable[[Heartbeat], Answer]]]) -> None:
-    """What a process of a model does: `MODULE SOCKET SPEC`.
+def run_daemon(configure: Callable[[Spec], tuple[int, Callable[[Heartbeat], BatchModel]]]) -> None:
+    """Serve a model; to be called by a module that is run as `MODULE SOCKET SPEC`.
 
     Args:
-        make: From the spec the most questions in one batch, and what makes the model.
+        configure: Returns the batch size for a description, and a function that makes the model.
     """
     path, spec = Path(sys.argv[1]), json.loads(sys.argv[2])
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
     listener.listen(256)
-    most, made = make(spec)
-    serve(listener, path, most, made)
+    most, make = configure(spec)
+    serve_batches(listener, path, most, make)
     path.with_suffix(".log").unlink(missing_ok=True)
 
 
-def _address(module: str, spec: Spec) -> Path:
-    """Where the process listens: one for each model, its weights as they are now, each GPU and this code."""
+def compute_socket_path(module: str, spec: Spec) -> Path:
+    """Compute the path of a daemon's socket from the model, its weights on disk, the GPU and this code."""
     gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     parts = [
         module,
         json.dumps(spec, sort_keys=True),
-        stamp(str(spec.get("weights", ""))),
+        stat_weights(str(spec.get("weights", ""))),
         gpu,
         str(Path(tableverse_factory.__file__).resolve()),
-        source_hash(),
+        compute_source_hash(),
         sys.prefix,
     ]
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
-    return _folder() / f"{name}.sock"
+    return _make_socket_folder() / f"{name}.sock"
 
 
-def _folder() -> Path:
-    """A folder that only this user can enter: in `XDG_RUNTIME_DIR` where that is one, else with the temporary files.
+def _make_socket_folder() -> Path:
+    """Create a folder that only this user can enter, in `XDG_RUNTIME_DIR` or with the temporary files.
 
     Raises:
-        ModelAccessError: if somebody else made it, or none can be made.
+        ModelAccessError: if it belongs to another user or cannot be created.
     """
-    above = [Path(given).absolute() for given in (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir()) if given]
-    ours = [path / f"tableverse-{os.getuid()}" for path in above if path.is_dir()]
-    fitting = [path for path in ours if len(os.fsencode(path)) <= _MAX_FOLDER]
+    parents = [Path(name).absolute() for name in (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir()) if name]
+    candidates = [path / f"tableverse-{os.getuid()}" for path in parents if path.is_dir()]
+    fitting = [path for path in candidates if len(os.fsencode(path)) <= _MAX_FOLDER]
     if not fitting:
         raise ModelAccessError(
             f"the process of a model needs a folder whose path has at most {_MAX_FOLDER} bytes: set XDG_RUNTIME_DIR"
@@ -136,28 +136,28 @@ def _folder() -> Path:
     return folder
 
 
-def _connected(path: Path, module: str, spec: Spec) -> socket.socket:
-    """A connection to the process, which is started where nobody listens.
+def _connect(path: Path, module: str, spec: Spec) -> socket.socket:
+    """Connect to the daemon, and start it if none listens.
 
     Raises:
-        ModelError: if it does not come.
+        ModelError: if it does not start.
     """
-    with _alone(path.with_name("lock")):
-        end = _knocked(path)
+    with _hold_lock(path.with_name("lock")):
+        end = _try_connect(path)
         if end is not None:
             return end
         path.unlink(missing_ok=True)
-        process = _started(path, module, spec)
+        process = _start(path, module, spec)
         until = time.monotonic() + START_S
         while time.monotonic() < until and process.poll() is None:
-            end = _knocked(path)
+            end = _try_connect(path)
             if end is not None:
                 return end
             time.sleep(_POLL_S)
     raise ModelError(f"the process of the model did not start; its last words are in {_LOG}")
 
 
-def _knocked(path: Path) -> socket.socket | None:
+def _try_connect(path: Path) -> socket.socket | None:
     end = socket.socket(socket.AF_UNIX)
     try:
         end.connect(str(path))
@@ -167,10 +167,10 @@ def _knocked(path: Path) -> socket.socket | None:
     return end
 
 
-def _started(path: Path, module: str, spec: Spec) -> "subprocess.Popen[bytes]":
-    """In a session of its own: the sandbox that starts it may be killed, and others ask it, too.
+def _start(path: Path, module: str, spec: Spec) -> "subprocess.Popen[bytes]":
+    """Start the daemon in its own session: the sandbox that starts it may be killed, but it serves others too.
 
-    It stays in the asker's folder, for `PYTHONPATH` and caches may be named from there.
+    It keeps the working directory, to which `PYTHONPATH` and caches may be relative.
     """
     command = [sys.executable, "-P", "-m", module, str(path), json.dumps(spec)]
     with path.with_suffix(".log").open("wb") as log:
@@ -178,8 +178,8 @@ def _started(path: Path, module: str, spec: Spec) -> "subprocess.Popen[bytes]":
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """While one looks for a process or starts it, others wait."""
+def _hold_lock(path: Path) -> Iterator[None]:
+    """Hold a lock, so that only one process looks for a daemon and starts it."""
     with contextlib.closing(path.open("ab")) as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

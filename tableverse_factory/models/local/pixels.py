@@ -1,67 +1,66 @@
-"""Pictures as a model wants them: resized, between 0 and 1, less the mean, over the deviation. No torchvision."""
+"""Preprocessing of images for models: resize and normalize, without torchvision."""
 
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
 from schemas.geometry import Picture
-from tableverse_factory.models.local.device import Device, Tensor, torch_here
+from tableverse_factory.models.local.device import Device, Tensor, import_torch
 
 Kernel = Literal["bilinear", "bicubic"]
-"""As torch calls it."""
 
 
 @dataclass(frozen=True, slots=True)
-class Normal:
-    """Mean and deviation of each colour, of values between 0 and 1."""
+class Normalization:
+    """Mean and standard deviation of each colour channel, for values between 0 and 1."""
 
     mean: tuple[float, float, float]
     deviation: tuple[float, float, float]
 
 
-IMAGENET = Normal((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
-HALF = Normal((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+IMAGENET = Normalization((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+HALF = Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 
 
-def picture_on(picture: Picture, device: Device) -> Tensor:
-    """The picture where the model is, shape (h, w, 3), uint8: bytes travel, resizing is done there."""
-    torch = torch_here()
+def upload_image(picture: Picture, device: Device) -> Tensor:
+    """Copy a picture to the device as uint8, shape (h, w, 3); it is resized there."""
+    torch = import_torch()
     on_gpu = device.kind == "cuda"
     host = torch.empty(picture.shape, dtype=torch.uint8, pin_memory=on_gpu)
     host.numpy()[...] = picture
-    return host.to(device.where, non_blocking=True) if on_gpu else host
+    return host.to(device.torch_device, non_blocking=True) if on_gpu else host
 
 
-def pixel_values(
-    pictures: list[Tensor], size: tuple[int, int], normal: Normal, device: Device, kernel: Kernel = "bilinear"
+def compute_pixel_values(
+    pictures: list[Tensor], size: tuple[int, int], normal: Normalization, device: Device, kernel: Kernel = "bilinear"
 ) -> Tensor:
-    """Pictures of any sizes as one batch, shape (n, 3, height, width), in the device's precision.
+    """Resize and normalize pictures to one batch, shape (n, 3, height, width), in the device's precision.
 
-    Resized as torchvision does with `antialias=True`, values rounded to whole ones before they are normalised, which
-    is what models saw when they were trained. The aspect is not kept.
+    Resizes as torchvision does with `antialias=True`; values are rounded before they are normalized, as in training.
+    The aspect ratio is not kept.
 
     Args:
         pictures: Shape (h, w, 3) each, uint8, on the device.
-        size: Height and width that the model wants.
-        normal: What it was trained with.
-        device: Where it runs.
-        kernel: By which it is resized.
+        size: Height and width of the model's input.
+        normal: Normalization that the model was trained with.
+        device: Device of the model.
+        kernel: Interpolation.
     """
-    mean, deviation = _constants(normal, device)
-    planes = torch_here().cat([_resized(picture, size, kernel) for picture in pictures])
+    mean, deviation = _upload_constants(normal, device)
+    planes = import_torch().cat([_resize(picture, size, kernel) for picture in pictures])
     return ((planes - mean) / deviation).to(device.dtype)
 
 
 @cache
-def _constants(normal: Normal, device: Device) -> tuple[Tensor, Tensor]:
-    """Mean and deviation of values up to 255; kept, for a copy of what is not pinned waits for all the GPU's work."""
-    tensor = torch_here().tensor
-    mean, deviation = (tensor(values, device=device.where) for values in (normal.mean, normal.deviation))
+def _upload_constants(normal: Normalization, device: Device) -> tuple[Tensor, Tensor]:
+    """Upload mean and deviation for values up to 255; cached, for a copy of unpinned memory waits for the GPU."""
+    tensor = import_torch().tensor
+    mean, deviation = (tensor(values, device=device.torch_device) for values in (normal.mean, normal.deviation))
     return mean.view(1, 3, 1, 1) * 255.0, deviation.view(1, 3, 1, 1) * 255.0
 
 
-def _resized(picture: Tensor, size: tuple[int, int], kernel: Kernel) -> Tensor:
-    torch = torch_here()
+def _resize(picture: Tensor, size: tuple[int, int], kernel: Kernel) -> Tensor:
+    torch = import_torch()
     planes = picture.permute(2, 0, 1)[None].to(torch.float32)
     if planes.shape[-2:] == size:
         return planes

@@ -6,8 +6,8 @@ from typing import Any
 
 from schemas.config import Config
 from tableverse_factory.core.errors import ConfigError
-from tableverse_factory.models.local.fingerprint import DISTRIBUTED_BY, identity, onnx_identity
-from tableverse_factory.models.local.hf_weights import PUBLISHED, at_commit, on_hub
+from tableverse_factory.models.local.fingerprint import DISTRIBUTED_BY, identify_model, identify_onnx_model
+from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS, pin_commit, resolve_hub_name
 
 _KEYS = {"depth": ("observe", "depth_weights"), "segmenter": ("perceive", "segmenter_weights")}
 """Section and key of the configuration that name weights of the Hub, by the part of run.json that records them."""
@@ -28,13 +28,13 @@ def record_weights(part: str, backend: str, config: Config, before: Mapping[str,
     """
     section, name = _KEYS[part]
     named = getattr(getattr(config, section), name)
-    key, weights = f"{section}.{name}", named or PUBLISHED[backend]
-    hub, found = on_hub(weights, key), identity(weights, config.models, DISTRIBUTED_BY.get(backend))
+    key, weights = f"{section}.{name}", named or DEFAULT_WEIGHTS[backend]
+    hub, found = resolve_hub_name(weights, key), identify_model(weights, config.models, DISTRIBUTED_BY.get(backend))
     if hub is None:
         return _require_weights(key, weights, found, "no folder or file here, and no `owner/name` of the hub")
     earlier = before.get(part, {}).get("weights", "")
     unchanged = earlier.startswith(f"{hub.name}@") and before["config"][section].get(name) == named
-    return {**found, "weights": earlier if unchanged else at_commit(weights, key)}
+    return {**found, "weights": earlier if unchanged else pin_commit(weights, key)}
 
 
 def record_onnx(key: str, weights: str) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def record_onnx(key: str, weights: str) -> dict[str, Any]:
     Raises:
         ConfigError: if it is missing.
     """
-    return _require_weights(key, weights, onnx_identity(weights), "give the .onnx file")
+    return _require_weights(key, weights, identify_onnx_model(weights), "give the .onnx file")
 
 
 def pin_commits(config: Config, recorded: Mapping[str, Any]) -> Config:

@@ -1,22 +1,23 @@
-"""Arrays between the processes of one user on one machine: a count, then each as an .npy file with its length."""
+"""Messages of arrays between the processes of one user on one machine: a frame for each array, as an .npy file."""
 
 import io
 import json
 import socket
-import struct
 import time
 import tokenize
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-_COUNT = struct.Struct("<I")
-_LENGTH = struct.Struct("<Q")
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.framing import FrameError, encode_header, read_frame
+
 MAX_ARRAYS = 16
 MAX_BYTES = 1 << 30
-"""Of one array: a picture of 200 million pixels fits."""
+"""Maximum size of one array: a picture of 200 million pixels fits."""
 
-_NO_ARRAY = (
+_ARRAY_ERRORS = (
     ValueError,
     EOFError,
     SyntaxError,
@@ -26,90 +27,85 @@ _NO_ARRAY = (
     RecursionError,
     tokenize.TokenError,
 )
-"""What numpy raises for a header that is none."""
+"""Errors that numpy raises for a malformed header."""
 
 
 class WireError(Exception):
-    """The other end is gone, too slow, or says what is no message."""
+    """The other end is gone, too slow, or sends no message."""
 
 
-def send(end: socket.socket, arrays: Sequence[np.ndarray]) -> None:
-    """Sends a message.
+def send_arrays(connection: socket.socket, arrays: Sequence[np.ndarray]) -> None:
+    """Send a message; the label of each frame is the number of arrays that follow it.
 
     Raises:
-        WireError: if nobody listens any more.
+        WireError: if the other end is gone.
     """
     try:
-        end.sendall(_COUNT.pack(len(arrays)))
-        for array in arrays:
-            held = io.BytesIO()
-            np.lib.format.write_array(held, np.ascontiguousarray(array), allow_pickle=False)
-            end.sendall(_LENGTH.pack(held.tell()))
-            end.sendall(held.getbuffer())
+        for following, array in zip(reversed(range(len(arrays))), arrays, strict=True):
+            file = io.BytesIO()
+            np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+            connection.sendall(encode_header(file.getvalue(), b"%d" % following))
+            connection.sendall(file.getbuffer())
     except OSError as error:
         raise WireError(str(error)) from error
 
 
-def receive(end: socket.socket, within_s: float | None = None) -> list[np.ndarray]:
-    """The next message.
+def receive_arrays(connection: socket.socket, within_s: float | None = None) -> list[np.ndarray]:
+    """Receive the next message.
 
     Args:
-        end: Of the connection.
-        within_s: For the whole of it; None for as long as it takes [s].
+        connection: Socket to read from.
+        within_s: Limit for the whole message; None for no limit [s].
 
     Raises:
-        WireError: at the end of the stream, after that time, or where it is no message.
+        WireError: at the end of the stream, after the limit, or for bytes that are no message.
     """
     until = None if within_s is None else time.monotonic() + within_s
-    (count,) = _COUNT.unpack(_exactly(end, _COUNT.size, until))
-    if count > MAX_ARRAYS:
-        raise WireError(f"a message of {count} arrays")
-    return [_array(end, until) for _ in range(count)]
+    arrays: list[np.ndarray] = []
+    following = b""
+    while following != b"0":
+        if len(arrays) == MAX_ARRAYS:
+            raise WireError(f"a message of more than {MAX_ARRAYS} arrays")
+        try:
+            following, data = read_frame(partial(_receive_exactly, connection, until=until), MAX_BYTES)
+            arrays.append(np.lib.format.read_array(io.BytesIO(data), allow_pickle=False))
+        except (FrameError, BuildError, *_ARRAY_ERRORS) as error:
+            raise WireError(f"not an array: {error}") from error
+    return arrays
 
 
-def _array(end: socket.socket, until: float | None) -> np.ndarray:
-    (length,) = _LENGTH.unpack(_exactly(end, _LENGTH.size, until))
-    if length > MAX_BYTES:
-        raise WireError(f"an array of {length} bytes")
-    try:
-        array: np.ndarray = np.lib.format.read_array(io.BytesIO(_exactly(end, length, until)), allow_pickle=False)
-    except _NO_ARRAY as error:
-        raise WireError(f"not an array: {error}") from error
-    return array
-
-
-def _exactly(end: socket.socket, length: int, until: float | None) -> bytearray:
+def _receive_exactly(connection: socket.socket, length: int, until: float | None) -> bytes:
     data = bytearray(length)
-    view, had = memoryview(data), 0
-    while had < length:
+    view, received = memoryview(data), 0
+    while received < length:
         left = None if until is None else until - time.monotonic()
         if left is not None and left <= 0.0:
             raise WireError("the other end is too slow")
         try:
             if left is not None:
-                end.settimeout(left)
-            got = end.recv_into(view[had:])
+                connection.settimeout(left)
+            count = connection.recv_into(view[received:])
         except OSError as error:
             raise WireError(str(error)) from error
-        if not got:
+        if not count:
             raise WireError("the other end is gone")
-        had += got
-    return data
+        received += count
+    return bytes(data)
 
 
-def words(kind: str, message: str) -> np.ndarray:
-    """Two strings as an array of bytes: how an answer says that there is none."""
+def encode_error(kind: str, message: str) -> np.ndarray:
+    """Encode the class and message of an error as an array of bytes."""
     return np.frombuffer(json.dumps([kind, message]).encode(), dtype=np.uint8)
 
 
-def read_words(array: np.ndarray) -> tuple[str, str]:
-    """What `words` made an array of.
+def decode_error(array: np.ndarray) -> tuple[str, str]:
+    """Decode the class and message of an error.
 
     Raises:
-        WireError: if it did not.
+        WireError: if the array holds none.
     """
     try:
         kind, message = json.loads(array.astype(np.uint8).tobytes())
     except ValueError as error:
-        raise WireError("not words") from error
+        raise WireError("not an error message") from error
     return str(kind), str(message)

@@ -66,6 +66,6 @@ def compute_answer_key(endpoint: Endpoint, messages: tuple[Message, ...], schema
 
 def _describe_disk_error(folder: Path, error: OSError) -> ModelAccessError:
     return ModelAccessError(
-        f"answers cannot be kept in {folder}: {error.strerror or error}. Free some space, or set TABLEVERSE_CACHE "
+        f"answers cannot be kept in {folder}: {error.strerror or error}. Free space, or set TABLEVERSE_CACHE "
         "to another folder"
     )

@@ -62,7 +62,7 @@ class RateLimiter:
                 raise
         except OSError as error:
             raise ModelAccessError(
-                f"turns to ask cannot be kept in {self._folder}: {error.strerror or error}. Free some space, or set "
+                f"turns to ask cannot be kept in {self._folder}: {error.strerror or error}. Free space, or set "
                 "TABLEVERSE_CACHE to another folder"
             ) from error
 

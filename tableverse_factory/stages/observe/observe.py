@@ -1,4 +1,4 @@
-"""The first stage: a row of the manifest becomes an observation, or a layout with its meshes."""
+"""First stage: read a row of the manifest as an observation, or as a layout with its meshes."""
 
 from typing import Protocol
 
@@ -12,37 +12,41 @@ from schemas.objects import PlacedObject, PlacedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import AnswerInvalidError, InputError
-from tableverse_factory.geometry.math.transforms import normalized_quaternion
-from tableverse_factory.geometry.mesh.meshes import bounds, placed_mesh
+from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.math.transforms import normalize_quaternion
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import Capture, read_capture, read_recorded_meshes
 from tableverse_factory.sources.content_hash import verify_content_hash
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
-from tableverse_factory.stages.observe.depth.depth_anything_2 import depth_anything_2
-from tableverse_factory.stages.observe.depth.depth_anything_3 import depth_anything_3, depth_anything_3_nested
-from tableverse_factory.stages.observe.depth.moge import moge_2
-from tableverse_factory.stages.observe.depth.recorded import recorded
+from tableverse_factory.stages.observe.depth.depth_anything_2 import estimate_depth_anything_2
+from tableverse_factory.stages.observe.depth.depth_anything_3 import (
+    estimate_depth_anything_3,
+    estimate_depth_anything_3_nested,
+)
+from tableverse_factory.stages.observe.depth.moge import estimate_moge_2
+from tableverse_factory.stages.observe.depth.recorded import read_recorded_depth
 
 TABLE_MARGIN_M = 0.15
 TABLE_COLOR = (176, 148, 116)
 
 
 class DepthModel(Protocol):
-    """The door of everything that gives a picture its metric depth and camera."""
+    """Interface of depth models, which give a picture metric depth and a camera."""
 
     def __call__(self, item: ImageRow, config: Config) -> Capture:
-        """The picture with its depth.
+        """Return the picture with its depth.
 
         Raises:
-            InputError: with a reason, where this model can say nothing about such a row.
-            AnswerInvalidError: where it gives none.
-            ModelAccessError: where it is not installed, or has no weights.
+            InputError: with a reason, if the model cannot process the row.
+            AnswerInvalidError: if its answer is invalid.
+            ModelAccessError: if it is not installed, or has no weights.
         """
         ...
 
 
-def sensor_depth(item: ImageRow, config: Config) -> Capture:
-    """The capture's own depth.
+def read_sensor_depth(item: ImageRow, config: Config) -> Capture:
+    """Read the sensor depth of a capture.
 
     Raises:
         InputError: `no_depth_model` for a bare picture, else as `read_capture`.
@@ -58,36 +62,36 @@ def sensor_depth(item: ImageRow, config: Config) -> Capture:
 
 
 DEPTH_MODELS: dict[str, DepthModel] = {
-    "sensor": sensor_depth,
-    "recorded": recorded,
-    "depth_anything_3": depth_anything_3,
-    "depth_anything_3_nested": depth_anything_3_nested,
-    "moge_2": moge_2,
-    "depth_anything_2": depth_anything_2,
+    "sensor": read_sensor_depth,
+    "recorded": read_recorded_depth,
+    "depth_anything_3": estimate_depth_anything_3,
+    "depth_anything_3_nested": estimate_depth_anything_3_nested,
+    "moge_2": estimate_moge_2,
+    "depth_anything_2": estimate_depth_anything_2,
 }
 
 
 def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Observation]:  # noqa: ARG001
-    """Reads a capture, or a picture through the depth model; what cannot be used is dropped with its reason.
+    """Read a capture, or a picture with the depth model; unusable rows are dropped with the reason.
 
     Raises:
-        ModelAccessError: if the depth model is not installed, or its weights are not there.
+        ModelAccessError: if the depth model is not installed or its weights are missing.
     """
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
         verify_content_hash(item, config.observe)
-        found = DEPTH_MODELS["sensor" if item.kind is SceneKind.CAPTURE else config.observe.depth](item, config)
-        replayed = config.place.mesh_model == "replay"
-        meshes = read_recorded_meshes(item.uri, found.ids, config.observe) if replayed else ()
+        capture = DEPTH_MODELS["sensor" if item.kind is SceneKind.CAPTURE else config.observe.depth](item, config)
+        is_replay = config.place.mesh_model == "replay"
+        meshes = read_recorded_meshes(item.uri, capture.ids, config.observe) if is_replay else ()
     except (InputError, AnswerInvalidError) as error:
         return Dropped(error.reason, str(error))
-    seen = (found.color, found.depth, found.camera, found.detections, found.ids)
-    return Done(Observation(item.scene_id, *seen, meshes, found.bend))
+    fields = (capture.color, capture.depth, capture.camera, capture.detections, capture.ids)
+    return Done(Observation(item.scene_id, *fields, meshes, capture.bend))
 
 
 def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[PlacedObjects]:  # noqa: ARG001
-    """Reads a layout file and its meshes; the table is as large as the objects and a margin."""
+    """Read a layout file and its meshes; the table is as large as the objects and a margin."""
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:
@@ -96,18 +100,18 @@ def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, servic
         meshes = read_layout_meshes(item.uri, layout, config.observe)
     except InputError as error:
         return Dropped(error.reason, str(error))
-    objects = tuple(_placed(entry, meshes[entry.mesh]) for entry in layout.objects)
-    return Done(PlacedObjects(item.scene_id, _table_under(objects), objects))
+    objects = tuple(_place_entry(entry, meshes[entry.mesh]) for entry in layout.objects)
+    return Done(PlacedObjects(item.scene_id, _fit_table(objects), objects))
 
 
-def _placed(entry: LayoutObject, mesh: TriangleMesh) -> PlacedObject:
-    pose = Pose(np.array(entry.pose.position), normalized_quaternion(np.array(entry.pose.quaternion_wxyz)))
+def _place_entry(entry: LayoutObject, mesh: TriangleMesh) -> PlacedObject:
+    pose = Pose(np.array(entry.pose.position), normalize_quaternion(np.array(entry.pose.quaternion_wxyz)))
     return PlacedObject(entry.id, entry.label, 1.0, mesh, entry.scale, pose, entry.contained_in, entry.count)
 
 
-def _table_under(objects: tuple[PlacedObject, ...]) -> Table:
-    """An axis-aligned table-top under all objects, `TABLE_MARGIN_M` larger on each side."""
-    boxes = [bounds(placed_mesh(o.mesh, o.pose, o.scale)) for o in objects]
+def _fit_table(objects: tuple[PlacedObject, ...]) -> Table:
+    """Fit an axis-aligned table-top under all objects, `TABLE_MARGIN_M` larger on each side."""
+    boxes = [aabb(place_mesh(o.mesh, o.pose, o.scale).vertices) for o in objects]
     low = np.min([box[0] for box in boxes], axis=0)[:2]
     high = np.max([box[1] for box in boxes], axis=0)[:2]
     return Table((low + high) / 2, (high - low) / 2 + TABLE_MARGIN_M, 0.0, TABLE_COLOR, 0.0)

@@ -14,8 +14,8 @@ from PIL import Image
 from schemas.geometry import Camera
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.client import MeshClient, MeshFile, MeshQuery, RgbdImage
-from tableverse_factory.stages.place.mesh_service.model_completion import mesh_of
-from tests.helpers.mesh_keepers import keepers_inside
+from tableverse_factory.stages.place.mesh_service.model_completion import convert_mesh
+from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import ROOT
 from tests.helpers.weights_hub import Model, weights_hub
 
@@ -82,7 +82,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
 
 @pytest.fixture
 def inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with keepers_inside(monkeypatch):
+    with daemons_inside(monkeypatch):
         yield
 
 
@@ -214,7 +214,7 @@ def asked(command: list[object], folder: Path, count: int) -> list[MeshFile | st
     view = RgbdImage(color, depth, Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
     masks = [np.arange(24).reshape(4, 6) // 2 == 3 + k for k in range(count)]
     line = (sys.executable, *map(str, command))
-    return MeshClient(line, 60.0, Services(folder / "cache")).make(view, [MeshQuery(mask, 5) for mask in masks])
+    return MeshClient(line, 60.0, Services(folder / "cache")).make_meshes(view, [MeshQuery(mask, 5) for mask in masks])
 
 
 @pytest.mark.slow
@@ -224,7 +224,7 @@ def test_sam_3d_objects_is_called_as_its_package_wants(inside, tmp_path):
     (answer,) = asked([HERE / "sam3d.py", "--checkout", tmp_path], tmp_path, 1)
     assert isinstance(answer, MeshFile), answer
     assert (answer.format, answer.up) == ("glb", "y")
-    np.testing.assert_allclose(3.0 * np.ptp(mesh_of(answer).vertices, axis=0), [1, 3, 2], atol=1e-6)
+    np.testing.assert_allclose(3.0 * np.ptp(convert_mesh(answer).vertices, axis=0), [1, 3, 2], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -235,7 +235,7 @@ def test_triposr_is_called_as_its_package_wants_and_memory_that_is_short_halves_
     answers = asked([HERE / "triposr.py", *options], tmp_path, 5)
     for answer in answers:
         assert isinstance(answer, MeshFile), answer
-        mesh = mesh_of(answer)
+        mesh = convert_mesh(answer)
         np.testing.assert_allclose(3.0 * np.ptp(mesh.vertices, axis=0), [1, 2, 3], atol=1e-6)
         assert mesh.vertex_colors is not None
         assert mesh.vertex_colors[0].tolist() == [200, 30, 20]

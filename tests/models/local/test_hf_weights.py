@@ -5,10 +5,10 @@ import pytest
 from schemas.config import Config
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import Device
-from tableverse_factory.models.local.hf_weights import at_commit, on_hub
+from tableverse_factory.models.local.hf_weights import pin_commit, resolve_hub_name
 from tableverse_factory.models.local.recorded_weights import pin_commits
 from tableverse_factory.run_record import collect_external_inputs, make_run_record
-from tableverse_factory.stages.perceive.sam.model import load
+from tableverse_factory.stages.perceive.sam.model import load_sam
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.weights_hub import Model, weights_hub
 
@@ -51,12 +51,12 @@ def run_of(weights, before=None):
 
 
 def test_what_is_loaded_is_the_revision_that_is_named(hub, folders):
-    old, new = (first_weight(load("sam2", str(folder), CPU)) for folder in folders)
+    old, new = (first_weight(load_sam("sam2", str(folder), CPU)) for folder in folders)
     assert old != new
     refs = hub.models[NAME].refs
-    assert first_weight(load("sam2", NAME, CPU)) == new
-    assert first_weight(load("sam2", f"{NAME}@v1", CPU)) == old
-    assert first_weight(load("sam2", f"{NAME}@{refs['v1']}", CPU)) == old
+    assert first_weight(load_sam("sam2", NAME, CPU)) == new
+    assert first_weight(load_sam("sam2", f"{NAME}@v1", CPU)) == old
+    assert first_weight(load_sam("sam2", f"{NAME}@{refs['v1']}", CPU)) == old
 
 
 def test_a_build_stays_at_the_commit_that_it_began_with(hub, folders):
@@ -71,8 +71,8 @@ def test_a_build_stays_at_the_commit_that_it_began_with(hub, folders):
     hub.asked.clear()
     assert run_of(NAME, before=first) == first
     assert not hub.asked
-    assert first_weight(load("sam2", stages.perceive.segmenter_weights, CPU)) == first_weight(
-        load("sam2", str(folders[1]), CPU)
+    assert first_weight(load_sam("sam2", stages.perceive.segmenter_weights, CPU)) == first_weight(
+        load_sam("sam2", str(folders[1]), CPU)
     )
 
 
@@ -85,11 +85,11 @@ def test_another_commit_is_another_run(hub, monkeypatch, tmp_path):
 
 def test_what_is_in_the_cache_asks_nobody(hub, folders):
     begun = run_of(NAME)
-    load("sam2", begun["segmenter"]["weights"], CPU)
+    load_sam("sam2", begun["segmenter"]["weights"], CPU)
     hub.models[NAME].commit(folders[0])
     hub.asked.clear()
     assert run_of(NAME) == begun
-    load("sam2", begun["segmenter"]["weights"], CPU)
+    load_sam("sam2", begun["segmenter"]["weights"], CPU)
     assert not hub.asked
 
 
@@ -101,7 +101,7 @@ def test_a_whole_commit_needs_no_hub(hub):
 
 def refused(weights):
     with pytest.raises(ModelAccessError, match=r"perceive\.segmenter_weights = ") as told:
-        at_commit(weights, KEY)
+        pin_commit(weights, KEY)
     assert "\n" not in str(told.value)
     return str(told.value)
 
@@ -114,7 +114,7 @@ def test_what_the_hub_does_not_know_is_said_before_the_build_begins(hub, monkeyp
 
 
 def test_a_hub_that_says_nothing_is_not_waited_for_without_end(hub, monkeypatch):
-    monkeypatch.setattr("tableverse_factory.models.local.hf_weights.PATIENCE_S", 0.2)
+    monkeypatch.setattr("tableverse_factory.models.local.hf_weights.HUB_TIMEOUT_S", 0.2)
     hub.silent_s = 1.0
     assert "the hub cannot be reached" in refused(NAME)
 
@@ -126,15 +126,15 @@ def test_a_client_that_is_too_old_to_ask_is_named(hub, monkeypatch):
 
 def test_a_missing_revision_and_a_gated_model_are_told_apart_where_they_are_loaded(hub):
     with pytest.raises(ModelAccessError, match="knows no 'v9' of this model"):
-        load("sam2", f"{NAME}@v9", CPU)
+        load_sam("sam2", f"{NAME}@v9", CPU)
     hub.gated.add(NAME)
     with pytest.raises(ModelAccessError, match="is gated"):
-        load("sam2", NAME, CPU)
+        load_sam("sam2", NAME, CPU)
 
 
 @pytest.mark.parametrize("weights", ["./weights/sam2", "/weights/sam2", "~/sam2", "sam2", "a/b/c", "a/b@", "a b/c"])
 def test_a_path_is_no_name_on_the_hub(weights):
-    assert on_hub(weights, KEY) is None
+    assert resolve_hub_name(weights, KEY) is None
 
 
 def test_a_home_is_where_the_shell_has_it(monkeypatch):
@@ -151,4 +151,4 @@ def test_a_folder_like_a_name_on_the_hub_is_never_guessed(hub, folders, tmp_path
         with pytest.raises(ModelAccessError, match=rf"'{weights}' may be a name on the hub .* write './{NAME}'"):
             run_of(weights)
     assert "sha256" in run_of(f"./{NAME}")["segmenter"]
-    assert first_weight(load("sam2", f"./{NAME}", CPU)) == first_weight(load("sam2", str(folders[0]), CPU))
+    assert first_weight(load_sam("sam2", f"./{NAME}", CPU)) == first_weight(load_sam("sam2", str(folders[0]), CPU))

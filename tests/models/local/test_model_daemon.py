@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.framing import encode_header
 from tableverse_factory.models.local import batch_server, model_daemon
 from tableverse_factory.models.local.batch_server import REFUSED, serve_batches
 from tableverse_factory.models.local.wire import WireError, decode_error, receive_arrays, send_arrays
@@ -157,7 +158,7 @@ def test_who_talks_slowly_holds_nobody_up_for_longer_than_one_message_may_take(d
     stop = threading.Event()
 
     def drip():
-        slow.sendall(b"\x01\x00\x00\x00" + (1000).to_bytes(8, "little"))
+        slow.sendall(encode_header(bytes(1000), b"0"))
         while not stop.wait(0.1):
             try:
                 slow.sendall(b"x")
@@ -183,7 +184,7 @@ def test_a_header_that_describes_no_array_is_no_message(shape):
     array = b"\x93NUMPY\x01\x00" + len(padded).to_bytes(2, "little") + padded
     left, right = socket.socketpair()
     with left, right:
-        left.sendall((1).to_bytes(4, "little") + len(array).to_bytes(8, "little") + array)
+        left.sendall(encode_header(array, b"0") + array)
         left.shutdown(socket.SHUT_WR)
         with pytest.raises(WireError):
             receive_arrays(right)
@@ -195,7 +196,7 @@ def test_who_hangs_up_or_talks_nonsense_is_forgotten(desk):
     send_arrays(gone, [np.array([1])])
     gone.close()
     rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
-    huge.sendall(b"\x01\x00\x00\x00" + b"\xff" * 8)
+    huge.sendall(encode_header(b"")[:-8] + b"\xff" * 8)
     for end in (rude, huge):
         with pytest.raises(WireError):
             receive_arrays(end)

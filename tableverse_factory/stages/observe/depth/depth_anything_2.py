@@ -1,4 +1,4 @@
-"""Depth Anything V2, metric (Yang et al. 2024), by transformers: light enough for a CPU; it tells no camera."""
+"""Metric Depth Anything V2 (Yang et al. 2024) from transformers: runs on a CPU; estimates no camera."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,70 +10,79 @@ from schemas.config import Config
 from schemas.geometry import Picture
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import ModelAccessError
-from tableverse_factory.models.local.batches import in_batches
-from tableverse_factory.models.local.device import Device, device_of, torch_here
-from tableverse_factory.models.local.hf_weights import PUBLISHED
-from tableverse_factory.models.local.pixels import IMAGENET, picture_on, pixel_values
-from tableverse_factory.models.local.weights import loaded, pretrained
+from tableverse_factory.models.local.batches import run_in_batches
+from tableverse_factory.models.local.device import Device, import_torch, select_device
+from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS
+from tableverse_factory.models.local.pixels import IMAGENET, compute_pixel_values, upload_image
+from tableverse_factory.models.local.weights import load_once, load_pretrained
 from tableverse_factory.sources.capture import Capture
-from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, camera_for, capture_of, centred
-from tableverse_factory.stages.observe.depth.rgb_image import read_photograph
+from tableverse_factory.stages.observe.depth.estimate import (
+    DepthEstimate,
+    build_capture,
+    create_centered_camera,
+    rescale_camera,
+)
+from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
 
 NAME = "depth_anything_2"
 SIDE_PX = 518
 
 
-def depth_anything_2(item: ImageRow, config: Config) -> Capture:
-    """The picture with the depth of the model's metric head; the focal length is by EXIF or `observe.focal_px`.
+def estimate_depth_anything_2(item: ImageRow, config: Config) -> Capture:
+    """Estimate metric depth; the focal length comes from EXIF or `observe.focal_px`.
 
     Raises:
-        InputError: `no_focal_length`, `depth_all_zero`, or as `read_photograph`.
+        InputError: `no_focal_length`, `depth_all_zero`, or as `read_rgb_image`.
         ModelAccessError: without torch, transformers or weights, or with weights of a relative model.
     """
-    photo = read_photograph(item.uri, config.observe)
-    focal = photo.focal_px(config.observe.focal_px)
-    depth = metric_depth(photo.color, config.observe.depth_weights or PUBLISHED[NAME], device_of(config.models))
+    photo = read_rgb_image(item.uri, config.observe)
+    focal = photo.get_focal_px(config.observe.focal_px)
+    depth = predict_metric_depth(
+        photo.color, config.observe.depth_weights or DEFAULT_WEIGHTS[NAME], select_device(config.models)
+    )
     height, width = photo.color.shape[:2]
-    camera = camera_for(centred(focal, focal, width, height), depth.shape[1], depth.shape[0])
-    return capture_of(photo.color, DepthEstimate(depth, camera), config.observe)
+    camera = rescale_camera(create_centered_camera(focal, focal, width, height), depth.shape[1], depth.shape[0])
+    return build_capture(photo.color, DepthEstimate(depth, camera), config.observe)
 
 
-def metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.ndarray, "h w"]:
-    """Metres at the model's own resolution.
+def predict_metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.ndarray, "h w"]:
+    """Predict depth at the model's resolution [m].
 
     Raises:
-        ModelAccessError: see `depth_anything_2`.
-        ModelError: where the memory is not enough.
+        ModelAccessError: see `estimate_depth_anything_2`.
+        ModelError: if the memory is short.
     """
-    model = loaded((NAME, weights, device), lambda: _metric(weights, device))
-    torch = torch_here()
-    size = process_size(color.shape[0], color.shape[1], int(model.config.patch_size))
+    model = load_once((NAME, weights, device), lambda: _load_metric_model(weights, device))
+    torch = import_torch()
+    size = compute_input_size(color.shape[0], color.shape[1], int(model.config.patch_size))
 
     def run(pictures: Sequence[Picture], _: int) -> list[Float32[np.ndarray, "h w"]]:
         with torch.inference_mode():
-            on_device = [picture_on(picture, device) for picture in pictures]
-            said = model(pixel_values(on_device, size, IMAGENET, device, "bicubic")).predicted_depth
-            return list(said.to(torch.float32).cpu().numpy())
+            on_device = [upload_image(picture, device) for picture in pictures]
+            predicted = model(compute_pixel_values(on_device, size, IMAGENET, device, "bicubic")).predicted_depth
+            return list(predicted.to(torch.float32).cpu().numpy())
 
-    (depth,), _ = in_batches(run, [color], 1)
+    (depth,), _ = run_in_batches(run, [color], 1)
     return depth
 
 
-def process_size(height: int, width: int, patch: int) -> tuple[int, int]:
-    """Height and width for the model: that side near `SIDE_PX` which changes less so, each a multiple of its patches.
+def compute_input_size(height: int, width: int, patch: int) -> tuple[int, int]:
+    """Compute the input size: the side that changes less becomes about `SIDE_PX`, both multiples of the patch.
 
-    So the model's own processor does it, and it was trained: 240 x 320 becomes 392 x 518, 1536 x 2048 518 x 686.
+    As the model's own processor does: 240 x 320 becomes 392 x 518, 1536 x 2048 becomes 518 x 686.
     """
     scale = min((SIDE_PX / height, SIDE_PX / width), key=lambda scale: abs(1.0 - scale))
     rows, columns = (max(1, round(side * scale / patch)) * patch for side in (height, width))
     return rows, columns
 
 
-def _metric(weights: str, device: Device) -> Any:
-    model = pretrained("DepthAnythingForDepthEstimation", weights, device, "observe.depth_weights", ("depth_anything",))
+def _load_metric_model(weights: str, device: Device) -> Any:
+    model = load_pretrained(
+        "DepthAnythingForDepthEstimation", weights, device, "observe.depth_weights", ("depth_anything",)
+    )
     if model.config.depth_estimation_type != "metric":
         raise ModelAccessError(
-            f"observe.depth_weights = {weights!r} is a relative model, which gives no metres: take a metric one, like "
-            f"{PUBLISHED[NAME]}"
+            f"observe.depth_weights = {weights!r} is a relative model, which gives no metres; use a metric one, like "
+            f"{DEFAULT_WEIGHTS[NAME]}"
         )
     return model

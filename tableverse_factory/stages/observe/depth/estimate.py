@@ -1,4 +1,4 @@
-"""What depth models say of a picture, and how it becomes a capture: back at its size, in metres, within bounds."""
+"""Estimates of depth models, and their conversion to captures."""
 
 from dataclasses import dataclass
 
@@ -8,22 +8,22 @@ from schemas.config import ObserveConfig
 from schemas.geometry import Camera, DepthImage, Frozen, Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.capture import Capture
-from tableverse_factory.stages.observe.depth.resample import brought_back
+from tableverse_factory.stages.observe.depth.resample import resample_depth
 
 MODEL_BEND = 0.015
-"""Monocular depth is smooth and wrong by a few per cent in large patches; so much of the distance is allowed for."""
-_METRES_OF_NO_TABLE = 100.0
-"""Depth of which all is beyond this is in another unit."""
+"""Share of the distance by which monocular depth may be bent smoothly."""
+_IMPLAUSIBLE_M = 100.0
+"""A depth map entirely beyond this is probably in another unit [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthEstimate(Frozen):
-    """Depth and camera of a picture at the resolution that the model worked at.
+    """Depth and camera at the resolution of the model.
 
     Attributes:
-        depth: Along the optical axis [m], shape (h, w); 0, negative or not finite where nothing is believed.
-        camera: Intrinsics at that resolution; `width` and `height` are those of `depth`.
-        bend: Share of the distance by which the depth may be bent smoothly; 0 of a sensor.
+        depth: Along the optical axis [m], shape (h, w); 0, negative or not finite where unknown.
+        camera: Intrinsics for the size of `depth`.
+        bend: Share of the distance by which the depth may be bent smoothly; 0 for a sensor.
     """
 
     depth: DepthImage
@@ -31,60 +31,60 @@ class DepthEstimate(Frozen):
     bend: float = MODEL_BEND
 
 
-def camera_for(camera: Camera, width: int, height: int) -> Camera:
-    """The same camera's intrinsics for a picture of another size; pixel centres at whole numbers."""
+def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Rescale intrinsics to another picture size; pixel centres are at whole numbers."""
     x, y = width / camera.width, height / camera.height
     return Camera(camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5, width, height)
 
 
-def centred(focal_x: float, focal_y: float, width: int, height: int) -> Camera:
-    """A camera whose principal point is the middle of the picture."""
+def create_centered_camera(focal_x: float, focal_y: float, width: int, height: int) -> Camera:
+    """Create a camera with its principal point in the middle of the picture."""
     return Camera(focal_x, focal_y, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
-def from_matrix(matrix: np.ndarray, width: int, height: int) -> Camera:
-    """Intrinsics as a matrix, the picture's left and upper edge at 0, as networks give them; in pixels.
+def parse_intrinsics(matrix: np.ndarray, width: int, height: int) -> Camera:
+    """Convert an intrinsic matrix, with the picture's left and upper edge at 0, as networks give it.
 
     Args:
-        matrix: Shape (3, 3).
-        width: Of the picture that it is for.
-        height: Likewise.
+        matrix: Shape (3, 3) [px].
+        width: Width of its picture [px].
+        height: Height of its picture [px].
 
     Raises:
-        InputError: `bad_intrinsics`, if a model gave what no camera has.
+        InputError: `bad_intrinsics` for values of no camera.
     """
     fx, fy, cx, cy = (float(matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
     inside = 0.0 <= cx <= width and 0.0 <= cy <= height
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0.0 and fy > 0.0 and inside):
-        said = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g}"
-        raise InputError(f"the depth model gave {said} for {width} x {height} pixels: no camera", "bad_intrinsics")
+        values = f"fx {fx:.4g}, fy {fy:.4g}, cx {cx:.4g}, cy {cy:.4g}"
+        raise InputError(f"the depth model gave {values} for {width} x {height} pixels: no camera", "bad_intrinsics")
     return Camera(fx, fy, cx - 0.5, cy - 0.5, width, height)
 
 
-def capture_of(
+def build_capture(
     color: Picture, estimate: DepthEstimate, bounds: ObserveConfig, origin: str = "the depth model's answer"
 ) -> Capture:
-    """The picture with the estimate's depth at its own size.
+    """Build a capture with the estimated depth at the size of the picture.
 
     Args:
         color: Shape (h, w, 3).
-        estimate: At any size of nearly the same aspect.
-        bounds: `max_depth_m`, beyond which nothing is believed.
-        origin: What holds the depth, for messages.
+        estimate: At any size of nearly the same aspect ratio.
+        bounds: Holds `max_depth_m`; greater depth is ignored.
+        origin: Source of the depth, for messages.
 
     Raises:
-        InputError: `depth_all_zero`, if no reading is left.
+        InputError: `depth_all_zero` if no depth is left.
     """
     height, width = color.shape[:2]
-    believed = np.isfinite(estimate.depth) & (estimate.depth > 0.0) & (estimate.depth <= bounds.max_depth_m)
-    if not believed.any():
+    is_valid = np.isfinite(estimate.depth) & (estimate.depth > 0.0) & (estimate.depth <= bounds.max_depth_m)
+    if not is_valid.any():
         read = estimate.depth[np.isfinite(estimate.depth) & (estimate.depth > 0.0)]
         nearest = f"the nearest is {read.min():.3g} m" if read.size else "no reading is finite and positive"
-        unit = "; is it in millimetres?" if read.size and read.min() > _METRES_OF_NO_TABLE else ""
+        unit = "; is it in millimetres?" if read.size and read.min() > _IMPLAUSIBLE_M else ""
         raise InputError(
             f"{origin} holds no depth between 0 and observe.max_depth_m = {bounds.max_depth_m:g} m: {nearest}{unit}",
             "depth_all_zero",
         )
-    depth = brought_back(np.where(believed, estimate.depth, 0.0), width, height, smeared=estimate.bend > 0.0)
-    camera = camera_for(estimate.camera, width, height)
+    depth = resample_depth(np.where(is_valid, estimate.depth, 0.0), width, height, smeared=estimate.bend > 0.0)
+    camera = rescale_camera(estimate.camera, width, height)
     return Capture(color, depth, camera, None, None, estimate.bend)

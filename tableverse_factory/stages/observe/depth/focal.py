@@ -1,4 +1,4 @@
-"""How long the lens of a bare picture was, by its EXIF."""
+"""Focal length of a picture from its EXIF data."""
 
 import math
 import struct
@@ -8,10 +8,10 @@ from typing import Any
 from PIL import Image
 
 DIAGONAL_35MM = math.hypot(36.0, 24.0)
-"""Of the film that "35 mm equivalent" speaks of [mm]; equivalence is of diagonals (CIPA DCG-001)."""
+"""Diagonal of 35 mm film, to which "35 mm equivalent" refers [mm] (CIPA DCG-001)."""
 
 SHORTEST, LONGEST = 0.2, 50.0
-"""Bounds of a believable focal length, in longer sides of the picture: a fisheye and a telescope lie outside."""
+"""Bounds of a plausible focal length, in longer sides of the picture: fisheyes and telescopes lie outside."""
 
 MAX_ASPECT_CHANGE = 0.02
 _EXIF_IFD = 0x8769
@@ -21,47 +21,47 @@ _SENSOR_PER_UNIT, _SENSOR_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
-def exif_focal(image: Image.Image) -> float | None:
-    """Focal length by the EXIF [px]; None where it says nothing that can be believed of this picture.
+def read_exif_focal(image: Image.Image) -> float | None:
+    """Read the focal length from EXIF [px]; None if it is missing or implausible.
 
-    A picture that was cut has another aspect than its camera gave it: then its EXIF is about another picture. One
-    that was made smaller is fine.
+    The EXIF of a cropped picture, whose aspect ratio differs from the recorded one, is ignored; that of a resized
+    picture is used.
     """
-    tags = _tags(image)
+    tags = _read_tags(image)
     longer, shorter = max(image.size), min(image.size)
-    taken = sorted(number for tag in (_WIDTH, _HEIGHT) if (number := _positive(tags.get(tag))) is not None)
+    taken = sorted(number for tag in (_WIDTH, _HEIGHT) if (number := _parse_positive(tags.get(tag))) is not None)
     if len(taken) == 2 and abs(taken[0] / taken[1] - shorter / longer) > MAX_ASPECT_CHANGE * shorter / longer:
         return None
-    focal = _by_film(tags, image.size) or _by_sensor(tags, longer, taken)
+    focal = _compute_from_film(tags, image.size) or _compute_from_sensor(tags, longer, taken)
     return focal if focal is not None and SHORTEST * longer <= focal <= LONGEST * longer else None
 
 
-def _tags(image: Image.Image) -> dict[int, Any]:
-    """What the camera wrote; nothing where that is broken, which says nothing about the pixels."""
+def _read_tags(image: Image.Image) -> dict[int, Any]:
+    """Read the EXIF tags; empty if they are damaged, which says nothing about the pixels."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off
+            warnings.simplefilter("ignore", UserWarning)  # Pillow warns about truncated maker notes
             return dict(image.getexif().get_ifd(_EXIF_IFD))
-    except (SyntaxError, ValueError, OverflowError, OSError, struct.error):  # each has been seen of Pillow
+    except (SyntaxError, ValueError, OverflowError, OSError, struct.error):  # Pillow raises each of them
         return {}
 
 
-def _by_film(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
-    equivalent = _positive(tags.get(_FOCAL_35MM))
+def _compute_from_film(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
+    equivalent = _parse_positive(tags.get(_FOCAL_35MM))
     return None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
 
 
-def _by_sensor(tags: dict[int, Any], longer: int, taken: list[float]) -> float | None:
-    """From millimetres and the sensor's pixels per length, at the size that the picture had when it was taken."""
-    focal_mm, per_unit = _positive(tags.get(_FOCAL_MM)), _positive(tags.get(_SENSOR_PER_UNIT))
+def _compute_from_sensor(tags: dict[int, Any], longer: int, taken: list[float]) -> float | None:
+    """Compute from millimetres and the sensor's resolution, at the recorded size of the picture."""
+    focal_mm, per_unit = _parse_positive(tags.get(_FOCAL_MM)), _parse_positive(tags.get(_SENSOR_PER_UNIT))
     unit_mm = _UNIT_MM.get(tags.get(_SENSOR_UNIT, 2))
     if focal_mm is None or per_unit is None or unit_mm is None or len(taken) != 2:
         return None
     return focal_mm * per_unit / unit_mm * longer / taken[1]
 
 
-def _positive(value: Any) -> float | None:
-    """A tag's number if it is one: rationals may divide by zero, and anybody may have written text."""
+def _parse_positive(value: Any) -> float | None:
+    """Parse an untrusted tag as a positive number; rationals may divide by zero."""
     if isinstance(value, bytes | str | bool) or value is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Packages of depth models that no index has: asked for where they are used, and missed in one line."""
+"""Packages of depth models that are installed from git, because no package index has them."""
 
 import importlib
 from importlib.util import find_spec
@@ -10,14 +10,14 @@ PACKAGES = {
     "depth_anything_3": ("Depth Anything 3", "git+https://github.com/ByteDance-Seed/Depth-Anything-3"),
     "moge": ("MoGe-2", "git+https://github.com/microsoft/MoGe"),
 }
-"""By module: what it is called, and what pip installs. Names like these on PyPI are not the authors'."""
+"""Name and pip source by module. Similar names on PyPI are not the authors'."""
 
 
-def package(module: str) -> ModuleType:
-    """A module of one of `PACKAGES`.
+def import_git_package(module: str) -> ModuleType:
+    """Import a module of one of `PACKAGES`.
 
     Raises:
-        ModelAccessError: saying what to install.
+        ModelAccessError: if it is not installed; says what to install.
     """
     name, source = PACKAGES[module.partition(".")[0]]
     try:
@@ -28,6 +28,6 @@ def package(module: str) -> ModuleType:
         raise ModelAccessError(f"{name} is not installed{lack}; pip install '{source}'") from None
 
 
-def is_there(module: str) -> bool:
-    """Whether a package of this name is installed; what it needs itself is not looked at."""
+def is_installed(module: str) -> bool:
+    """Whether a package is installed; its dependencies are not checked."""
     return find_spec(module) is not None

@@ -1,4 +1,4 @@
-"""Depth at the resolution of a model brought back to the picture, without points that hang between two surfaces."""
+"""Resampling of a model's depth to the size of the picture, without flying pixels between surfaces."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -7,27 +7,26 @@ from scipy import ndimage
 from schemas.geometry import DepthImage
 
 STEP = 0.04
-"""Neighbouring depths that differ by more than this share lie on two surfaces: a table seen at 10° from a metre and a
-half away changes by 2.5 % from pixel to pixel of a model that works at 504."""
+"""Neighbouring depths that differ by more than this share lie on two surfaces: a table seen at 10° from 1.5 m changes
+by 2.5 % between pixels of a model that works at 504."""
 
 
-def brought_back(depth: DepthImage, width: int, height: int, *, smeared: bool = True) -> Float32[np.ndarray, "h w"]:
-    """The depth at another size: smooth on a surface, and from one side or the other at a step, never from between.
+def resample_depth(depth: DepthImage, width: int, height: int, *, smeared: bool = True) -> Float32[np.ndarray, "h w"]:
+    """Resample depth: bilinear on a surface, nearest neighbour at a step.
 
-    Networks smear steps over some pixels, and bilinear resizing does it again; points from there hang in the air
-    between an object and what lies behind it. Those that the model gave are taken out, and no new ones are made: a
-    pixel is interpolated only where all four around it lie on one surface, else it gets the nearest of them.
+    Networks and bilinear resizing smear steps, which gives flying pixels between an object and its background. Those of
+    the model are removed, and no new ones arise: a pixel is interpolated only if its four neighbours lie on one surface.
 
     Args:
-        depth: Shape (h', w') [m]; 0 where there is none.
-        width: Of the picture.
-        height: Of the picture.
-        smeared: Whether steps are smeared in it, as networks do; a sensor's readings are left as they are.
+        depth: Shape (h', w'); 0 where unknown [m].
+        width: Width of the picture [px].
+        height: Height of the picture [px].
+        smeared: Whether steps are smeared, as by networks; depth of a sensor is not filtered.
     """
-    source = np.where(hanging(depth), 0.0, depth).astype(np.float32) if smeared else depth.astype(np.float32)
+    source = np.where(find_step_pixels(depth), 0.0, depth).astype(np.float32) if smeared else depth.astype(np.float32)
     if source.shape == (height, width):
         return source
-    rows, columns = _positions(source.shape[0], height), _positions(source.shape[1], width)
+    rows, columns = _map_centers(source.shape[0], height), _map_centers(source.shape[1], width)
     top, left = np.floor(rows).astype(np.intp), np.floor(columns).astype(np.intp)
     down, right = (rows - top).astype(np.float32)[:, None], (columns - left).astype(np.float32)[None, :]
     bottom = np.minimum(top + 1, source.shape[0] - 1)
@@ -43,8 +42,8 @@ def brought_back(depth: DepthImage, width: int, height: int, *, smeared: bool = 
     return result
 
 
-def hanging(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
-    """Pixels with a step among their eight neighbours that lie on neither side of it."""
+def find_step_pixels(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
+    """Find pixels that lie between the two sides of a step among their eight neighbours."""
     known = depth > 0.0
     low = ndimage.minimum_filter(np.where(known, depth, np.inf), 3, mode="nearest")
     high = ndimage.maximum_filter(np.where(known, depth, 0.0), 3, mode="nearest")
@@ -55,8 +54,8 @@ def hanging(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
     return between
 
 
-def _positions(source: int, target: int) -> Float64[np.ndarray, " n"]:
-    """Where the centres of the target's pixels lie among those of the source, which covers the same picture."""
+def _map_centers(source: int, target: int) -> Float64[np.ndarray, " n"]:
+    """Map the centres of target pixels to coordinates of the source, which covers the same picture."""
     centres = (np.arange(target) + 0.5) * (source / target) - 0.5
     within: Float64[np.ndarray, " n"] = np.clip(centres, 0.0, source - 1.0)
     return within

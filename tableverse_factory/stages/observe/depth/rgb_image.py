@@ -1,4 +1,4 @@
-"""A picture without depth: its pixels the right way up, and the focal length that its file tells."""
+"""Picture without depth: upright pixels and the focal length from its file."""
 
 from dataclasses import dataclass
 
@@ -8,62 +8,62 @@ from PIL import Image
 from schemas.config import ObserveConfig
 from schemas.geometry import Frozen, Picture
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.untrusted import open_picture, read_bytes
-from tableverse_factory.sources.image_file import picture_of
-from tableverse_factory.stages.observe.depth.focal import exif_focal
+from tableverse_factory.core.storage.untrusted import open_image, read_bytes
+from tableverse_factory.sources.image_file import decode_upright
+from tableverse_factory.stages.observe.depth.focal import read_exif_focal
 
 MAX_SIDE_PX = 2048
-"""Longer side at which pictures go on: depth models see 500 pixels, and every stage after pays for each of the rest."""
+"""Maximum longer side; larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest."""
 
 MAX_ASPECT = 8.0
-"""Of the longer side to the shorter: no camera makes narrower pictures, and no depth model was trained on them."""
+"""Maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbImage(Frozen):
-    """A bare picture, at most `MAX_SIDE_PX` on its longer side.
+    """A picture without depth, at most `MAX_SIDE_PX` on its longer side.
 
     Attributes:
         color: Shape (h, w, 3) sRGB.
-        exif_px: Focal length by its EXIF, for `color` [px]; None where it tells none.
-        scale: Size of `color` over that of the file.
+        exif_px: Focal length from EXIF, for `color` [px]; None if unknown.
+        scale: Size of `color` relative to that of the file.
     """
 
     color: Picture
     exif_px: float | None
     scale: float
 
-    def focal_px(self, configured: float | None) -> float:
-        """Focal length for `color` [px]: by the EXIF, which is about this picture, else as configured for all.
+    def get_focal_px(self, configured: float | None) -> float:
+        """Return the focal length for `color` [px], from EXIF or else as configured.
 
         Args:
-            configured: `observe.focal_px`, for the file's own size.
+            configured: `observe.focal_px`, for the size of the file.
 
         Raises:
-            InputError: `no_focal_length`, saying how to give it.
+            InputError: `no_focal_length` if there is neither.
         """
         if self.exif_px is not None:
             return self.exif_px
         if configured is not None:
             return configured * self.scale
         raise InputError(
-            "this depth model does not tell the focal length, and the picture's EXIF holds none that fits it "
-            "(FocalLengthIn35mmFilm, or FocalLength with FocalPlaneXResolution): give observe.focal_px, the focal "
-            "length of these pictures in their pixels, or take depth_anything_3_nested or moge_2, which estimate it",
+            "this depth model does not estimate the focal length, and the picture's EXIF holds none that fits it "
+            "(FocalLengthIn35mmFilm, or FocalLength with FocalPlaneXResolution): set observe.focal_px, the focal "
+            "length of these pictures in pixels, or use depth_anything_3_nested or moge_2, which estimate it",
             "no_focal_length",
         )
 
 
-def read_photograph(uri: str, bounds: ObserveConfig) -> RgbImage:
-    """Reads a picture once, for its pixels and its EXIF.
+def read_rgb_image(uri: str, bounds: ObserveConfig) -> RgbImage:
+    """Read a picture's pixels and EXIF.
 
     Raises:
-        InputError: `picture_too_narrow`, or as `bare_pictures.read_picture`.
+        InputError: `picture_too_narrow`, or as `image_file.decode_upright`.
     """
     name = uri.rsplit("/", 1)[-1]
     data = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
-    color = picture_of(data, name, bounds)
-    focal = exif_focal(open_picture(data, name, bounds, "unreadable_color"))
+    color = decode_upright(data, name, bounds)
+    focal = read_exif_focal(open_image(data, name, bounds, "unreadable_color"))
     height, width = color.shape[:2]
     if max(width, height) > MAX_ASPECT * min(width, height):
         raise InputError(

@@ -1,4 +1,4 @@
-"""The process that holds SAM for all workers of a GPU: `python -m tableverse_factory.stages.perceive.sam.process`."""
+"""Daemon that holds SAM for all workers of a GPU: `python -m tableverse_factory.stages.perceive.sam.process`."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -6,52 +6,52 @@ from typing import Literal
 import numpy as np
 
 from schemas.geometry import IdImage
-from tableverse_factory.models.local.batch_server import Answer, Arrays, Heartbeat
+from tableverse_factory.models.local.batch_server import Arrays, BatchModel, Heartbeat
 from tableverse_factory.models.local.device import Device
-from tableverse_factory.models.local.model_daemon import Spec, ask, main
-from tableverse_factory.models.local.weights import absolute
-from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, as_ids
-from tableverse_factory.stages.perceive.sam.model import load
+from tableverse_factory.models.local.model_daemon import Spec, ask_daemon, run_daemon
+from tableverse_factory.models.local.weights import make_absolute
+from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, to_id_image
+from tableverse_factory.stages.perceive.sam.model import load_sam
 
 
-def ids_from_process(name: str, weights: str, device: Device, batch: int, question: BoxQuestion) -> IdImage:
-    """The id image of a picture, computed together with those that others ask for at the same time.
+def segment_in_daemon(name: str, weights: str, device: Device, batch: int, question: BoxQuestion) -> IdImage:
+    """Segment a picture in the daemon, in one batch with those of other workers.
 
     Raises:
-        ModelAccessError: where a person must see to the weights or the machine.
-        ModelError: where the memory is not enough for one picture, or the process dies.
+        ModelAccessError: if a person must act on the weights or the machine.
+        ModelError: if one picture does not fit into the memory, or the daemon dies.
     """
     spec: Spec = {
         "name": name,
-        "weights": absolute(weights),
+        "weights": make_absolute(weights),
         "device": device.kind,
         "precision": device.precision,
         "batch": batch,
     }
-    (ids,) = ask(__name__, spec, (question.color, question.boxes, question.holders))
-    return as_ids(ids)
+    (ids,) = ask_daemon(__name__, spec, (question.color, question.boxes, question.holders))
+    return to_id_image(ids)
 
 
-def make(spec: Spec) -> tuple[int, Callable[[Heartbeat], Answer]]:
-    """The size of a batch, and what makes the model that a spec names."""
-    device = Device("cuda" if spec["device"] == "cuda" else "cpu", _precision(str(spec["precision"])))
+def configure_sam_daemon(spec: Spec) -> tuple[int, Callable[[Heartbeat], BatchModel]]:
+    """Return the batch size, and a function that makes the model of a description."""
+    device = Device("cuda" if spec["device"] == "cuda" else "cpu", _parse_precision(str(spec["precision"])))
     batch = int(spec["batch"])
 
-    def made(_: Heartbeat) -> Answer:
-        model = load(str(spec["name"]), str(spec["weights"]), device)
+    def make(_: Heartbeat) -> BatchModel:
+        model = load_sam(str(spec["name"]), str(spec["weights"]), device)
 
         def answer(questions: Sequence[Arrays]) -> Sequence[Arrays]:
-            asked = [BoxQuestion(color, boxes, holders) for color, boxes, holders in questions]
-            return [(ids.astype(np.int16),) for ids in model.ids(asked, batch)]
+            decoded = [BoxQuestion(color, boxes, holders) for color, boxes, holders in questions]
+            return [(ids.astype(np.int16),) for ids in model.segment(decoded, batch)]
 
         return answer
 
-    return batch, made
+    return batch, make
 
 
-def _precision(name: str) -> Literal["float32", "bfloat16"]:
+def _parse_precision(name: str) -> Literal["float32", "bfloat16"]:
     return "bfloat16" if name == "bfloat16" else "float32"
 
 
 if __name__ == "__main__":
-    main(make)
+    run_daemon(configure_sam_daemon)

@@ -1,7 +1,7 @@
-"""Keeps one mesh process for all workers of a machine: `python -m tableverse_factory.stages.place.mesh_service.daemon`.
+"""Daemon that owns one mesh process for all workers: `python -m tableverse_factory.stages.place.mesh_service.daemon`.
 
-Workers ask for the objects of a scene each. What waits goes to the process together, and what comes back is put on the
-disk at once, from where whoever asked reads it: a worker that is killed loses nobody anything, itself included.
+Each request is for the objects of a scene. Waiting requests go to the process together, and meshes are cached on disk
+at once, from where the workers read them: a killed worker loses no mesh, neither its own nor those of others.
 """
 
 import atexit
@@ -14,89 +14,105 @@ from typing import Any
 import numpy as np
 
 from schemas.identity import content_hash
-from tableverse_factory.models.local.batch_server import Answer, Arrays, Heartbeat
-from tableverse_factory.models.local.model_daemon import Spec, ask, main
-from tableverse_factory.stages.place.mesh_service.process import MeshFrame, MeshProcess, ProcessFaultError, environment
-from tableverse_factory.stages.place.mesh_service.requests import MeshRequest, SceneRequest, described, request_for
+from tableverse_factory.models.local.batch_server import Arrays, BatchModel, Heartbeat
+from tableverse_factory.models.local.model_daemon import Spec, ask_daemon, run_daemon
+from tableverse_factory.stages.place.mesh_service.process import (
+    MeshFrame,
+    MeshProcess,
+    ProcessFaultError,
+    select_environment,
+)
+from tableverse_factory.stages.place.mesh_service.requests import (
+    MeshRequest,
+    SceneRequest,
+    build_message,
+    describe_process,
+)
 
 SCENES, OBJECTS = 8, 32
-"""Asked for together; in one request: when the process dies, so many are asked for again, one at a time."""
+"""Maximum number of scenes in a batch, and of objects in one request to the process."""
 _CLOSE_S = 2.0
-"""In which the process may end by itself [s]."""
+"""Time for the process to end by itself [s]."""
 
 
-def spec_of(command: tuple[str, ...]) -> Spec:
-    """What tells one process from another: the same words name others elsewhere, or with other variables."""
-    passed = json.dumps(environment(), sort_keys=True).encode()
+def build_spec(command: tuple[str, ...]) -> Spec:
+    """Build the identity of a process: its command, working directory and environment."""
+    passed = json.dumps(select_environment(), sort_keys=True).encode()
     return {"command": json.dumps(command), "folder": str(Path.cwd()), "environment": content_hash(passed)}
 
 
-def ask_keeper(command: tuple[str, ...], question: MeshFrame) -> MeshFrame:
-    """What the keeper of this command's process says to one scene's objects (see `mesh_orders`).
+def request_meshes(command: tuple[str, ...], request: MeshFrame) -> MeshFrame:
+    """Send a request of `client.MeshClient` to the daemon of a command.
 
     Raises:
-        ModelAccessError: if no process can be started.
-        ModelError: if the keeper dies again and again.
+        ModelAccessError: if the process cannot be started.
+        ModelError: if the daemon dies at every attempt.
     """
-    (answer,) = ask(__name__, spec_of(command), [np.frombuffer(b"".join(question.packed()), dtype=np.uint8)])
-    return MeshFrame.read(answer.tobytes())
+    (answer,) = ask_daemon(
+        __name__, build_spec(command), [np.frombuffer(b"".join(request.encode_parts()), dtype=np.uint8)]
+    )
+    return MeshFrame.decode(answer.tobytes())
 
 
 class MeshDaemon:
-    """One process, and its replacements."""
+    """Owner of a mesh process, which it replaces after a fault."""
 
-    def __init__(self, command: tuple[str, ...], stay: Callable[[], None] = lambda: None) -> None:
-        """Starts it; `stay` is called every second of any wait.
+    def __init__(self, command: tuple[str, ...], heartbeat: Callable[[], None] = lambda: None) -> None:
+        """Start the process.
+
+        Args:
+            command: Program and arguments.
+            heartbeat: Called every second of any wait.
 
         Raises:
-            ModelAccessError: if it cannot be started.
+            ModelAccessError: if the process cannot be started.
         """
-        self._command, self._stay = command, stay
+        self._command, self._heartbeat = command, heartbeat
         self._process: MeshProcess | None = None
-        self._who: dict[str, Any] = {}
+        self._hello: dict[str, Any] = {}
         self._numbers = count()
-        self._started()
+        self.ensure_process()
 
-    def answers(self, questions: Sequence[Arrays]) -> Iterator[Arrays]:
-        """The answer to each scene, as soon as its last object has one and those before it are told."""
-        scenes = [SceneRequest(MeshFrame.read(question.tobytes())) for (question,) in questions]
-        self._started()
+    def answer_scenes(self, questions: Sequence[Arrays]) -> Iterator[Arrays]:
+        """Yield the answer to each scene, in order, as soon as its last object is settled."""
+        scenes = [SceneRequest(MeshFrame.decode(question.tobytes())) for (question,) in questions]
+        self.ensure_process()
         for scene in scenes:
-            scene.meant(self._who)
-        work = self._worked(scenes)
+            scene.check_process(self._hello)
+        work = self._settle_open(scenes)
         for scene in scenes:
             while scene.open_meshes():
                 next(work)
-            yield [np.frombuffer(b"".join(scene.told(self._who).packed()), dtype=np.uint8)]
-        for _ in work:  # what a scene is still owed that has been given up meanwhile
+            yield [np.frombuffer(b"".join(scene.build_answer(self._hello).encode_parts()), dtype=np.uint8)]
+        for _ in work:  # objects of a request whose scene was given up meanwhile
             pass
 
     def close(self) -> None:
-        """Ends the process."""
+        """End the process."""
         if self._process is not None:
             self._process.close(_CLOSE_S)
             self._process = None
 
-    def _worked(self, scenes: Sequence[SceneRequest]) -> Iterator[None]:
-        """Settles all that is open, with a stop wherever something may have been."""
+    def _settle_open(self, scenes: Sequence[SceneRequest]) -> Iterator[None]:
+        """Settle all open objects; yields whenever an object may have been settled."""
         while meshes := [mesh for scene in scenes for mesh in scene.open_meshes()]:
-            yield from self._make(meshes)
+            yield from self._settle_request(meshes)
             yield
 
-    def _make(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
-        """Settles as many as one request takes, each content once.
+    def _settle_request(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
+        """Settle the objects of one request, each content once.
 
-        A process that dies, falls silent or sends nonsense is replaced, and what it owed is asked for once more, an
-        object at a time; an object that does it again has no mesh.
+        A process that dies, falls silent or sends an invalid message is replaced, and the open objects are requested
+        again one at a time; an object at which it fails again has no mesh.
         """
         by_key: dict[str, MeshRequest] = {}
         for mesh in meshes:
             by_key.setdefault(mesh.key, mesh)
-        wanted = [mesh for mesh in list(by_key.values())[:OBJECTS] if not mesh.is_kept()]
+        requested = [mesh for mesh in list(by_key.values())[:OBJECTS] if not mesh.find_cached()]
         try:
-            yield from self._ask(wanted)
+            yield from self._ask(requested)
         except ProcessFaultError:
-            for mesh in wanted:
+            for mesh in requested:
                 if mesh.is_open:
                     try:
                         yield from self._ask([mesh])
@@ -104,58 +120,58 @@ class MeshDaemon:
                         mesh.fail(fault)
 
     def _ask(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
-        """One request for all of these that mean this very process; answers are kept as they come, with a stop at each.
+        """Request the objects whose scenes expect this process; caches meshes as they come, and yields after each.
 
         Raises:
-            ModelAccessError: if it cannot be started, or cannot load its weights.
-            ProcessFaultError: if the process is of no use any more; it is ended then.
+            ModelAccessError: if the process cannot be started, or cannot load its weights.
+            ProcessFaultError: if the process failed; it has been ended then.
         """
-        process = self._started()
+        process = self.ensure_process()
         for mesh in meshes:
-            mesh.scene.meant(self._who)
+            mesh.scene.check_process(self._hello)
         meshes = [mesh for mesh in meshes if mesh.is_open]
         if not meshes:
             return
         silence_s = max(mesh.scene.silence_s for mesh in meshes)
-        owed = {str(next(self._numbers)): mesh for mesh in meshes}
+        open_meshes = {str(next(self._numbers)): mesh for mesh in meshes}
         try:
             process.load()
-            process.send(request_for(owed), silence_s)
-            while owed:
+            process.send(build_message(open_meshes), silence_s)
+            while open_meshes:
                 frame = process.receive(silence_s)
                 name = frame.head.get("id")
-                if not isinstance(name, str) or name not in owed:
+                if not isinstance(name, str) or name not in open_meshes:
                     raise ProcessFaultError("it answered for an object that was not asked for")
-                owed[name].settle(frame, self._who)
-                del owed[name]
+                open_meshes[name].store_answer(frame, self._hello)
+                del open_meshes[name]
                 yield
-        except BaseException as error:  # whatever it is: answers may be on their way that nobody asks for any more
+        except BaseException as error:  # the process may still send answers to this request
             self._process = None
             process.close()
             if not isinstance(error, ProcessFaultError):
                 raise
-            said = process.last_words()
-            raise ProcessFaultError(f"{error}; it says: {said}" if said else str(error)) from error
+            line = process.read_last_line()
+            raise ProcessFaultError(f"{error}; it says: {line}" if line else str(error)) from error
 
-    def _started(self) -> MeshProcess:
-        """The process, a fresh one where it has died."""
+    def ensure_process(self) -> MeshProcess:
+        """Return the process, started anew if it has died."""
         if self._process is None or not self._process.is_alive:
             self.close()
-            self._process = MeshProcess(self._command, self._stay)
-            self._who = described(self._process.hello)
+            self._process = MeshProcess(self._command, self._heartbeat)
+            self._hello = describe_process(self._process.hello)
         return self._process
 
 
-def make(spec: Spec) -> tuple[int, Callable[[Heartbeat], Answer]]:
-    """The most scenes at a time, and what starts the keeper of the command that a spec names."""
+def configure_mesh_daemon(spec: Spec) -> tuple[int, Callable[[Heartbeat], BatchModel]]:
+    """Return the batch size, and a function that starts the daemon of a description."""
 
-    def made(stay: Heartbeat) -> Answer:
-        keeper = MeshDaemon(tuple(json.loads(str(spec["command"]))), stay)
-        atexit.register(keeper.close)
-        return keeper.answers
+    def make(heartbeat: Heartbeat) -> BatchModel:
+        daemon = MeshDaemon(tuple(json.loads(str(spec["command"]))), heartbeat)
+        atexit.register(daemon.close)
+        return daemon.answer_scenes
 
-    return SCENES, made
+    return SCENES, make
 
 
 if __name__ == "__main__":
-    main(make)
+    run_daemon(configure_mesh_daemon)

@@ -1,8 +1,8 @@
-"""Starts the command of a mesh process and sees to its end: `mesh_launch.py PARENT COMMAND…`, plain Python.
+"""Launcher of a mesh process that kills all of its descendants at the end: `launcher.py PARENT COMMAND…`.
 
-The command may be a wrapper (a shell, an environment's launcher, a container's client) that starts the process proper.
-When whoever asked for it dies, even by `kill -9`, or the command ends, all below is killed, whatever its session:
-nothing may go on holding a GPU that nobody asks any more. The command inherits stdin and stdout; here they are closed.
+The command may be a wrapper (a shell, an environment's launcher, a container's client) that starts the actual process.
+When the parent dies, even by `kill -9`, or the command ends, all descendants are killed, whatever their session, so
+that none keeps a GPU. The command inherits stdin and stdout; the launcher closes its own. Imports only Python itself.
 """
 
 import ctypes
@@ -17,10 +17,10 @@ _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 
 
 def main() -> NoReturn:
-    """Runs the command to its end, and ends as it did."""
+    """Run the command to its end, and exit with its status."""
     parent, command = int(sys.argv[1]), sys.argv[2:]
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for the parent, whose end is ours
-    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, whose end ends us
+    signal.signal(signal.SIGTERM, _terminate)
     kernel = ctypes.CDLL(None)
     kernel.prctl(_PR_SET_CHILD_SUBREAPER, 1)
     kernel.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
@@ -28,45 +28,45 @@ def main() -> NoReturn:
         sys.exit(1)
     child = os.fork()
     if child == 0:
-        _become(command, kernel)
+        _exec_command(command, kernel)
     os.close(0)
     os.close(1)
-    status = _waited(child)
-    _kill_all_below()
+    status = _wait_for(child)
+    _kill_descendants()
     if os.WIFSIGNALED(status):
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         os.kill(os.getpid(), os.WTERMSIG(status))
     os._exit(os.waitstatus_to_exitcode(status))
 
 
-def _become(command: list[str], kernel: ctypes.CDLL) -> NoReturn:
-    """Is the command, which is killed when this program is: then nobody is left to do it."""
+def _exec_command(command: list[str], kernel: ctypes.CDLL) -> NoReturn:
+    """Replace this process by the command, which the kernel kills with the launcher."""
     kernel.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        os.execvp(command[0], command)  # noqa: S606 as it is given
+        os.execvp(command[0], command)  # noqa: S606 no shell
     except OSError as error:
         os.write(2, f"{command[0]}: {error.strerror}\n".encode(errors="replace"))
     os._exit(1)
 
 
-def _waited(child: int) -> int:
-    """The status of the child; orphans that end meanwhile are reaped."""
+def _wait_for(child: int) -> int:
+    """Wait for the child and return its status; orphans that end meanwhile are reaped."""
     while True:
         pid, status = os.waitpid(-1, 0)
         if pid == child:
             return status
 
 
-def _end(*_: object) -> NoReturn:
-    _kill_all_below()
+def _terminate(*_: object) -> NoReturn:
+    _kill_descendants()
     os._exit(1)
 
 
-def _kill_all_below() -> None:
-    """Kills every descendant: again and again, for what they start until they are dead."""
-    while below := _below(os.getpid()):
-        for pid in below:
+def _kill_descendants() -> None:
+    """Kill all descendants, repeatedly, for they may start others until they are dead."""
+    while descendants := _find_descendants(os.getpid()):
+        for pid in descendants:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         with suppress(ChildProcessError):
@@ -74,8 +74,8 @@ def _kill_all_below() -> None:
                 pass
 
 
-def _below(root: int) -> set[int]:
-    """All descendants, by the kernel's list of processes; their orphans are ours."""
+def _find_descendants(root: int) -> set[int]:
+    """Find all descendants in /proc; as their subreaper this process adopts their orphans."""
     parents: dict[int, int] = {}
     for path in Path("/proc").iterdir():
         if path.name.isdecimal():

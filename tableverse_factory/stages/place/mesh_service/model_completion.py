@@ -1,4 +1,4 @@
-"""The MeshModels with weights: objects go to a mesh process, its files come back as closed meshes of modest size."""
+"""Shape completion by a mesh process, whose files become closed meshes of modest size."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,15 +18,15 @@ from tableverse_factory.geometry.mesh.repair import make_closed_solid
 from tableverse_factory.geometry.mesh.voxel_solids import find_largest_part, from_manifold, simplify_solid
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.interfaces import Completion
-from tableverse_factory.stages.place.mesh_service.client import Answer, MeshClient, MeshFile, MeshQuery, RgbdImage
+from tableverse_factory.stages.place.mesh_service.client import MeshAnswer, MeshClient, MeshFile, MeshQuery, RgbdImage
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MAX_FACES = 4000
-"""Of a mesh that is kept: about what the embedded default makes."""
-MAX_FACES_TAKEN = 2_000_000
-"""Of a mesh that is worked on at all."""
+"""Maximum number of faces of a completed mesh."""
+MAX_INPUT_FACES = 2_000_000
+"""Maximum number of faces of a mesh that is accepted."""
 TOLERANCE = 5e-4
-"""How far simplification may move the surface at first, as a share of the longest side."""
+"""Initial tolerance of simplification, as a share of the longest side."""
 _SEEDS = 2**31
 
 
@@ -37,60 +37,60 @@ def complete_with_model(
     rng: np.random.Generator,
     services: Services,
 ) -> list[Completion | GeometryError]:
-    """All objects of a scene in one request; pose and size are left to registration: a model's scale is not metric.
+    """Complete all objects of a scene; pose and size are left to registration, for models have no metric scale.
 
     Raises:
         ModelAccessError: if the process does not start.
-        ModelError: if it answers nothing.
+        ModelError: if it made no mesh.
     """
     seen = scene.observation
     view = RgbdImage(seen.color, seen.depth, seen.camera)
     draw = int(rng.integers(2**63)).to_bytes(8, "little")
-    orders = [_order(scene, sighting, draw) for sighting in views]
-    if not orders:
+    queries = [_build_query(scene, object_view, draw) for object_view in views]
+    if not queries:
         return []
-    maker = MeshClient(config.mesh_command, config.mesh_timeout_s, services)
-    return [_completion(answer, config.mesh_model) for answer in maker.make(view, orders)]
+    client = MeshClient(config.mesh_command, config.mesh_timeout_s, services)
+    return [_convert_answer(answer, config.mesh_model) for answer in client.make_meshes(view, queries)]
 
 
-def mesh_of(answer: MeshFile) -> TriangleMesh:
-    """The file as a closed mesh: z up, centred, its longest side 1, at most about `MAX_FACES` faces, its own colours.
+def convert_mesh(answer: MeshFile) -> TriangleMesh:
+    """Convert a file to a closed mesh: z up, centered, longest side 1, about `MAX_FACES` faces, with its colours.
 
     Raises:
-        GeometryError: if it does not decode, is empty, not finite, too large, or encloses nothing.
+        GeometryError: if it does not decode, is empty, not finite or too large, or encloses nothing.
     """
     mesh = read_mesh(answer.data, f"answer.{answer.format}")
-    if len(mesh.faces) > MAX_FACES_TAKEN:
-        raise GeometryError(f"a mesh of {len(mesh.faces)} triangles; at most {MAX_FACES_TAKEN} are taken of a model")
+    if len(mesh.faces) > MAX_INPUT_FACES:
+        raise GeometryError(f"a mesh of {len(mesh.faces)} triangles; at most {MAX_INPUT_FACES} are taken of a model")
     low, high = aabb(mesh.vertices)
     vertices = (mesh.vertices - box_center(mesh)) / float((high - low).max())
-    if answer.format == "glb" and answer.up == "z":  # reading has turned it, as the standard wants
+    if answer.format == "glb" and answer.up == "z":  # the reader has turned it, as the standard says
         vertices = vertices @ Y_UP_TO_Z_UP
     if answer.format != "glb" and answer.up == "y":
         vertices = vertices @ Y_UP_TO_Z_UP.T
-    upright = TriangleMesh(vertices, mesh.faces, _vertex_colors(mesh))
+    upright = TriangleMesh(vertices, mesh.faces, _sample_vertex_colors(mesh))
     solid, _ = make_closed_solid(upright)
-    return _coloured(from_manifold(simplify_solid(find_largest_part(solid), MAX_FACES, TOLERANCE)), upright)
+    return _transfer_colors(from_manifold(simplify_solid(find_largest_part(solid), MAX_FACES, TOLERANCE)), upright)
 
 
-def _order(scene: PerceivedObjects, sighting: ObjectView, draw: bytes) -> MeshQuery:
-    """Its seed depends on the scene's and on its own pixels, not on what else was found beside it."""
-    mask = scene.instance_ids == sighting.instance_id
+def _build_query(scene: PerceivedObjects, object_view: ObjectView, draw: bytes) -> MeshQuery:
+    """Build a query whose seed depends on the scene's draw and the object's pixels, not on other objects."""
+    mask = scene.instance_ids == object_view.instance_id
     seed = int(content_hash(draw, np.packbits(mask).tobytes())[:15], 16) % _SEEDS
     return MeshQuery(mask, seed)
 
 
-def _completion(answer: Answer, name: str) -> Completion | GeometryError:
+def _convert_answer(answer: MeshAnswer, name: str) -> Completion | GeometryError:
     if isinstance(answer, str):
         return GeometryError(answer)
     try:
-        return Completion(mesh_of(answer), None, f"{name}/{answer.model}", answer.licence)
+        return Completion(convert_mesh(answer), None, f"{name}/{answer.model}", answer.licence)
     except GeometryError as error:
         return error
 
 
-def _vertex_colors(mesh: TriangleMesh) -> Colors | None:
-    """The colours of the vertices, read from the texture where there is one."""
+def _sample_vertex_colors(mesh: TriangleMesh) -> Colors | None:
+    """Return the vertex colours, sampled from the texture if there is one."""
     if mesh.texture is None:
         return mesh.vertex_colors
     height, width = mesh.texture.picture.shape[:2]
@@ -102,8 +102,8 @@ def _vertex_colors(mesh: TriangleMesh) -> Colors | None:
     return colors
 
 
-def _coloured(mesh: TriangleMesh, original: TriangleMesh) -> TriangleMesh:
-    """Each vertex in the colour of the nearest of the original; as it is where that has none."""
+def _transfer_colors(mesh: TriangleMesh, original: TriangleMesh) -> TriangleMesh:
+    """Give each vertex the colour of the nearest original vertex, if the original has colours."""
     if original.vertex_colors is None:
         return mesh
     _, nearest = cKDTree(original.vertices, balanced_tree=False).query(mesh.vertices)

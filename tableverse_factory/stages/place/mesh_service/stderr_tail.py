@@ -1,4 +1,4 @@
-"""What a process that failed said last, whatever else it says and however much."""
+"""Tail of a process's stderr, read in a thread so that the process never blocks."""
 
 import threading
 from typing import IO
@@ -11,10 +11,9 @@ _SHOWN = 200
 
 
 class StderrTail:
-    """What a process wrote to its stderr: all of it is read, so that it never waits, and the end of it is kept."""
+    """Reader of a process's stderr that keeps the last 64 KiB."""
 
     def __init__(self, pipe: IO[bytes]) -> None:
-        """Reads from now on, in a thread."""
         self._pipe, self._end = pipe, b""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -24,8 +23,8 @@ class StderrTail:
             self._end = (self._end + block)[-_BLOCK:]
         self._pipe.close()
 
-    def line(self) -> str:
-        """The last line, which is there when the process has ended."""
+    def read_last_line(self) -> str:
+        """Return the last line; it is complete when the process has ended."""
         self._thread.join(_END_S)
         lines = [line for line in self._end.decode(errors="replace").splitlines() if line.strip()]
         return sanitize_line(lines[-1].strip(), _SHOWN) if lines else ""

@@ -15,12 +15,16 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.models.local.weights import release
+from tableverse_factory.models.local.weights import release_models
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.observe.depth.depth_anything_2 import process_size
-from tableverse_factory.stages.observe.depth.depth_anything_3 import believed, metric_estimate, nested_estimate
-from tableverse_factory.stages.observe.depth.from_git import PACKAGES, package
-from tableverse_factory.stages.observe.depth.moge import moge_estimate
+from tableverse_factory.stages.observe.depth.depth_anything_2 import compute_input_size
+from tableverse_factory.stages.observe.depth.depth_anything_3 import (
+    build_nested_estimate,
+    mask_unreliable_depth,
+    scale_to_metres,
+)
+from tableverse_factory.stages.observe.depth.from_git import PACKAGES, import_git_package
+from tableverse_factory.stages.observe.depth.moge import build_moge_estimate
 from tableverse_factory.stages.observe.observe import DEPTH_MODELS, observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tests.helpers.depth_weights import save_tiny_depth
@@ -44,7 +48,7 @@ def test_metres_of_the_metric_model_do_not_depend_on_how_far_it_shrank_the_pictu
     width, height, focal_px = 1000, 750, 800.0
     columns, rows = round(width * shrunk), round(height * shrunk)
     canonical = np.full((rows, columns), 2.0 * 300.0 / (focal_px * shrunk), np.float32)
-    found = metric_estimate(canonical, None, None, focal_px, width, height)
+    found = scale_to_metres(canonical, None, None, focal_px, width, height)
     np.testing.assert_allclose(found.depth, 2.0, rtol=1e-6)
     assert found.camera.fx == pytest.approx(focal_px * columns / width)
     assert (found.camera.width, found.camera.height) == (columns, rows)
@@ -54,7 +58,7 @@ def test_metres_of_the_metric_model_do_not_depend_on_how_far_it_shrank_the_pictu
 def test_the_unit_of_the_confidence_does_not_matter(low, unit):
     confidence = np.full((10, 10), unit, np.float32)
     confidence[:3] = np.float32(unit) * np.float32(0.1)
-    kept = believed(np.full((10, 10), np.float32(low)), None, confidence) > 0
+    kept = mask_unreliable_depth(np.full((10, 10), np.float32(low)), None, confidence) > 0
     assert not kept[:3].any()
     assert kept[3:].all()
 
@@ -65,7 +69,7 @@ def test_sky_and_what_is_no_number_are_not_believed(kind):
     depth[0, :3] = np.nan, np.inf, -2.0
     sky = np.zeros((6, 6), kind)
     sky[5] = 1
-    found = believed(depth, sky, None)
+    found = mask_unreliable_depth(depth, sky, None)
     assert np.isfinite(found).all()
     assert (found[0, :3] == 0).all()
     assert (found[5] == 0).all()
@@ -74,7 +78,7 @@ def test_sky_and_what_is_no_number_are_not_believed(kind):
 
 def test_the_camera_of_the_nested_model_stays_with_its_resolution():
     matrix = np.array([[378.0, 0, 252.0], [0, 380.0, 189.0], [0, 0, 1]])
-    found = nested_estimate(np.ones((378, 504), np.float32), None, None, matrix)
+    found = build_nested_estimate(np.ones((378, 504), np.float32), None, None, matrix)
     assert found.camera == Camera(378.0, 380.0, 251.5, 188.5, 504, 378)
 
 
@@ -87,7 +91,7 @@ def test_points_of_moge_come_out_of_its_depth_and_camera():
     v, u = (np.indices((height, width)) + 0.5) / np.array([height, width])[:, None, None]
     points = np.stack([(u - 0.5) / fx * depth, (v - 0.5) / fy * depth, depth], axis=-1)
     intrinsics = np.array([[fx, 0, 0.5], [0, fy, 0.5], [0, 0, 1]])
-    found = moge_estimate(np.where(mask, depth, np.inf), mask, intrinsics)
+    found = build_moge_estimate(np.where(mask, depth, np.inf), mask, intrinsics)
     np.testing.assert_allclose(backproject(found.depth, found.camera)[mask], points[mask], atol=1e-6)
     assert (found.depth[~mask] == 0).all()
 
@@ -101,7 +105,7 @@ def test_without_its_package_the_build_stops_and_says_what_to_install(tmp_path, 
 def test_every_model_that_is_on_git_alone_says_where():
     for module in PACKAGES:
         with pytest.raises(ModelAccessError, match="is not installed"):
-            package(f"{module}.api")
+            import_git_package(f"{module}.api")
 
 
 @pytest.mark.parametrize("name", ["depth_anything_3", "depth_anything_2"])
@@ -113,7 +117,7 @@ def test_a_model_that_tells_no_focal_length_needs_one(tmp_path, name):
 
 @given(st.integers(1, 5000), st.integers(1, 5000))
 def test_the_size_for_the_model_is_whole_patches_near_the_pictures_aspect(height, width):
-    rows, columns = process_size(height, width, 14)
+    rows, columns = compute_input_size(height, width, 14)
     assert rows % 14 == columns % 14 == 0
     assert 518 in (rows, columns)
     if max(height, width) < 4 * min(height, width):
@@ -122,7 +126,7 @@ def test_the_size_for_the_model_is_whole_patches_near_the_pictures_aspect(height
 
 def test_the_size_for_the_model_is_that_of_its_own_processor():
     sizes = {(240, 320): (392, 518), (400, 500): (420, 518), (480, 640): (518, 686), (1536, 2048): (518, 686)}
-    assert {size: process_size(*size, 14) for size in sizes} == sizes
+    assert {size: compute_input_size(*size, 14) for size in sizes} == sizes
 
 
 @pytest.mark.parametrize("size", [(2, 2048), (2048, 2), (100, 801)])
@@ -168,7 +172,7 @@ def weights(tmp_path_factory):
     for kind, folder in folders.items():
         save_tiny_depth(folder, kind)
     yield folders
-    release()
+    release_models()
 
 
 def test_depth_anything_2_runs_from_a_folder_and_gives_the_same_bytes_again(tmp_path, weights):
@@ -186,7 +190,7 @@ def test_depth_anything_2_runs_from_a_folder_and_gives_the_same_bytes_again(tmp_
     assert found.camera == Camera(150.0, 150.0, 79.5, 59.5, 160, 120)
     assert 0.0 < found.depth.max() < 20.0, "the sigmoid of the metric head times its greatest depth"
     assert found.bend > 0.0
-    release()
+    release_models()
     np.testing.assert_array_equal(observed(path, **config).value.depth, found.depth)
 
 

@@ -12,8 +12,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from schemas.config import ObserveConfig
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.stages.observe.depth.focal import LONGEST, SHORTEST, exif_focal
-from tableverse_factory.stages.observe.depth.rgb_image import MAX_SIDE_PX, read_photograph
+from tableverse_factory.stages.observe.depth.focal import LONGEST, SHORTEST, read_exif_focal
+from tableverse_factory.stages.observe.depth.rgb_image import MAX_SIDE_PX, read_rgb_image
 
 BOUNDS = ObserveConfig()
 EXIF_IFD, MM, MM_35, WIDTH, HEIGHT, PER_UNIT, UNIT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003, 0xA20E, 0xA210
@@ -34,7 +34,7 @@ def jpeg(size=(400, 300), orientation=None, **tags):
 
 
 def focal(**given):
-    return exif_focal(Image.open(io.BytesIO(jpeg(**given))))
+    return read_exif_focal(Image.open(io.BytesIO(jpeg(**given))))
 
 
 def test_by_the_equivalent_on_film():
@@ -92,7 +92,7 @@ BROKEN = {
 def test_whatever_pillow_raises_about_broken_exif_is_no_focal_length(raised, data):
     with pytest.raises(raised):
         Image.open(io.BytesIO(data)).getexif().get_ifd(EXIF_IFD)
-    assert exif_focal(Image.open(io.BytesIO(data))) is None
+    assert read_exif_focal(Image.open(io.BytesIO(data))) is None
 
 
 def exif_of(told) -> bytes:
@@ -112,7 +112,7 @@ def test_exif_that_was_changed_or_cut_gives_a_believable_length_or_none(changes,
     exif = bytearray(SOUND)
     for place, value in changes:
         exif[place] = value
-    found = exif_focal(Image.open(io.BytesIO(with_exif(b"Exif\0\0" + bytes(exif[:kept]), kind))))
+    found = read_exif_focal(Image.open(io.BytesIO(with_exif(b"Exif\0\0" + bytes(exif[:kept]), kind))))
     assert found is None or SHORTEST * 40 <= found <= LONGEST * 40
     if not changes and kept == len(SOUND):
         assert found == pytest.approx(26 * 50 / 43.2666, rel=1e-4)
@@ -122,7 +122,7 @@ def test_exif_that_was_changed_or_cut_gives_a_believable_length_or_none(changes,
 def test_a_turned_picture_stands_upright_and_keeps_its_focal_length(tmp_path, orientation):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg(orientation=orientation, mm_35=26))
-    photo = read_photograph(str(path), BOUNDS)
+    photo = read_rgb_image(str(path), BOUNDS)
     assert photo.color.shape == ((300, 400, 3) if orientation < 5 else (400, 300, 3))
     assert photo.exif_px == pytest.approx(26 * 500 / 43.2666, rel=1e-4)
 
@@ -130,20 +130,20 @@ def test_a_turned_picture_stands_upright_and_keeps_its_focal_length(tmp_path, or
 def test_a_large_picture_is_made_smaller_and_its_focal_length_with_it(tmp_path):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg(size=(4096, 1024), mm_35=50))
-    photo = read_photograph(str(path), BOUNDS)
+    photo = read_rgb_image(str(path), BOUNDS)
     assert photo.color.shape == (512, MAX_SIDE_PX, 3)
     assert photo.exif_px == pytest.approx(50 * np.hypot(4096, 1024) / 43.2666 / 2, rel=1e-4)
     path.write_bytes(jpeg(size=(4096, 1024)))
-    assert read_photograph(str(path), BOUNDS).focal_px(3000.0) == pytest.approx(1500.0)
+    assert read_rgb_image(str(path), BOUNDS).get_focal_px(3000.0) == pytest.approx(1500.0)
 
 
 def test_exif_goes_before_what_is_configured_for_all_and_none_is_a_reason(tmp_path):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg(mm_35=26))
-    assert read_photograph(str(path), BOUNDS).focal_px(1234.0) == pytest.approx(300.46, rel=1e-3)
+    assert read_rgb_image(str(path), BOUNDS).get_focal_px(1234.0) == pytest.approx(300.46, rel=1e-3)
     path.write_bytes(jpeg())
-    assert read_photograph(str(path), BOUNDS).focal_px(1234.0) == 1234.0
+    assert read_rgb_image(str(path), BOUNDS).get_focal_px(1234.0) == 1234.0
     with pytest.raises(InputError) as refused:
-        read_photograph(str(path), BOUNDS).focal_px(None)
+        read_rgb_image(str(path), BOUNDS).get_focal_px(None)
     assert refused.value.reason == "no_focal_length"
     assert "observe.focal_px" in str(refused.value)

@@ -15,15 +15,15 @@ import psutil
 import pytest
 
 from tableverse_factory.core.disk_cache import DiskCache
-from tableverse_factory.models.local.batch_server import serve
-from tableverse_factory.models.local.wire import send
+from tableverse_factory.models.local.batch_server import serve_batches
+from tableverse_factory.models.local.wire import send_arrays
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.client import MeshClient
 from tableverse_factory.stages.place.mesh_service.daemon import OBJECTS, MeshDaemon
 from tableverse_factory.stages.place.mesh_service.process import MeshFrame
-from tableverse_factory.stages.place.mesh_service.requests import described
+from tableverse_factory.stages.place.mesh_service.requests import describe_process
 from tests.helpers.mesh_asker import hashes
-from tests.helpers.mesh_keepers import keepers_inside
+from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS, ROOT
 
 BAD = 666
@@ -111,7 +111,7 @@ def test_scenes_of_several_workers_go_through_one_process_together(tmp_path, wor
     together = [one.answer() for one in workers]
     assert len({line.split()[-1] for line in noted(tmp_path)}) == 1
     assert [line.rpartition(" ")[0] for line in noted(tmp_path, "request")[asked:]] == ["request of 2", "request of 5"]
-    with keepers_inside(monkeypatch):
+    with daemons_inside(monkeypatch):
         maker = MeshClient(command_of(tmp_path, "gate"), 20.0, Services(tmp_path / "other"))
         for name, seed, got in zip("abc", range(3), alone, strict=True):
             assert hashes(maker, name, [seed]) == got
@@ -136,23 +136,25 @@ def test_a_worker_that_is_killed_harms_nobody_and_what_it_asked_for_is_not_lost(
     assert len(noted(tmp_path, "make")) == 6, "nothing is made twice"
 
 
-def question(folder: Path, keeper: MeshDaemon, name: str, *seeds: int, silence_s: float = 20.0) -> list[np.ndarray]:
+def build_request(
+    folder: Path, daemon: MeshDaemon, name: str, *seeds: int, silence_s: float = 20.0
+) -> list[np.ndarray]:
     """What a worker sends that knows who answers."""
     head = {
-        "to": described(keeper._started().hello),
-        "of": len(seeds),
-        "kept_in": str(folder / "kept"),
+        "hello": describe_process(daemon.ensure_process().hello),
+        "count": len(seeds),
+        "cache": str(folder / "kept"),
         "silence_s": silence_s,
         "camera": {"fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0},
         "objects": [{"number": k, "key": f"{name}{k:063d}", "seed": seed} for k, seed in enumerate(seeds)],
     }
     frame = MeshFrame(head, (name.encode(), b"", *(b"mask" for _ in seeds)))
-    return [np.frombuffer(b"".join(frame.packed()), dtype=np.uint8)]
+    return [np.frombuffer(b"".join(frame.encode_parts()), dtype=np.uint8)]
 
 
-def told(answers: Iterable[Sequence[np.ndarray]]) -> list[tuple[list[int], str]]:
+def read_outcomes(answers: Iterable[Sequence[np.ndarray]]) -> list[tuple[list[int], str]]:
     """For each scene the objects that have no mesh, and why it is given up."""
-    heads = [MeshFrame.read(answer.tobytes()).head for (answer,) in answers]
+    heads = [MeshFrame.decode(answer.tobytes()).head for (answer,) in answers]
     return [(sorted(map(int, head["reasons"])), head["given_up"]) for head in heads]
 
 
@@ -163,7 +165,7 @@ def kept_seeds(folder: Path, name: str, n: int) -> list[int]:
     return [int(data.rpartition(b"# ")[2].split()[0]) for data in kept]
 
 
-def refusing(folder: Path) -> Path:
+def make_full_folder(folder: Path) -> Path:
     """A folder whose disk keeps nothing."""
     (folder / "full").mkdir()
     (folder / "full" / "kept").touch()
@@ -171,7 +173,7 @@ def refusing(folder: Path) -> Path:
 
 
 @pytest.fixture
-def keeper(tmp_path: Path) -> Iterator[Callable[[str], MeshDaemon]]:
+def start_daemon(tmp_path: Path) -> Iterator[Callable[[str], MeshDaemon]]:
     kept: list[MeshDaemon] = []
 
     def start(behaviour: str) -> MeshDaemon:
@@ -183,10 +185,10 @@ def keeper(tmp_path: Path) -> Iterator[Callable[[str], MeshDaemon]]:
         one.close()
 
 
-def test_an_object_that_kills_the_process_costs_no_other_scene_anything(tmp_path, keeper):
-    one = keeper("crash")
+def test_an_object_that_kills_the_process_costs_no_other_scene_anything(tmp_path, start_daemon):
+    one = start_daemon("crash")
     asked = [("a", 1, 2), ("b", 3, BAD, 4), ("c", BAD), ("d", 5, BAD, 1000 + BAD, 2000 + BAD, 6), ("e", 7)]
-    answers = told(one.answers([question(tmp_path, one, *scene) for scene in asked]))
+    answers = read_outcomes(one.answer_scenes([build_request(tmp_path, one, *scene) for scene in asked]))
     assert [missing for missing, _ in answers] == [[], [1], [0], [1, 2, 3], []]
     assert [why.partition(":")[0] for _, why in answers] == [
         *("", ""),
@@ -198,11 +200,11 @@ def test_an_object_that_kills_the_process_costs_no_other_scene_anything(tmp_path
     assert all(len(noted(tmp_path, f"make {seed} ")) == 1 for seed in (1, 2, 3, 4, 5, 7))
 
 
-def test_many_objects_are_several_requests_and_each_scene_is_told_when_its_own_are_made(tmp_path, keeper):
+def test_many_objects_are_several_requests_and_each_scene_is_told_when_its_own_are_made(tmp_path, start_daemon):
     (tmp_path / "log.gate").touch()
-    one = keeper("gate")
+    one = start_daemon("gate")
     asked = [("a", *range(20)), ("b", *range(20, 40)), ("c", *range(40, 75))]
-    answers = one.answers([question(tmp_path, one, *scene) for scene in asked])
+    answers = one.answer_scenes([build_request(tmp_path, one, *scene) for scene in asked])
     next(answers)
     assert 20 <= len(noted(tmp_path, "make")) <= OBJECTS
     list(answers)
@@ -210,36 +212,38 @@ def test_many_objects_are_several_requests_and_each_scene_is_told_when_its_own_a
     assert (max(sizes), sum(sizes), len(sizes)) == (OBJECTS, 75, 3)
 
 
-def test_a_scene_is_told_while_the_process_works_on_another_of_the_same_request(tmp_path, keeper):
-    one = keeper("gate")
-    answers = one.answers([question(tmp_path, one, "a", 1, silence_s=3.0), question(tmp_path, one, "b", 2, BAD)])
-    assert told([next(answers)]) == [([], "")]
+def test_a_scene_is_told_while_the_process_works_on_another_of_the_same_request(tmp_path, start_daemon):
+    one = start_daemon("gate")
+    answers = one.answer_scenes(
+        [build_request(tmp_path, one, "a", 1, silence_s=3.0), build_request(tmp_path, one, "b", 2, BAD)]
+    )
+    assert read_outcomes([next(answers)]) == [([], "")]
     assert not (tmp_path / "log.gate").exists()
     (tmp_path / "log.gate").touch()
-    assert told(answers) == [([], "")]
+    assert read_outcomes(answers) == [([], "")]
     assert len(noted(tmp_path, "start")) == len(noted(tmp_path, "request")) == 1
 
 
-def test_of_two_scenes_in_a_request_the_more_patient_one_is_heeded(tmp_path, keeper):
-    one = keeper("gate")
-    asked = [question(tmp_path, one, "a", 1, silence_s=0.2), question(tmp_path, one, "b", BAD)]
+def test_of_two_scenes_in_a_request_the_more_patient_one_is_heeded(tmp_path, start_daemon):
+    one = start_daemon("gate")
+    asked = [build_request(tmp_path, one, "a", 1, silence_s=0.2), build_request(tmp_path, one, "b", BAD)]
     opened = threading.Timer(0.8, (tmp_path / "log.gate").touch)
     opened.start()
-    assert told(one.answers(asked)) == [([], "")] * 2
+    assert read_outcomes(one.answer_scenes(asked)) == [([], "")] * 2
     opened.join()
     assert len(noted(tmp_path, "start")) == 1
 
 
-def test_a_disk_that_refuses_costs_its_own_scene_and_no_other(tmp_path, keeper):
+def test_a_disk_that_refuses_costs_its_own_scene_and_no_other(tmp_path, start_daemon):
     (tmp_path / "log.gate").touch()
-    one, full = keeper("gate"), refusing(tmp_path)
+    one, full = start_daemon("gate"), make_full_folder(tmp_path)
     asked = [("b", 11, 12), ("c", 21, 22)]
-    scenes = [question(full, one, "a", 1, 2, 3), *(question(tmp_path, one, *scene) for scene in asked)]
-    answers = list(one.answers(scenes))
-    refused = [MeshFrame.read(answer.tobytes()).head["refused"] for (answer,) in answers]
-    assert ["Make room" in why for why in refused] == [True, False, False]
-    list(one.answers([question(full, one, "a", 1, 2, 3)]))
-    assert told(one.answers([question(tmp_path, one, "d", 31, 32, 33)])) == [([], "")]
+    scenes = [build_request(full, one, "a", 1, 2, 3), *(build_request(tmp_path, one, *scene) for scene in asked)]
+    answers = list(one.answer_scenes(scenes))
+    refused = [MeshFrame.decode(answer.tobytes()).head["refused"] for (answer,) in answers]
+    assert ["Free space" in why for why in refused] == [True, False, False]
+    list(one.answer_scenes([build_request(full, one, "a", 1, 2, 3)]))
+    assert read_outcomes(one.answer_scenes([build_request(tmp_path, one, "d", 31, 32, 33)])) == [([], "")]
     found = [kept_seeds(tmp_path, name, n) for name, n in (("b", 2), ("c", 2), ("d", 3))]
     assert found == [[11, 12], [21, 22], [31, 32, 33]]
     assert len(noted(tmp_path, "start")) == 1
@@ -250,50 +254,52 @@ def test_a_disk_that_refuses_costs_its_own_scene_and_no_other(tmp_path, keeper):
 def test_whatever_ends_a_request_ends_the_process_and_its_answers_with_it(tmp_path):
     calls: list[int] = []
 
-    def stay() -> None:
+    def heartbeat() -> None:
         calls.append(1)
         if len(calls) == 1:
             raise RuntimeError("stopped in the middle")
 
-    one = MeshDaemon(command_of(tmp_path, "gate"), stay)
+    one = MeshDaemon(command_of(tmp_path, "gate"), heartbeat)
     try:
-        asked = question(tmp_path, one, "a", 1, BAD, 2)
+        asked = build_request(tmp_path, one, "a", 1, BAD, 2)
         calls.clear()
         with pytest.raises(RuntimeError, match="in the middle"):
-            list(one.answers([asked]))
+            list(one.answer_scenes([asked]))
         (pid,) = {int(line.split()[-1]) for line in noted(tmp_path)}
         wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE, 5.0)
         (tmp_path / "log.gate").touch()
-        assert told(one.answers([question(tmp_path, one, "b", 11, 12, 13)])) == [([], "")]
+        assert read_outcomes(one.answer_scenes([build_request(tmp_path, one, "b", 11, 12, 13)])) == [([], "")]
         assert kept_seeds(tmp_path, "b", 3) == [11, 12, 13]
         assert len(noted(tmp_path, "start")) == 2
     finally:
         one.close()
 
 
-def test_the_same_object_asked_for_by_two_at_once_is_made_once(tmp_path, keeper):
-    one = keeper("well")
-    assert told(one.answers([question(tmp_path, one, "a", 1, 2) for _ in range(2)])) == [([], "")] * 2
+def test_the_same_object_asked_for_by_two_at_once_is_made_once(tmp_path, start_daemon):
+    one = start_daemon("well")
+    assert (
+        read_outcomes(one.answer_scenes([build_request(tmp_path, one, "a", 1, 2) for _ in range(2)])) == [([], "")] * 2
+    )
     assert len(noted(tmp_path, "make")) == 2
 
 
-def test_when_nobody_is_left_the_process_ends_in_the_middle_of_its_work(tmp_path, keeper):
+def test_when_nobody_is_left_the_process_ends_in_the_middle_of_its_work(tmp_path, start_daemon):
     path = tmp_path / "sock"
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
     listener.listen()
     made: list[MeshDaemon] = []
 
-    def make(stay: Callable[[], None]) -> Callable[..., Iterator[list[np.ndarray]]]:
-        made.append(MeshDaemon(command_of(tmp_path, "hang"), stay))
-        return made[0].answers
+    def make(heartbeat: Callable[[], None]) -> Callable[..., Iterator[list[np.ndarray]]]:
+        made.append(MeshDaemon(command_of(tmp_path, "hang"), heartbeat))
+        return made[0].answer_scenes
 
-    thread = threading.Thread(target=serve, args=(listener, path, 8, make, 0.3))
+    thread = threading.Thread(target=serve_batches, args=(listener, path, 8, make, 0.3))
     thread.start()
     with socket.socket(socket.AF_UNIX) as end:
         end.connect(str(path))
         wait_until(lambda: bool(made))
-        send(end, question(tmp_path, made[0], "a", BAD))
+        send_arrays(end, build_request(tmp_path, made[0], "a", BAD))
         wait_until(lambda: bool(noted(tmp_path, f"make {BAD}")))
         thread.join(1.5)
         assert thread.is_alive(), "somebody waits"

@@ -27,11 +27,11 @@ from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.mesh_service import model_completion
 from tableverse_factory.stages.place.mesh_service.client import MeshFile
-from tableverse_factory.stages.place.mesh_service.model_completion import MAX_FACES, mesh_of
+from tableverse_factory.stages.place.mesh_service.model_completion import MAX_FACES, complete_with_model, convert_mesh
 from tableverse_factory.stages.place.place import place
 from tableverse_factory.stages.place.view.object_view import view_object
 from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
-from tests.helpers.mesh_keepers import keepers_inside
+from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS
 from tests.stages.place.test_place import box, cup, seen
 
@@ -43,7 +43,7 @@ Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 @pytest.fixture(autouse=True)
 def inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with keepers_inside(monkeypatch):
+    with daemons_inside(monkeypatch):
         yield
 
 
@@ -77,7 +77,7 @@ def test_whatever_way_a_file_names_as_up_is_up_and_nothing_is_mirrored(form: str
         mesh.vertices = mesh.vertices @ Y_UP.T
     mesh.vertices = 37.0 * mesh.vertices + 5.0
     data = mesh.export(file_type=form)
-    got = mesh_of(file_of(data.encode() if isinstance(data, str) else data, form, up))
+    got = convert_mesh(file_of(data.encode() if isinstance(data, str) else data, form, up))
     assert to_trimesh(got).is_watertight
     assert to_trimesh(got).volume > 0.0
     np.testing.assert_allclose(np.ptp(got.vertices, axis=0), np.ptp(expected.vertices, axis=0), atol=1e-3)
@@ -88,7 +88,7 @@ def test_a_mesh_of_many_faces_becomes_small_closed_and_keeps_its_shape_and_colou
     ball = trimesh.creation.icosphere(6)  # 81,920 faces
     shown = np.where(ball.vertices[:, 2:] > 0.0, (200, 30, 20), (20, 30, 200))
     ball = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=shown, process=False)
-    got = mesh_of(file_of(ball.export(file_type="glb"), "glb", "z"))
+    got = convert_mesh(file_of(ball.export(file_type="glb"), "glb", "z"))
     assert len(got.faces) <= MAX_FACES
     assert to_trimesh(got).is_watertight
     np.testing.assert_allclose(np.linalg.norm(got.vertices, axis=1), 0.5, atol=2e-3)
@@ -104,7 +104,7 @@ def test_a_texture_becomes_colours_of_vertices():
     uv = np.stack([np.full(len(ball.vertices), 0.5), (ball.vertices[:, 2] + 1.0) / 2], axis=1)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
     ball.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    got = mesh_of(file_of(ball.export(file_type="glb"), "glb", "z"))
+    got = convert_mesh(file_of(ball.export(file_type="glb"), "glb", "z"))
     assert got.vertex_colors is not None
     assert np.abs(got.vertex_colors[got.vertices[:, 2] > 0.1].astype(int) - (200, 30, 20)).max() < 5
     assert np.abs(got.vertex_colors[got.vertices[:, 2] < -0.1].astype(int) - (20, 30, 200)).max() < 5
@@ -116,7 +116,7 @@ def test_crumbs_beside_a_mesh_are_dropped_and_holes_are_closed():
     crumb = trimesh.creation.icosphere(2, 0.05)
     crumb.apply_translation((0.9, 0, 0))
     data = trimesh.util.concatenate([cube, crumb]).export(file_type="ply")
-    got = to_trimesh(mesh_of(file_of(data, "ply", "z")))
+    got = to_trimesh(convert_mesh(file_of(data, "ply", "z")))
     assert got.is_watertight
     assert got.volume == pytest.approx(np.prod(got.extents), rel=1e-3)
 
@@ -145,15 +145,15 @@ def ply_of(n_faces: int) -> bytes:
 )
 def test_what_is_no_mesh_is_an_error_that_says_so(data: bytes, form: str, why: str):
     with pytest.raises(GeometryError, match=why):
-        mesh_of(file_of(data, form, "z"))
+        convert_mesh(file_of(data, form, "z"))
 
 
 def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene = seen(box(0.06, 0.05, 0.1), box(0.05, 0.05, 0.06, x=0.2))
     monkeypatch.setattr(model_completion, "_SEEDS", 667)
     seeds = iter([1, 666])
-    order = model_completion._order
-    monkeypatch.setattr(model_completion, "_order", lambda *of: replace(order(*of), seed=next(seeds)))
+    order = model_completion._build_query
+    monkeypatch.setattr(model_completion, "_build_query", lambda *of: replace(order(*of), seed=next(seeds)))
     outcome = place(scene, by_model(SERVER, "nan"), np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     assert [item.object_id for item in outcome.value.objects] == ["obj_000"]
@@ -175,7 +175,7 @@ def test_a_scene_whose_objects_have_too_few_points_asks_nothing(tmp_path: Path):
 
 def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyPatch, cache: Path) -> list[int]:
     drawn: list[int] = []
-    order = model_completion._order
+    order = model_completion._build_query
 
     def noted(*of: object) -> object:
         made = order(*of)
@@ -183,7 +183,7 @@ def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyP
         return made
 
     with monkeypatch.context() as patch:
-        patch.setattr(model_completion, "_order", noted)
+        patch.setattr(model_completion, "_build_query", noted)
         completions(scene, run_seed, cache)
     return drawn
 
@@ -191,7 +191,7 @@ def seeds_of(scene: PerceivedObjects, run_seed: int, monkeypatch: pytest.MonkeyP
 def completions(scene: PerceivedObjects, run_seed: int, cache: Path) -> Sequence[Completion | GeometryError]:
     sightings = [view_object(scene, item, DepthSupport(0.0, np.zeros((0, 2)))) for item in scene.objects]
     config = by_model(TRIPOSR, "--self-test").place
-    return model_completion(scene, sightings, config, np.random.default_rng(run_seed), Services(cache))
+    return complete_with_model(scene, sightings, config, np.random.default_rng(run_seed), Services(cache))
 
 
 def test_an_objects_seed_depends_on_run_scene_and_pixels_and_not_on_its_neighbours(monkeypatch, tmp_path):

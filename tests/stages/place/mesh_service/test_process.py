@@ -20,19 +20,19 @@ from tableverse_factory.models.local import model_daemon
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service import client
 from tableverse_factory.stages.place.mesh_service import process as process_module
-from tableverse_factory.stages.place.mesh_service.client import Answer, MeshClient, MeshFile, MeshQuery, RgbdImage
-from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon, spec_of
+from tableverse_factory.stages.place.mesh_service.client import MeshAnswer, MeshClient, MeshFile, MeshQuery, RgbdImage
+from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon, build_spec
 from tableverse_factory.stages.place.mesh_service.process import MeshProcess
-from tests.helpers.mesh_keepers import keepers_inside
+from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS
 
 SERVER = HELPERS / "mesh_server.py"
 BAD = 666
 VIEW = RgbdImage(np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
 
-Make = Callable[..., list[Answer]]
+Make = Callable[..., list[MeshAnswer]]
 Log = Callable[[], list[str]]
-Keepers = dict[tuple[str, ...], MeshDaemon]
+Daemons = dict[tuple[str, ...], MeshDaemon]
 
 
 def orders(*seeds: int) -> list[MeshQuery]:
@@ -61,16 +61,16 @@ def command(tmp_path: Path) -> Callable[..., tuple[str, ...]]:
 
 
 @pytest.fixture(autouse=True)
-def keepers(monkeypatch: pytest.MonkeyPatch) -> Iterator[Keepers]:
-    with keepers_inside(monkeypatch) as found:
+def daemons(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemons]:
+    with daemons_inside(monkeypatch) as found:
         yield found
 
 
 @pytest.fixture
 def make(tmp_path: Path, command: Callable[[str], tuple[str, ...]]) -> Make:
-    def ask(behaviour: str, *seeds: int, silence_s: float = 10.0) -> list[Answer]:
+    def ask(behaviour: str, *seeds: int, silence_s: float = 10.0) -> list[MeshAnswer]:
         maker = MeshClient(command(behaviour), silence_s, Services(tmp_path / "cache"))
-        return maker.make(VIEW, orders(*seeds))
+        return maker.make_meshes(VIEW, orders(*seeds))
 
     return ask
 
@@ -88,23 +88,23 @@ def process() -> Iterator[Callable[..., MeshProcess]]:
         one.close()
 
 
-def end_all(keepers: Keepers) -> None:
+def end_all(daemons: Daemons) -> None:
     """As when all workers have gone and other ones come."""
-    while keepers:
-        keepers.popitem()[1].close()
+    while daemons:
+        daemons.popitem()[1].close()
     client._HELLO_CACHE.clear()
 
 
-def is_made(answer: Answer) -> bool:
+def is_made(answer: MeshAnswer) -> bool:
     return isinstance(answer, MeshFile) and answer.data.startswith(b"v 0 0 0")
 
 
-def test_one_process_serves_scene_after_scene_and_nothing_is_made_twice(make: Make, log: Log, keepers: Keepers):
+def test_one_process_serves_scene_after_scene_and_nothing_is_made_twice(make: Make, log: Log, daemons: Daemons):
     assert all(map(is_made, make("well", 1, 2)))
     assert log() == ["start", "load", "make 1", "make 2"]
     assert all(map(is_made, make("well", 2, 3)))
     assert log() == ["make 3"]
-    end_all(keepers)
+    end_all(daemons)
     assert all(map(is_made, make("well", 3, 1, 2)))
     assert log() == ["start"], "the weights of a model that has nothing to do need not be loaded"
 
@@ -204,36 +204,36 @@ def test_a_process_that_cannot_begin_stops_the_build_with_one_line(make, monkeyp
 
 def test_a_program_that_is_not_there_is_named(tmp_path: Path):
     with pytest.raises(ModelAccessError, match=r"it says: /nowhere/python: No such file or directory"):
-        MeshClient(("/nowhere/python", "x.py"), 1.0, Services(tmp_path)).make(VIEW, orders(1))
+        MeshClient(("/nowhere/python", "x.py"), 1.0, Services(tmp_path)).make_meshes(VIEW, orders(1))
 
 
 def test_a_new_version_of_a_model_is_asked_again_and_a_seed_counts_only_where_it_is_wanted(
-    tmp_path, log, command, keepers
+    tmp_path, log, command, daemons
 ):
     script = tmp_path / "server.py"
     maker = MeshClient(command("well", script), 9.0, Services(tmp_path))
     for version, wants, seed, asked in (("1", "seed", 1, 1), ("2", "seed", 1, 1), ("2", "seed", 2, 1)):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
-        end_all(keepers)
-        maker.make(VIEW, orders(seed))
+        end_all(daemons)
+        maker.make_meshes(VIEW, orders(seed))
         assert sum(line.startswith("make") for line in log()) == asked, (version, wants, seed)
     script.write_text(SERVER.read_text().replace('"wants": ["seed"]', '"wants": []'))
-    end_all(keepers)
+    end_all(daemons)
     for seed, asked in ((1, 1), (2, 0)):
-        maker.make(VIEW, orders(seed))
+        maker.make_meshes(VIEW, orders(seed))
         assert sum(line.startswith("make") for line in log()) == asked
 
 
 def test_a_worker_that_knows_an_earlier_version_is_told_and_gets_what_the_new_one_makes(
-    tmp_path, log, command, keepers
+    tmp_path, log, command, daemons
 ):
     script = tmp_path / "server.py"
     maker = MeshClient(command("well", script), 9.0, Services(tmp_path))
     for version in ("1", "2"):
         script.write_text(SERVER.read_text().replace('"version": "1"', f'"version": "{version}"'))
-        assert all(map(is_made, maker.make(VIEW, orders(1 + int(version)))))
-        assert client._HELLO_CACHE[json.dumps(spec_of(command("well", script)))]["version"] == version
-        keepers.popitem()[1].close()
+        assert all(map(is_made, maker.make_meshes(VIEW, orders(1 + int(version)))))
+        assert client._HELLO_CACHE[json.dumps(build_spec(command("well", script)))]["version"] == version
+        daemons.popitem()[1].close()
     assert log().count("make 3") == 1
 
 
@@ -242,13 +242,13 @@ def test_a_process_that_is_another_one_after_its_death_gives_nothing_under_the_f
     version = '"version": str(Path(os.environ["MESH_LOG"]).with_suffix(".flag").exists())'
     script.write_text(SERVER.read_text().replace('"version": "1"', version))
     maker = MeshClient(command("crash once", script), 9.0, Services(tmp_path))
-    assert all(map(is_made, maker.make(VIEW, orders(1, BAD))))
-    assert client._HELLO_CACHE[json.dumps(spec_of(command("crash once", script)))]["version"] == "True"
+    assert all(map(is_made, maker.make_meshes(VIEW, orders(1, BAD))))
+    assert client._HELLO_CACHE[json.dumps(build_spec(command("crash once", script)))]["version"] == "True"
     assert [line for line in log() if line.startswith("make")] == ["make 1", f"make {BAD}", "make 1", f"make {BAD}"]
 
 
 def test_who_empties_the_cache_meanwhile_costs_another_question_and_not_the_scene(tmp_path, make, log, monkeypatch):
-    ask, emptied = client.ask_keeper, []
+    ask, emptied = client.request_meshes, []
 
     def then_empty(line, question):
         answer = ask(line, question)
@@ -257,23 +257,23 @@ def test_who_empties_the_cache_meanwhile_costs_another_question_and_not_the_scen
             shutil.rmtree(tmp_path / "cache")
         return answer
 
-    monkeypatch.setattr(client, "ask_keeper", then_empty)
+    monkeypatch.setattr(client, "request_meshes", then_empty)
     times = 1
     assert all(map(is_made, make("well", 1, 2)))
     assert log().count("make 1") == 2
     times = 100
-    with pytest.raises(ModelError, match="do not stay where they are kept"):
+    with pytest.raises(ModelError, match="cached meshes disappear"):
         make("well", 3)
 
 
-def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(make: Make, keepers: Keepers):
+def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(make: Make, daemons: Daemons):
     for seed in range(3):
         make("chatter", seed)
-    ((_, keeper),) = keepers.items()
-    process = keeper._process
+    ((_, daemon),) = daemons.items()
+    process = daemon._process
     assert process is not None
     assert str(Path(f"/proc/{process._process.pid}/fd/2").readlink()).startswith("pipe:")
-    assert len(process._said._end) <= 1 << 16
+    assert len(process._stderr._end) <= 1 << 16
 
 
 def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -293,27 +293,27 @@ def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, mon
         'echo "$(env | grep hush) $HOME $HF_HOME $CUDA_VISIBLE_DEVICES $OWN" >&2; exit 1',
     )
     with pytest.raises(ModelAccessError, match=r"it says: /home/own /hf 1 1$"):
-        MeshClient(tell, 1.0, Services(tmp_path)).make(VIEW, orders(1))
+        MeshClient(tell, 1.0, Services(tmp_path)).make_meshes(VIEW, orders(1))
     monkeypatch.setenv("HF_ENDPOINT", "https://mirror.example")
-    assert process.environment()["HF_ENDPOINT"] == "https://mirror.example"
+    assert process_module.select_environment()["HF_ENDPOINT"] == "https://mirror.example"
 
 
-def test_the_same_words_elsewhere_are_another_process(tmp_path, monkeypatch: pytest.MonkeyPatch, keepers: Keepers):
+def test_the_same_words_elsewhere_are_another_process(tmp_path, monkeypatch: pytest.MonkeyPatch, daemons: Daemons):
     command, found = (sys.executable, "-m", "own_server", "well"), []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "own_server.py").write_text(SERVER.read_text().replace('"tetra"', f'"{name}"'))
         monkeypatch.chdir(tmp_path / name)
-        (answer,) = MeshClient(command, 9.0, Services(tmp_path)).make(VIEW, orders(1))
+        (answer,) = MeshClient(command, 9.0, Services(tmp_path)).make_meshes(VIEW, orders(1))
         assert isinstance(answer, MeshFile)
         found.append(answer.model)
-        keepers.popitem()[1].close()
+        daemons.popitem()[1].close()
     assert found == ["one@1", "two@1"]
 
 
-def test_a_keeper_is_shared_from_one_folder_with_one_environment(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_a_daemon_is_shared_from_one_folder_with_one_environment(tmp_path, monkeypatch: pytest.MonkeyPatch):
     def address() -> Path:
-        return model_daemon._address("keeper", spec_of(("meshserver", "well")))
+        return model_daemon.compute_socket_path("daemon", build_spec(("meshserver", "well")))
 
     here = address()
     monkeypatch.setenv("SOME_TOKEN", "not passed on")
@@ -328,7 +328,7 @@ def test_a_cache_that_cannot_be_written_is_told_to_who_named_it(tmp_path, comman
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "meshes").touch()
     with pytest.raises(ModelAccessError, match=r"meshes cannot be kept in .*: Not a directory"):
-        MeshClient(command("well"), 9.0, Services(tmp_path / "full")).make(VIEW, orders(1))
+        MeshClient(command("well"), 9.0, Services(tmp_path / "full")).make_meshes(VIEW, orders(1))
 
 
 def test_ending_it_ends_what_it_started(process: Callable[..., MeshProcess]):
@@ -339,15 +339,15 @@ def test_ending_it_ends_what_it_started(process: Callable[..., MeshProcess]):
     assert not psutil.wait_procs(below, timeout=5.0)[1]
 
 
-def test_what_is_below_a_launcher_that_is_killed_alone_is_killed(keepers: Keepers):
+def test_what_is_below_a_launcher_that_is_killed_alone_is_killed(daemons: Daemons):
     line = ("sh", "-c", f"{sys.executable} {SERVER} 'stuck'; true")
-    keeper = keepers[line] = MeshDaemon(line)
-    process = keeper._started()
+    daemon = daemons[line] = MeshDaemon(line)
+    process = daemon.ensure_process()
     below = psutil.Process(process._process.pid).children(recursive=True)
     assert len(below) == 2
     os.kill(process._process.pid, signal.SIGKILL)
     process._process.wait()
-    assert keeper._started() is not process
+    assert daemon.ensure_process() is not process
     assert not psutil.wait_procs(below, timeout=5.0)[1]
 
 
