@@ -18,7 +18,7 @@ from tableverse_factory.geometry.math.transforms import (
     normalize_quaternion,
     transform_points,
 )
-from tableverse_factory.physics.mjcf.drawables import load_scenery, make_box_mesh, read_geom_color, read_geom_mesh
+from tableverse_factory.physics.mjcf.scenery import load_scenery, make_box_mesh, read_geom_color, read_geom_mesh
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.execution.poses import pose_from_row
 from tableverse_factory.robotics.robots.arm import Arm

@@ -13,8 +13,8 @@ from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
-from tableverse_factory.physics.mjcf.drawables import Rgb, make_geom_box, read_geom_color, read_geom_mesh
-from tableverse_factory.physics.mjcf.hidden_geoms import find_geoms_without_visual
+from tableverse_factory.physics.mjcf.scenery import Rgb, make_geom_box, read_geom_color, read_geom_mesh
+from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.model_solids import body_name, make_geom_mesh
 
 # Lowercase names of supports, which are never taken for objects
@@ -95,7 +95,7 @@ def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Model
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
     seen = _list_visual_geoms(model, geoms)
     looks = [_load_visual(model, data, geom, pose) for geom in seen]
-    unseen = (_load_visual(model, data, geom, pose) for geom in find_geoms_without_visual(model, data, seen, solid))
+    unseen = (_load_visual(model, data, geom, pose) for geom in find_undrawn_geoms(model, data, seen, solid))
     hulls = [hull for hull in (_compute_hull(model, data, geom, pose) for geom in solid) if hull is not None]
     mass, center, inertia = _compute_mass_properties(model, data, root, pose)
     friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0

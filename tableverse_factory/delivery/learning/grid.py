@@ -15,8 +15,8 @@ from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.vector_sim import load_scene_spec
-from tableverse_factory.physics.mjcf.drawables import make_geom_box, read_geom_color, read_geom_mesh
 from tableverse_factory.physics.mjcf.scene_objects import read_slab
+from tableverse_factory.physics.mjcf.scenery import make_geom_box, read_geom_color, read_geom_mesh
 from tableverse_factory.physics.mjcf.spec import VISUAL_GROUP
 from tableverse_factory.physics.render.render import look_at, render
 from tableverse_factory.physics.render.views import frame_points

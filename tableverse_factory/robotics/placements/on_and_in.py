@@ -53,7 +53,7 @@ class ConvexPieces:
         key = turn.quaternion_wxyz.tobytes()
         if key not in self._rotated:
             self._rotated[key] = self._standing.turned(rotation_matrix(turn.quaternion_wxyz), np.zeros(3))
-        return self._up.first_clear([MovingSolid(self._rotated[key], offset)], self._near, clearance_m)
+        return self._up.find_first_clear([MovingSolid(self._rotated[key], offset)], self._near, clearance_m)
 
 
 def _build_solids(scene_object: SceneObject) -> Solids:

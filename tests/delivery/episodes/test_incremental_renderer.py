@@ -11,7 +11,7 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_from_rotation_vector,
     transform_points,
 )
-from tableverse_factory.physics.mjcf.drawables import make_box_mesh
+from tableverse_factory.physics.mjcf.scenery import make_box_mesh
 from tableverse_factory.physics.render.render import render
 from tests.helpers.recorded_dataset import EYE, GREEN, RED, painted_box
 
