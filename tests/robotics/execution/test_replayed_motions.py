@@ -256,7 +256,7 @@ def test_verify_replays_nothing_but_datasets(tmp_path: Path, run) -> None:
     code, _, err = run("verify", tmp_path, "--trajectories")
     assert (code, "--trajectories needs a dataset" in err) == (1, True)
     code, _, err = run("verify", dataset_of(tmp_path / "without", [], {}), "--trajectories")
-    assert (code, "no trajectories in it to replay" in err) == (1, True)
+    assert (code, "no trajectories to replay" in err) == (1, True)
 
 
 def test_an_arm_from_a_file_is_given_again(good: RolloutResult, tmp_path: Path, run) -> None:
