@@ -11,7 +11,7 @@ from schemas.identity import content_hash
 from tableverse_factory.core.config import fingerprint_config, fingerprint_tree, select_output_affecting
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.source_hash import compute_source_hash
-from tableverse_factory.core.storage.files import StoragePath, missing_build_error, read_whole, write_atomic
+from tableverse_factory.core.storage.files import StoragePath, make_missing_build_error, read_whole, write_atomic
 from tableverse_factory.stage import RecordFunction, Stage
 
 FORMAT = "tableverse-dataset-1"
@@ -162,7 +162,7 @@ def read_run(path: StoragePath) -> dict[str, Any]:
     try:
         record = json.loads(read_whole(path))
     except FileNotFoundError:
-        raise missing_build_error(path) from None
+        raise make_missing_build_error(path) from None
     except NotADirectoryError:
         raise BuildError(f"{path.parent} is a file: give the OUT of `tableverse build`, a folder") from None
     except StoreError:

@@ -42,12 +42,12 @@ def open_dataset(path: str | Path) -> "Dataset":
     """
     try:
         filesystem, root = _filesystem(str(path))
-        there = filesystem.isdir(root)
+        exists = filesystem.isdir(root)
     except StoreError as error:
         raise InputError(str(error)) from None
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{path}: cannot be reached: {sanitize_line(str(error), 300)}") from None
-    if not there:
+    if not exists:
         raise InputError(f"{path}: no such folder; give the OUT of `tableverse build`")
     if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
         raise InputError(f"{path}: neither run.json nor scenes/ in it; {_suggest_folder(str(path))}")

@@ -11,7 +11,7 @@ from tableverse_factory.core.text import sanitize_line
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
 _QUERY = re.compile(r"\?[^\s\"'<>)]*")
 _USER = re.compile(r"(?<=://)[^/\s@]*@")
-_GO_ON = "What is there stays: run the same command again"
+_GO_ON = "What was uploaded stays: run the same command again"
 
 _CHANGED = 412
 _PASSING = frozenset({409, 429, 500, 502, 503, 504})
@@ -20,8 +20,8 @@ _BY_STATUS = {
     402: "the account's storage is used up",
     403: "the token may not do this: it needs write access to this owner's datasets (huggingface.co/settings/tokens)",
     404: "there is no such dataset, or the token may not see it",
-    409: "somebody else changes the dataset just now",
-    _CHANGED: "somebody else changed the dataset",
+    409: "another process is changing the dataset just now",
+    _CHANGED: "another process changed the dataset",
     413: "the Hub finds a file or a commit too large",
     429: "the Hub asks to slow down",
 }

@@ -17,7 +17,7 @@ class BuildSpec:
         rows: The whole manifest.
         pipelines: Stages of each kind of row.
         config: Of the build.
-        fingerprints: Of the stages of each kind of row (see `stage_fingerprints`).
+        fingerprints: Of the stages of each kind of row (see `fingerprint_stages`).
         records_dir: Where the outputs of stages are kept.
         keep: Whether they stay there when their shard is committed.
         todo: Ranks of the scenes to work on, in the plan's order.

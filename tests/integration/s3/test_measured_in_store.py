@@ -6,8 +6,8 @@ import numpy as np
 
 from tableverse_factory.core.storage.files import get_store
 from tests.helpers.builds import Silent, request, write_manifest
-from workers.run import run_build
 from workers.progress.stage_costs import collect_measurements
+from workers.run import run_build
 
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 

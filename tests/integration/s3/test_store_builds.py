@@ -9,7 +9,7 @@ import pytest
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage import s3
-from tableverse_factory.core.storage.files import list_names, parse_path, get_store
+from tableverse_factory.core.storage.files import get_store, list_names, parse_path
 from tableverse_factory.dataset.shard_plan import read_plan
 from tests.helpers.builds import (
     Silent,
@@ -24,11 +24,11 @@ from tests.helpers.builds import (
     write_manifest,
 )
 from tests.helpers.store_bytes import digests_in
-from workers.run import run_build
 from workers.plan.invalidate import reopen_scenes
 from workers.plan.read_manifest import read_manifest
 from workers.progress.build_state import read_build_state
 from workers.progress.follow import BuildFollower
+from workers.run import run_build
 from workers.state import commit
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger, journal_path
@@ -63,7 +63,7 @@ def test_the_same_bytes_as_on_the_disk_also_with_the_manifest_in_the_store(whole
     assert not [name for name in get_store(store).list_sizes(store.path, recursive=True) if ".work" in name]
     found = read_build_state(store / "out")
     assert (found.done, found.dropped, found.failed, found.remaining) == (5, 2, 1, 0)
-    assert BuildFollower(store / "out").look().committed == found.shards == 2
+    assert BuildFollower(store / "out").read_tally().committed == found.shards == 2
 
 
 def test_a_second_run_changes_nothing_and_another_build_is_refused(whole, store, proxy):
@@ -157,7 +157,7 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
     ledger = Ledger(store, plan, rows)
     result = compute(rows[0], out)
     with monkeypatch.context() as patched:
-        for name in ("write_atomic", "put_into_place", "remove", "remove_folder"):
+        for name in ("write_atomic", "move", "remove", "remove_folder"):
             patched.setattr(commit, name, until_killed(getattr(commit, name)))
         with pytest.raises(Killed):
             ledger.record(result)

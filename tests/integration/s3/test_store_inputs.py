@@ -11,13 +11,14 @@ from schemas.work import SandboxSetup
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage.untrusted import exists, list_file_names
 from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.run_record import collect_versions
 from tableverse_factory.sources.capture import read_capture, read_detections
 from tableverse_factory.sources.content_hash import hash_entry
 from tableverse_factory.sources.manifest import make_manifest
 from tests.helpers.captures_on_disk import write_capture, write_layout, write_picture
 from tests.helpers.small_dataset import write_small_dataset
 from tests.integration.s3.test_store_readers import upload
-from workers.executors.preflight import NodeExpectation, own_versions
+from workers.executors.preflight import NodeExpectation
 from workers.executors.protocol import WorkerLost
 from workers.executors.ray_executor import ClusterSpec, RayExecutor
 
@@ -103,10 +104,12 @@ def test_a_dataset_whose_tables_cannot_be_listed_is_not_an_empty_one(store, prox
 def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(store, proxy, impatient, tmp_path):
     proxy.fault = lambda method, path: "denied"
     records = str(tmp_path / "records")
-    setup = SandboxSetup("tests.helpers.tiny_line:LINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records)
+    setup = SandboxSetup(
+        "tests.helpers.tiny_line:PIPELINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records
+    )
     executor = RayExecutor(setup, Pools(), ClusterSpec(None, 1, [], tmp_path))
     try:
-        executor._expected = NodeExpectation(own_versions(), (f"{store}/one",))
+        executor._expected = NodeExpectation(collect_versions(), (f"{store}/one",))
         worker = executor.start(executor.pool_of("geometry"))
         until = time.monotonic() + 60.0
         while not (events := executor.wait(1.0)):

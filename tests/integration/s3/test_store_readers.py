@@ -8,7 +8,7 @@ import pytest
 from schemas.config import ObserveConfig
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import list_names, parse_path, get_store
+from tableverse_factory.core.storage.files import get_store, list_names, parse_path
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.sources.content_hash import verify_content_hash
 from tableverse_factory.sources.manifest import make_manifest
