@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from protocol import About, Make, Mesh, Order, load_box, mark, serve
+from protocol import MakeMeshes, MeshFile, MeshOrder, ModelInfo, hash_names, load_box, serve
 
 LICENCE = "SAM License"
 
 
 def main() -> None:
-    """Parses the command line and answers until the other side hangs up."""
+    """Parse the command line and serve."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkout", type=Path, default=Path("sam-3d-objects"), help="clone of facebookresearch's")
     parser.add_argument("--config", type=Path, help="pipeline.yaml; default: checkpoints/hf/ of the checkout")
@@ -26,30 +26,30 @@ def main() -> None:
     parser.add_argument("--self-test", action="store_true", help="answer with boxes, load nothing")
     options = parser.parse_args()
     if options.self_test:
-        serve(About("self-test", "1", "CC0-1.0"), load_box)
+        serve(ModelInfo("self-test", "1", "CC0-1.0"), load_box)
         return
     wants = ("seed",) if options.no_depth else ("seed", "depth")
     config = options.config or options.checkout / "checkpoints" / "hf" / "pipeline.yaml"
-    version = f"{options.version} of {mark(options.checkout, config)}"
-    about = About("sam-3d-objects", version, LICENCE, wants)
-    serve(about, lambda: load(options.checkout, config, options.compile), release=release)
+    version = f"{options.version} of {hash_names(options.checkout, config)}"
+    info = ModelInfo("sam-3d-objects", version, LICENCE, wants)
+    serve(info, lambda: load(options.checkout, config, options.compile), release=release)
 
 
-def load(checkout: Path, config: Path, compiled: bool) -> Make:
-    """The model, its weights on the GPU."""
+def load(checkout: Path, config: Path, compiled: bool) -> MakeMeshes:
+    """Load the model on the GPU."""
     sys.path.insert(0, str(checkout / "notebook"))
     from inference import Inference
 
     # Calling it fits pose and size to the picture, which is not used: its pipeline can leave it.
     pipeline = Inference(str(config), compile=compiled)._pipeline
-    # It takes one picture at a time: there is no batch to make larger or smaller.
+    # It takes one picture at a time.
     return lambda orders, _: [make_one(pipeline, order) for order in orders]
 
 
-def make_one(pipeline: Any, order: Order) -> Mesh:
-    """One object's mesh: a GLB, whose vertices the model has turned to Y-up.
+def make_one(pipeline: Any, order: MeshOrder) -> MeshFile:
+    """Make the mesh of one object, a GLB with y up.
 
-    Its pose and scale are left alone: they belong to the gaussians, which are Z-up, and the scale is not metric.
+    Pose and scale are ignored: they belong to the gaussians, which are z up, and the scale is not metric.
     """
     import numpy as np
     import torch
@@ -57,7 +57,7 @@ def make_one(pipeline: Any, order: Order) -> Mesh:
 
     image = np.array(Image.open(io.BytesIO(order.picture)).convert("RGB"))
     mask = np.where(np.array(Image.open(io.BytesIO(order.mask))) > 0, 255, 0).astype(np.uint8)
-    seen = None if order.depth is None else torch.from_numpy(pointmap(order, mask.shape))
+    points = None if order.depth is None else torch.from_numpy(build_pointmap(order, mask.shape))
     mesh = pipeline.run(
         np.dstack([image, mask]),
         None,
@@ -66,15 +66,15 @@ def make_one(pipeline: Any, order: Order) -> Mesh:
         with_texture_baking=False,
         with_layout_postprocess=False,
         use_vertex_color=True,
-        pointmap=seen,
+        pointmap=points,
     )["glb"]
     if mesh is None:
         raise ValueError("the model decoded no mesh")
-    return Mesh(mesh.export(file_type="glb"), "glb", "y")
+    return MeshFile(mesh.export(file_type="glb"), "glb", "y")
 
 
-def pointmap(order: Order, shape: Sequence[int]) -> Any:
-    """Points of the pixels in PyTorch3D's camera axes: x left, y up, z forward [m]; NaN where unknown. Shape (h, w, 3).
+def build_pointmap(order: MeshOrder, shape: Sequence[int]) -> Any:
+    """Compute pixel points in PyTorch3D's camera axes: x left, y up, z forward; NaN where unknown [m]. Shape (h, w, 3).
 
     The protocol's camera has OpenCV's axes (x right, y down, z forward).
     """
@@ -89,7 +89,7 @@ def pointmap(order: Order, shape: Sequence[int]) -> Any:
 
 
 def release() -> None:
-    """Gives memory back after an error."""
+    """Free memory after an error."""
     import torch
 
     torch.cuda.empty_cache()

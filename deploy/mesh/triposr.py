@@ -10,17 +10,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from protocol import About, Make, Mesh, Order, load_box, mark, serve
+from protocol import MakeMeshes, MeshFile, MeshOrder, ModelInfo, hash_names, load_box, serve
 
 FOREGROUND = 0.85
-"""Share of the picture's side that the object takes: what the model was trained on."""
+"""Share of the picture's side that the object takes, as in training."""
 GREY = 127
 CHUNK = 8192
 FILES = ("config.yaml", "model.ckpt")
 
 
 def main() -> None:
-    """Parses the command line and answers until the other side hangs up."""
+    """Parse the command line and serve."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkout", type=Path, default=Path("TripoSR"), help="clone of VAST-AI-Research's")
     parser.add_argument("--weights", default="stabilityai/TripoSR", help="folder, or on the hub NAME or NAME@REVISION")
@@ -31,19 +31,19 @@ def main() -> None:
     parser.add_argument("--self-test", action="store_true", help="answer with boxes, load nothing")
     options = parser.parse_args()
     if options.self_test:
-        serve(About("self-test", "1", "CC0-1.0"), load_box)
+        serve(ModelInfo("self-test", "1", "CC0-1.0"), load_box)
         return
-    of = mark(options.checkout, options.weights, Path(options.weights) / "config.yaml")
+    of = hash_names(options.checkout, options.weights, Path(options.weights) / "config.yaml")
     at = f"{options.resolution}, {options.batch} at a time"
-    about = About("triposr", f"{options.version} of {of} at {at}", "MIT")
-    serve(about, lambda: load(options), options.batch, release)
+    info = ModelInfo("triposr", f"{options.version} of {of} at {at}", "MIT")
+    serve(info, lambda: load(options), options.batch, release)
 
 
-def load(options: argparse.Namespace) -> Make:
-    """The model, its weights on the device.
+def load(options: argparse.Namespace) -> MakeMeshes:
+    """Load the model on the device.
 
-    They are a pickle (`model.ckpt`), and the model's own code loads it with torch's default: the variable below forbids
-    torch, whatever its version, to run anything that stands in there.
+    The weights are a pickle (`model.ckpt`) that the model's code loads with torch's defaults; the variable below keeps
+    all versions of torch from running code in it.
     """
     os.environ["TORCH_FORCE_WEIGHTS_ONLY_LOAD"] = "1"
     sys.path.insert(0, str(options.checkout))
@@ -51,24 +51,24 @@ def load(options: argparse.Namespace) -> Make:
     from tsr.system import TSR
 
     device = options.device or ("cuda:0" if torch.cuda.is_available() else "cpu")
-    model = TSR.from_pretrained(folder_of(options.weights), config_name=FILES[0], weight_name=FILES[1])
+    model = TSR.from_pretrained(resolve_weights(options.weights), config_name=FILES[0], weight_name=FILES[1])
     model.renderer.set_chunk_size(CHUNK)
     model.to(device)
 
-    def make(orders: Any, size: int) -> list[Mesh]:
-        pictures = [on_grey(order) for order in orders]
+    def make(orders: Any, size: int) -> list[MeshFile]:
+        pictures = [crop_on_grey(order) for order in orders]
         pictures += pictures[-1:] * (size - len(pictures))
         with torch.no_grad():
             codes = model(pictures, device=device)[: len(orders)]
             meshes = model.extract_mesh(codes, True, resolution=options.resolution)
         # Its world is x towards the camera, y right, z up; PLY keeps the coordinates as they are.
-        return [Mesh(mesh.export(file_type="ply"), "ply", "z") for mesh in meshes]
+        return [MeshFile(mesh.export(file_type="ply"), "ply", "z") for mesh in meshes]
 
     return make
 
 
-def folder_of(weights: str) -> str:
-    """What lies at a revision of the hub as a folder; without one the name as it is, for the model's own code."""
+def resolve_weights(weights: str) -> str:
+    """Download weights with a revision and return their folder; other names are returned as they are."""
     name, _, revision = weights.partition("@")
     if not revision or Path(weights).is_dir():
         return weights
@@ -78,8 +78,8 @@ def folder_of(weights: str) -> str:
     return str(Path(config).parent)
 
 
-def on_grey(order: Order) -> Any:
-    """The object alone, in the middle of a square of grey, as a picture."""
+def crop_on_grey(order: MeshOrder) -> Any:
+    """Return a picture of the object alone, in the middle of a grey square."""
     import numpy as np
     from PIL import Image
 
@@ -96,7 +96,7 @@ def on_grey(order: Order) -> Any:
 
 
 def release() -> None:
-    """Gives memory back after an error."""
+    """Free memory after an error."""
     import torch
 
     if torch.cuda.is_available():

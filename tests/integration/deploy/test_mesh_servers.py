@@ -104,7 +104,7 @@ def test_a_batch_that_does_not_fit_is_halved_and_one_bad_object_costs_itself(mod
             raise ValueError("nothing in the mask")
         return [order.upper() for order in orders]
 
-    answers = protocol.made(make, ["a", "b", "c", "bad", "d"], 8, lambda: released.append(1))
+    answers = protocol.make_all(make, ["a", "b", "c", "bad", "d"], 8, lambda: released.append(1))
     assert answers == ["A", "B", "C", "ValueError: nothing in the mask", "D"]
     assert released
 
@@ -115,9 +115,9 @@ def test_a_bad_object_changes_no_shape_in_which_its_neighbours_are_made(module):
             raise ValueError("nothing in the mask")
         return [(order, size) for order in orders]
 
-    made = module("protocol").made
-    assert made(make, ["a", "bad", "b"], 4, lambda: None) == [("a", 4), "ValueError: nothing in the mask", ("b", 4)]
-    assert made(make, ["a"], 4, lambda: None) == [("a", 4)]
+    make_all = module("protocol").make_all
+    assert make_all(make, ["a", "bad", "b"], 4, lambda: None) == [("a", 4), "ValueError: nothing in the mask", ("b", 4)]
+    assert make_all(make, ["a"], 4, lambda: None) == [("a", 4)]
 
 
 def test_one_object_that_never_fits_has_none(module):
@@ -127,7 +127,7 @@ def test_one_object_that_never_fits_has_none(module):
         sizes.append(size)
         raise MemoryError
 
-    assert module("protocol").made(make, ["a", "b"], 4, lambda: None) == ["MemoryError: "] * 2
+    assert module("protocol").make_all(make, ["a", "b"], 4, lambda: None) == ["MemoryError: "] * 2
     assert sizes == [4, 2, 1, 1]
 
 
@@ -136,7 +136,7 @@ def test_a_gpu_that_is_lost_ends_the_process_and_blames_no_object(module):
         raise RuntimeError("CUDA error: device-side assert triggered")
 
     with pytest.raises(RuntimeError, match="device-side"):
-        module("protocol").made(make, ["a"], 4, lambda: None)
+        module("protocol").make_all(make, ["a"], 4, lambda: None)
 
 
 def test_other_weights_or_settings_are_another_version(tmp_path):
@@ -168,8 +168,8 @@ def test_a_pointmap_has_the_axes_of_pytorch3d(module):
     depth = np.zeros((4, 6), "<f4")
     depth[3, 5] = 2.0
     camera = {"fx": 5.0, "fy": 4.0, "cx": 3.0, "cy": 2.0}
-    order = module("protocol").Order(b"", b"", 0, depth.tobytes(), camera)
-    points = module("sam3d").pointmap(order, (4, 6))
+    order = module("protocol").MeshOrder(b"", b"", 0, depth.tobytes(), camera)
+    points = module("sam3d").build_pointmap(order, (4, 6))
     assert np.isnan(points[0, 0]).all()
     # To the right of the middle and below it: x is to the left there, y up, z ahead.
     np.testing.assert_allclose(points[3, 5], [-0.8, -0.5, 2.0])
@@ -180,8 +180,8 @@ def test_triposr_is_shown_the_object_alone_in_the_middle_of_grey(module):
     picture[10:44, 60:77] = (250, 0, 0)
     mask = np.zeros((60, 80), np.uint8)
     mask[10:44, 60:77] = 255
-    order = module("protocol").Order(png(picture), png(mask), 0, None, {})
-    shown = np.array(module("triposr").on_grey(order))
+    order = module("protocol").MeshOrder(png(picture), png(mask), 0, None, {})
+    shown = np.array(module("triposr").crop_on_grey(order))
     assert shown.shape == (40, 40, 3)  # 34 rows are 85 %
     red = (shown == (250, 0, 0)).all(axis=-1)
     assert (np.argwhere(red).min(axis=0).tolist(), np.argwhere(red).max(axis=0).tolist()) == ([3, 11], [36, 27])
@@ -189,7 +189,7 @@ def test_triposr_is_shown_the_object_alone_in_the_middle_of_grey(module):
 
 
 def test_triposr_takes_weights_at_a_revision_of_the_hub(module, monkeypatch, tmp_path):
-    folder_of = module("triposr").folder_of
+    resolve_weights = module("triposr").resolve_weights
     with weights_hub(monkeypatch, tmp_path / "cache") as hub:
         model = hub.models["someone/triposr"] = Model()
         for text in ("old", "new"):
@@ -197,13 +197,13 @@ def test_triposr_takes_weights_at_a_revision_of_the_hub(module, monkeypatch, tmp
             for name in ("config.yaml", "model.ckpt"):
                 (tmp_path / text / name).write_text(text)
             model.commit(tmp_path / text, branch=text)
-        found = Path(folder_of("someone/triposr@old"))
+        found = Path(resolve_weights("someone/triposr@old"))
         assert sorted((path.name, path.read_text()) for path in found.iterdir()) == [
             ("config.yaml", "old"),
             ("model.ckpt", "old"),
         ]
-    assert folder_of("someone/triposr") == "someone/triposr"
-    assert folder_of(str(tmp_path)) == str(tmp_path)
+    assert resolve_weights("someone/triposr") == "someone/triposr"
+    assert resolve_weights(str(tmp_path)) == str(tmp_path)
 
 
 def asked(command: list[object], folder: Path, count: int) -> list[MeshFile | str]:

@@ -15,7 +15,7 @@ def resample_depth(depth: DepthImage, width: int, height: int, *, smeared: bool 
     """Resample depth: bilinear on a surface, nearest neighbour at a step.
 
     Networks and bilinear resizing smear steps, which gives flying pixels between an object and its background. Those of
-    the model are removed, and no new ones arise: a pixel is interpolated only if its four neighbours lie on one surface.
+    the model are removed, and no new ones arise: only pixels with four neighbours on one surface are interpolated.
 
     Args:
         depth: Shape (h', w'); 0 where unknown [m].
