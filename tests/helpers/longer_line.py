@@ -51,6 +51,7 @@ def plan(scene, config, rng, services):
 
 
 _SHORT = (*tiny_line._STAGES[:3], Stage("pack", "curation", pack, reads=("export",)))
-_LONG = (*_SHORT, Stage("trajectories", "trajectories", plan, reads=("trajectories",), post_export_tables=("trajectories",)))
+_TRAJECTORIES = ("trajectories",)
+_LONG = (*_SHORT, Stage("trajectories", "trajectories", plan, _TRAJECTORIES, post_export_tables=_TRAJECTORIES))
 SHORT = dict.fromkeys(SceneKind, _SHORT)
 LONG = dict.fromkeys(SceneKind, _LONG)

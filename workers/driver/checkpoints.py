@@ -71,8 +71,8 @@ class CheckpointIndex:
                 scene.costs[stage.name] = decode(cost)
         if self._spec.added_only and not scene.stage.is_post_export:
             raise BuildError(
-                f"{scene.row.scene_id}: {scene.stage.name} would have to run again, because {CHECKPOINTS}/ was deleted or "
-                "this scene was taken back before. Its files are still in its shard. Give the manifest, with "
+                f"{scene.row.scene_id}: {scene.stage.name} would have to run again, because {CHECKPOINTS}/ was deleted "
+                "or this scene was taken back before. Its files are still in its shard. Give the manifest, with "
                 f"`tableverse build MANIFEST OUT --stages +{scene.stages[-1].name}`, or delete {WORK}/, and add --again"
             )
 

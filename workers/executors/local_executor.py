@@ -56,8 +56,7 @@ class LocalExecutor:
 
     def fetch(self, payload: Payload) -> bytes:
         """Return the payload, which is bytes already."""
-        data: bytes = payload
-        return data
+        return payload
 
     def close(self) -> None:
         """Kill the child."""

@@ -56,7 +56,8 @@ def _explain_misfit(name: str, needs: Mapping[str, float], nodes: Sequence[Node]
     if not lacking:
         return (
             f"pool {name} wants {_format_amounts(needs)} on one node, and no node has all of it: "
-            f"{_format_nodes(nodes, needs)}. Lower {_format_options(needs)} of {name} in --pools, or start a larger node"
+            f"{_format_nodes(nodes, needs)}. Lower {_format_options(needs)} of {name} in --pools, "
+            "or start a larger node"
         )
     wanted = _format_amounts({resource: needs[resource] for resource in lacking})
     had = _format_amounts({resource: most[resource] for resource in lacking})
@@ -76,8 +77,8 @@ def _check_together(specs: Mapping[str, PoolSpec], capacity: Mapping[str, float]
         if amount > have + _ROUNDING * max(1.0, have):
             raise BuildError(
                 f"the pools {', '.join(specs)} together want {_format_amount(resource, amount)} for their fewest actors "
-                f"and the build may use {_format_amount(resource, have)}: lower min or what an actor holds in --pools, "
-                "give more --workers, or start more nodes"
+                f"and the build may use {_format_amount(resource, have)}: lower min or what an actor holds in "
+                "--pools, give more --workers, or start more nodes"
             )
 
 
