@@ -76,9 +76,9 @@ def _check_together(specs: Mapping[str, PoolSpec], capacity: Mapping[str, float]
         have = capacity.get(resource, 0.0)
         if amount > have + _ROUNDING * max(1.0, have):
             raise BuildError(
-                f"the pools {', '.join(specs)} together want {_format_amount(resource, amount)} for their fewest actors "
-                f"and the build may use {_format_amount(resource, have)}: lower min or what an actor holds in "
-                "--pools, give more --workers, or start more nodes"
+                f"the pools {', '.join(specs)} together want {_format_amount(resource, amount)} for their fewest "
+                f"actors and the build may use {_format_amount(resource, have)}: lower min or what an actor holds "
+                "in --pools, give more --workers, or start more nodes"
             )
 
 
