@@ -56,8 +56,7 @@ def encode(record: Any) -> bytes:
     blobs: list[bytes | memoryview] = []
     tree = json.dumps(_to_tree(record, blobs), separators=(",", ":")).encode()
     batch = pa.record_batch([pa.array([tree], pa.large_binary()), _make_list(blobs)], _SCHEMA)
-    message: bytes = batch.serialize().to_pybytes()
-    return message
+    return batch.serialize().to_pybytes()
 
 
 def decode(data: bytes) -> Any:

@@ -65,9 +65,7 @@ def query(
             "--columns", "-c", metavar="A,B", autocompletion=completions.complete_columns, help="Names; `all` for all."
         ),
     ] = "",
-    limit: Annotated[
-        int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="Most rows to print.")
-    ] = None,
+    limit: Annotated[int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="Most rows to print.")] = None,
     output: Annotated[Format, typer.Option("--format", "-f", help="A table for people, or all rows for a script.")] = (
         Format.TABLE
     ),

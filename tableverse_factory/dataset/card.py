@@ -166,8 +166,7 @@ def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str,
 
 
 def _select_done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = scenes.filter(pc.equal(scenes["status"], "done")).select(columns).to_pylist()
-    return rows
+    return scenes.filter(pc.equal(scenes["status"], "done")).select(columns).to_pylist()
 
 
 def _sort_by_count(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:

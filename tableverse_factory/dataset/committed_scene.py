@@ -81,8 +81,7 @@ def _read_version(path: StoragePath) -> tuple[Hashable, ...]:
 
 
 def _select_rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist()
-    return rows
+    return table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist()
 
 
 def _read_files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:

@@ -240,8 +240,7 @@ def _sum_times(parts: Sequence[Values], n: int) -> Values:
 
 
 def _get_spec(pools: Pools, pool: str) -> PoolSpec:
-    spec: PoolSpec = getattr(pools, pool)
-    return spec
+    return getattr(pools, pool)
 
 
 def _compute_held_seconds(measured: BuildSample, pools: Pools) -> dict[str, Values]:

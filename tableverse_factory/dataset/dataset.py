@@ -258,8 +258,7 @@ class Dataset:
             raise InputError(f"{self.path}: damaged: {path} is missing although its shard is committed") from None
         except (pa.ArrowException, OSError) as error:
             raise _unreadable_error(path, error) from None
-        rows: list[dict[str, Any]] = found.to_pylist()
-        return rows
+        return found.to_pylist()
 
     def _read_scene_bytes(self, row: Mapping[str, Any], shard: int) -> bytes:
         start, size = int(row["tar_offset"]), int(row["tar_size"])

@@ -183,8 +183,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
 
 class _WebFile(AbstractBufferedFile):  # type: ignore[misc]
     def _fetch_range(self, start: int, end: int) -> bytes:
-        data: bytes = self.fs.cat_file(self.path, start, end)
-        return data
+        return self.fs.cat_file(self.path, start, end)
 
 
 def check_web_address(text: str) -> str:

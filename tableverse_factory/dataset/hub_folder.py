@@ -30,8 +30,7 @@ class HubFolder(WebFolder):
         """Return the token, if there is one, for the Hub alone and never for a redirection's target."""
         from huggingface_hub.utils import build_hf_headers
 
-        headers: dict[str, str] = build_hf_headers(library_name=LIBRARY)
-        return headers
+        return build_hf_headers(library_name=LIBRARY)
 
     def sizes(self, folder: str) -> dict[str, int]:
         """List the names and sizes [bytes] of the files in a folder."""

@@ -66,5 +66,4 @@ def make_hub_api() -> "HfApi":
         InputError: if huggingface_hub is not installed.
     """
     hub = import_extra("huggingface_hub", "the Hugging Face Hub", "hub")
-    api: HfApi = hub.HfApi(library_name=LIBRARY)
-    return api
+    return hub.HfApi(library_name=LIBRARY)

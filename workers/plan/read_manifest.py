@@ -58,10 +58,7 @@ def _read_records(path: StoragePath) -> list[dict[str, Any]]:
     if missing:
         there = ", ".join(table.column_names)[:300]
         raise InputError(f"{path} lacks the columns {', '.join(missing)}: it has {there}; {_manifest_hint()}")
-    records: list[dict[str, Any]] = table.select(
-        [n for n in ImageRow.model_fields if n in table.column_names]
-    ).to_pylist()
-    return records
+    return table.select([n for n in ImageRow.model_fields if n in table.column_names]).to_pylist()
 
 
 def _manifest_hint(folder: Path | str = "FOLDER", name: str = "images.parquet") -> str:

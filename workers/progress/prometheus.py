@@ -119,8 +119,7 @@ def prometheus_text(dataset: str, samples: Iterable[Sample]) -> str:
     """Format samples in Prometheus' text format 0.0.4; those of one metric must be adjacent."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Collector([_make_family(dataset, *group) for group in itertools.groupby(samples, _get_metric)]))
-    text: str = generate_latest(registry).decode()
-    return text
+    return generate_latest(registry).decode()
 
 
 class MetricsFile:

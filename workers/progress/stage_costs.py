@@ -84,8 +84,7 @@ def _sum_tokens(scenes: Iterable[SceneStatus], field_name: str) -> Values:
 
 
 def _read_size(place: StoragePath) -> int:
-    size: int = place.stat().st_size
-    return size
+    return place.stat().st_size
 
 
 def _collect_stage_times(

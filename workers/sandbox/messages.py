@@ -67,6 +67,5 @@ def decode_message(data: bytes) -> SandboxMessage:
     elif kind in (_REPORT, _BROKEN):
         message = decode(rest)
         if isinstance(message, StageReport if kind == _REPORT else Failed):
-            known: StageReport | Failed = message
-            return known
+            return message
     raise ValueError(f"not a message of a sandbox: {data[:20]!r}")

@@ -33,8 +33,7 @@ def parse_stage(name: str) -> str:
 def encode_checkpoint(name: str, record: bytes) -> bytes:
     """Encode a record as a frame: its length, then its zstd compression, under its name."""
     packed = len(record).to_bytes(_SIZE_BYTES, "little") + pa.compress(record, codec="zstd", asbytes=True)
-    framed: bytes = encode_header(packed, name.encode()) + packed
-    return framed
+    return encode_header(packed, name.encode()) + packed
 
 
 def decode_checkpoint(framed: bytes) -> bytes | None:
@@ -102,5 +101,4 @@ def _decompress(packed: bytes) -> bytes | None:
     size = int.from_bytes(packed[:_SIZE_BYTES], "little")
     if size > MAX_PAYLOAD_BYTES:
         return None
-    record: bytes = pa.decompress(memoryview(packed)[_SIZE_BYTES:], decompressed_size=size, codec="zstd", asbytes=True)
-    return record
+    return pa.decompress(memoryview(packed)[_SIZE_BYTES:], decompressed_size=size, codec="zstd", asbytes=True)

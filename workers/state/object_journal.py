@@ -58,8 +58,7 @@ class ObjectJournal(Journal):
         if entry.segment < self._start:
             return read_object_result(self._folder, entry)
         first = entry.offset - self._start
-        result: SceneResult = decode(bytes(self._buffer[first : first + entry.size]))
-        return result
+        return decode(bytes(self._buffer[first : first + entry.size]))
 
     def tick(self) -> None:
         """Write the buffer if it is old enough."""
@@ -108,8 +107,7 @@ class ObjectJournal(Journal):
 def read_object_result(folder: UPath, entry: JournalEntry) -> SceneResult:
     """Read the result at `entry` and nothing else."""
     data = read_range(folder / _object_name(entry.segment), entry.offset - entry.segment, entry.size)
-    result: SceneResult = decode(data)
-    return result
+    return decode(data)
 
 
 def read_object_journal(folder: UPath, start: int = 0) -> JournalState:

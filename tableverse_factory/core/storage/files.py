@@ -84,8 +84,7 @@ def redact_uri(uri: str) -> str:
 
 def get_store(path: UPath) -> "ObjectStore":
     """Get the object store of a remote path."""
-    store: ObjectStore = path.fs
-    return store
+    return path.fs
 
 
 def list_names(folder: StoragePath) -> list[str]:
@@ -230,8 +229,7 @@ def remove_folder(folder: StoragePath, keep: str = "") -> None:
 def open_stream(path: StoragePath) -> BinaryIO:
     """Open a file that is read front to back; from a store a few megabytes are fetched ahead."""
     if isinstance(path, UPath):
-        file: BinaryIO = path.fs.open(path.path, "rb", block_size=_READ_AHEAD_BYTES, cache_type="readahead")
-        return file
+        return path.fs.open(path.path, "rb", block_size=_READ_AHEAD_BYTES, cache_type="readahead")
     return path.open("rb")
 
 
@@ -242,16 +240,14 @@ def read_whole(path: StoragePath) -> bytes:
         FileNotFoundError: if there is none.
     """
     if isinstance(path, UPath):
-        data: bytes = path.fs.cat_file(path.path)
-        return data
+        return path.fs.cat_file(path.path)
     return path.read_bytes()
 
 
 def read_range(path: StoragePath, offset: int, size: int) -> bytes:
     """Read some bytes of a file, fewer where it ends earlier."""
     if isinstance(path, UPath):
-        data: bytes = path.fs.cat_file(path.path, start=offset, end=offset + size)
-        return data
+        return path.fs.cat_file(path.path, start=offset, end=offset + size)
     with path.open("rb") as file:
         file.seek(offset)
         return file.read(size)

@@ -84,8 +84,7 @@ class IncrementalRenderer:
             share = (covered[touched] / _SUPERSAMPLING**2)[:, None]
             picture[touched] = picture[touched] * (1.0 - share) + total[touched] / _SUPERSAMPLING**2
         indices = (np.clip(picture, 0.0, 1.0) * (_LEVELS - 1)).astype(np.int32)
-        levels: Picture = self._levels[indices].reshape(height, width, 3)
-        return levels
+        return self._levels[indices].reshape(height, width, 3)
 
     def _seen(self, poses: Sequence[Pose]) -> tuple[np.ndarray, np.ndarray]:
         """Find subpixels in which a moving part is nearest, and their linear colors."""
@@ -146,8 +145,7 @@ class _MovingPart:
         turned = normals @ rotation_matrix(pose.quaternion_wxyz).T
         points = transform_points(pose, hits.points)
         ambient, direct = compute_light(points, turned, albedo, camera_to_table.position, lighting)
-        total: np.ndarray = ambient + direct
-        return total
+        return ambient + direct
 
 
 class _ShadowReceiver:
@@ -188,8 +186,7 @@ class _ShadowReceiver:
         low, high = flat.min(axis=0) - _SHADOW_MARGIN_M, flat.max(axis=0) + _SHADOW_MARGIN_M
         first, last = np.searchsorted(self._across, [low[0], high[0]])
         along = self._along[first:last]
-        near: np.ndarray = first + np.flatnonzero((along >= low[1]) & (along <= high[1]) & ~blocked[first:last])
-        return near
+        return first + np.flatnonzero((along >= low[1]) & (along <= high[1]) & ~blocked[first:last])
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
@@ -204,10 +201,9 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 def _downsample(image: np.ndarray) -> np.ndarray:
     height, width, channels = image.shape
-    mean: np.ndarray = image.reshape(
+    return image.reshape(
         height // _SUPERSAMPLING, _SUPERSAMPLING, width // _SUPERSAMPLING, _SUPERSAMPLING, channels
     ).mean(axis=(1, 3))
-    return mean
 
 
 def _select_hits(hits: Hits, indices: np.ndarray) -> Hits:

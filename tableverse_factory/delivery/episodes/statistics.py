@@ -42,8 +42,7 @@ def merge_stats(all_figures: Sequence[Mapping[str, np.ndarray]]) -> FeatureStats
     weights = counts / counts.sum()
 
     def weighted(name: str) -> np.ndarray:
-        total: np.ndarray = np.tensordot(weights, np.stack([figures[name] for figures in all_figures]), axes=1)
-        return total
+        return np.tensordot(weights, np.stack([figures[name] for figures in all_figures]), axes=1)
 
     mean = weighted("mean")
     variances = [figures["std"] ** 2 + (figures["mean"] - mean) ** 2 for figures in all_figures]

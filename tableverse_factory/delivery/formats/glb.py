@@ -24,8 +24,7 @@ def encode_glb(contents: ModelContents, labels: Mapping[str, str]) -> bytes:
     scene = trimesh.Scene(base_frame="scene")
     for content in (*contents.objects, *contents.still):
         _add_object(scene, content, labels.get(content.name))
-    data: bytes = scene.export(file_type="glb", include_normals=False)
-    return data
+    return scene.export(file_type="glb", include_normals=False)
 
 
 def _add_object(scene: trimesh.Scene, content: ModelObject, label: str | None) -> None:

@@ -104,8 +104,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             InputError: `bad_action` if it has another shape, or is not finite.
         """
         share = (np.clip(self._numbers("action", action), -1.0, 1.0) + 1.0) / 2.0
-        command: np.ndarray = self._low + share * (self._high - self._low)
-        return command
+        return self._low + share * (self._high - self._low)
 
     def command_to_action(self, command: np.ndarray) -> np.ndarray:
         """Convert a command, as in recorded trajectories, to an action. Shape (j + 1,).
@@ -114,8 +113,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             InputError: as `action_to_command`.
         """
         share = (self._numbers("command", command) - self._low) / (self._high - self._low)
-        action: np.ndarray = np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
-        return action
+        return np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

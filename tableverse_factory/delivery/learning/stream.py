@@ -215,5 +215,4 @@ def take_part(ordered: Indices, index: int, of: int, even_for: int = 1) -> Indic
 
     `even_for` drops the last few scenes of the order, fewer than this, so that as many parts are equally long.
     """
-    part: Indices = ordered[: len(ordered) - len(ordered) % even_for][index::of]
-    return part
+    return ordered[: len(ordered) - len(ordered) % even_for][index::of]

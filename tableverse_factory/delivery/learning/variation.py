@@ -83,8 +83,7 @@ def _move_pose(pose: np.ndarray, center: Vector3, offset: Vector3, turn: float) 
 def _rotate_about_z(points: np.ndarray, turn: float) -> np.ndarray:
     """Rotate points, whose last axis is x, y, z."""
     c, s = np.cos(turn), np.sin(turn)
-    turned: np.ndarray = points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return turned
+    return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _is_above_table(station: Station, data: mujoco.MjData, points: np.ndarray) -> bool:
@@ -115,8 +114,7 @@ def _find_touched_bodies(station: Station, data: mujoco.MjData, body: int) -> se
 
 def _mask_contacts(station: Station, data: mujoco.MjData, body: int) -> np.ndarray:
     """Mask a body's contacts. Shape (c,)."""
-    mine: np.ndarray = (station.model.geom_bodyid[data.contact.geom] == body).any(axis=1)
-    return mine
+    return (station.model.geom_bodyid[data.contact.geom] == body).any(axis=1)
 
 
 def _measure_depth(station: Station, data: mujoco.MjData, body: int) -> float:

@@ -80,8 +80,7 @@ def stack_panels(panels: Sequence[Picture], axis: int) -> Picture:
     shape = list(panels[0].shape)
     shape[axis] = GUTTER
     gutter = np.full(shape, 255, dtype=np.uint8)
-    stacked: Picture = np.concatenate([part for panel in panels for part in (gutter, panel)][1:], axis=axis)
-    return stacked
+    return np.concatenate([part for panel in panels for part in (gutter, panel)][1:], axis=axis)
 
 
 def _frame_scenes(sceneries: Sequence[Scenery]) -> PosedCamera:
@@ -119,5 +118,4 @@ def _add_caption(picture: Picture, text: str) -> Picture:
     image.paste(Image.fromarray(np.array(picture)), (0, _CAPTION))
     font = ImageFont.load_default(size=15)
     ImageDraw.Draw(image).text((2, 2), text, fill="black", font=font)
-    captioned: Picture = np.asarray(image)
-    return captioned
+    return np.asarray(image)

@@ -69,8 +69,7 @@ class LayoutCase:
         objects = self.item.objects
         at = [poses.get(placed.object_id, placed.pose) for placed in objects]
         change = compute_azimuths(make_parts(objects, self.pieces, at), self.groups)[1:] - self.azimuths[1:]
-        turned: Float64[np.ndarray, " k"] = (change + np.pi) % (2 * np.pi) - np.pi
-        return turned
+        return (change + np.pi) % (2 * np.pi) - np.pi
 
 
 def make_parts(

@@ -176,5 +176,4 @@ def _find_deepest(depths: Sequence[tuple[int, int, float]]) -> float:
 
 def _compute_center(placed: PlacedObject, pose: Pose, scale: float) -> Vector3:
     """Compute the centre of the box of the mesh in the table frame [m]."""
-    center: Vector3 = transform_points(pose, box_center(placed.mesh)[None], scale)[0]
-    return center
+    return transform_points(pose, box_center(placed.mesh)[None], scale)[0]

@@ -255,8 +255,7 @@ def _count_overlaps(
 def _compute_pairwise_f(
     shared: Float64[np.ndarray, "t f"], true_sizes: Float64[np.ndarray, " t"], found_sizes: Float64[np.ndarray, " f"]
 ) -> Float64[np.ndarray, "t f"]:
-    f: Float64[np.ndarray, "t f"] = 2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1)
-    return f
+    return 2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1)
 
 
 def _find_truth(capture: Path) -> Path | None:

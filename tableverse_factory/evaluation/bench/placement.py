@@ -220,8 +220,7 @@ def _find_placed(perceived: PerceivedObjects, placed: PlacedObjects, instance_id
 
 def _map_table_frames(ours: Pose, true: Pose) -> Matrix4:
     """Compute the transform from the estimated table frame to the true one, through the common camera."""
-    motion: Matrix4 = matrix_from_pose(true) @ np.linalg.inv(matrix_from_pose(ours))
-    return motion
+    return matrix_from_pose(true) @ np.linalg.inv(matrix_from_pose(ours))
 
 
 def _parse_pose(value: dict[str, Any]) -> Pose:

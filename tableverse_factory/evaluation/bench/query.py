@@ -75,8 +75,7 @@ def bench_query(out: Path, what: str) -> QueryTimes:
     turn = iter([*ids, *ids])
 
     def find(opened: Dataset) -> int:
-        found: int = opened.objects.to_table(columns=_COLUMNS, filter=wanted).num_rows
-        return found
+        return opened.objects.to_table(columns=_COLUMNS, filter=wanted).num_rows
 
     filter_ms, cpu_ms = _time_repeatedly(lambda: find(dataset))
     return QueryTimes(

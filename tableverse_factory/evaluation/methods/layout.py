@@ -214,8 +214,7 @@ def _place_object(item: MethodObject) -> TriangleMesh:
 
 def _compute_own_center(item: MethodObject) -> Vector3:
     """Compute the centre of the mesh's own box in the scene [m], which turning the object does not move."""
-    center: Vector3 = transform_points(item.pose, box_center(item.mesh)[None], item.scale)[0]
-    return center
+    return transform_points(item.pose, box_center(item.mesh)[None], item.scale)[0]
 
 
 def _compute_percentile(values: Sequence[float], percent: float) -> float | None:

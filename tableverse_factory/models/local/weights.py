@@ -22,8 +22,7 @@ def load_once(key: tuple[object, ...], make: Callable[[], _Model]) -> _Model:
     """Return the model of a key, made at the first call in this process."""
     if key not in _LOADED:
         _LOADED[key] = make()
-    model: _Model = _LOADED[key]
-    return model
+    return _LOADED[key]
 
 
 def release_models() -> None:

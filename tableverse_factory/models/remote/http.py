@@ -175,8 +175,7 @@ def post_json(endpoint: Endpoint, path: str, body: Mapping[str, Any]) -> Mapping
     url = f"{endpoint.base_url.rstrip('/')}/{path}"
 
     async def send(client: BoundedClient) -> Mapping[str, Any]:
-        answer: Mapping[str, Any] = (await client.post(url, json=body)).json()
-        return answer
+        return (await client.post(url, json=body)).json()
 
     return send_with_retries(endpoint, send, {}, time.monotonic() + endpoint.timeout_s, seed=url.encode())
 

@@ -111,8 +111,7 @@ class Recording(Frozen):
         """Return another object's pose at each sample, or None where it stands as exported."""
         if object_id not in self.moved_ids:
             return None
-        poses: Float32[np.ndarray, "t 7"] = self.moved_poses[:, self.moved_ids.index(object_id)]
-        return poses
+        return self.moved_poses[:, self.moved_ids.index(object_id)]
 
 
 def encode_recording(recording: Recording) -> bytes:

@@ -106,8 +106,7 @@ class ExecutionMonitor:
     def _compute_matter_spread(self) -> Float64[np.ndarray, "n 3"]:
         """Compute the mean square distance of each other body's matter from its center, along principal axes [m²]."""
         inertia, mass = self._model.body_inertia[self._other_bodies], self._model.body_mass[self._other_bodies]
-        spread: Float64[np.ndarray, "n 3"] = (inertia.sum(axis=1, keepdims=True) / 2 - inertia) / mass[:, None]
-        return spread
+        return (inertia.sum(axis=1, keepdims=True) / 2 - inertia) / mass[:, None]
 
     def _list_touching_fingers(self, data: mujoco.MjData) -> int:
         pairs = data.contact.geom

@@ -11,8 +11,7 @@ def compute_angles(a_wxyz: Float[np.ndarray, "*n 4"], b_wxyz: Float[np.ndarray, 
     """Compute smallest angles between unit quaternions, which broadcast [rad]; exactly 0 between equal ones."""
     a, b = a_wxyz.astype(np.float64), b_wxyz.astype(np.float64)
     less, more = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
-    between: Float[np.ndarray, "*k"] = 4.0 * np.arctan2(np.minimum(less, more), np.maximum(less, more))
-    return between
+    return 4.0 * np.arctan2(np.minimum(less, more), np.maximum(less, more))
 
 
 def pose_from_row(row: Float[np.ndarray, "7"]) -> Pose:

@@ -110,8 +110,7 @@ class Rollout:
         return data
 
     def _target(self, index: int) -> Float64[np.ndarray, " k"]:
-        target: Float64[np.ndarray, " k"] = self.commands.targets[min(index, len(self.commands) - 1)]
-        return target
+        return self.commands.targets[min(index, len(self.commands) - 1)]
 
     def _sample(self, data: mujoco.MjData, index: int) -> StateSample:
         phase = int(self.commands.phases[min(index, len(self.commands) - 1)])

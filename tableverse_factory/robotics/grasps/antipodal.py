@@ -60,8 +60,7 @@ class _ContactPairs(Frozen):
     alignment: Numbers
 
     def middle(self) -> Points:
-        middle: Points = self.first + 0.5 * self.width[:, None] * self.axis
-        return middle
+        return self.first + 0.5 * self.width[:, None] * self.axis
 
     def select(self, kept: np.ndarray) -> "_ContactPairs":
         return _ContactPairs(self.first[kept], self.axis[kept], self.width[kept], self.alignment[kept])
@@ -156,8 +155,7 @@ def _score_nearness(middle: Points, center: Vector3) -> Numbers:
     """Score 1 where the center of mass hangs below the grasp, falling with the lever of its weight."""
     across = np.hypot(middle[:, 0] - center[0], middle[:, 1] - center[1])
     above = 0.5 * np.maximum(center[2] - middle[:, 2], 0.0)  # what is held below its centre wants to topple
-    nearness: Numbers = 1.0 / (1.0 + np.hypot(across, above) / _HALF_SCORE_LEVER_M)
-    return nearness
+    return 1.0 / (1.0 + np.hypot(across, above) / _HALF_SCORE_LEVER_M)
 
 
 def _keep_above_table(pairs: _ContactPairs, gripper: GripperShape) -> _ContactPairs:
@@ -234,7 +232,4 @@ def _compute_retreat(gripper: GripperShape, rotation: Rotations, position: Point
     deepest = (down @ gripper.finger_centers.T - np.abs(down) @ gripper.finger_half_sizes.T).min(axis=1)
     mirrored = (down * [1.0, -1.0, 1.0]) @ gripper.finger_centers.T - np.abs(down) @ gripper.finger_half_sizes.T
     deepest = np.minimum(deepest, mirrored.min(axis=1)) - np.abs(down[:, 1]) * (0.5 * width + FINGER_CLEARANCE_M)
-    back: Numbers = np.maximum(TABLE_CLEARANCE_M + _SLACK_M - position[:, 2] - deepest, 0.0) / np.maximum(
-        -approach, 1e-3
-    )
-    return back
+    return np.maximum(TABLE_CLEARANCE_M + _SLACK_M - position[:, 2] - deepest, 0.0) / np.maximum(-approach, 1e-3)

@@ -70,8 +70,7 @@ def _is_above_table(grasps: Grasps, boxes: Boxes) -> Mask:
     centers, half = boxes
     down = grasps.rotations[:, 2]
     middle = grasps.positions[:, 2, None] + np.einsum("nbk,nk->nb", centers, down)
-    free: Mask = (middle - np.abs(down) @ half.T >= TABLE_CLEARANCE_M).all(axis=1)
-    return free
+    return (middle - np.abs(down) @ half.T >= TABLE_CLEARANCE_M).all(axis=1)
 
 
 def _contains_points(grasps: Grasps, boxes: Boxes, points: Points) -> Mask:
@@ -119,5 +118,4 @@ def _overlaps_boxes(grasps: Grasps, boxes: Boxes, piece: TriangleMesh) -> Mask:
     local = np.einsum("nji,nvj->nvi", grasps.rotations, piece.vertices[None] - grasps.positions[:, None])
     low, high = local.min(axis=1)[:, None], local.max(axis=1)[:, None]
     apart |= ((low > centers + half) | (high < centers - half)).any(axis=2)
-    overlapping: Mask = (~apart).any(axis=1)
-    return overlapping
+    return (~apart).any(axis=1)

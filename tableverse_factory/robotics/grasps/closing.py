@@ -69,8 +69,7 @@ def close_pads(
 def _orient_normals(normals: Points, ways: Points) -> Points:
     """Orient normals against the rays, whatever the winding of the faces."""
     facing = np.einsum("nci,nci->nc", normals, ways)[..., None]
-    turned: Points = np.where(facing > 0.0, -normals, normals)
-    return turned
+    return np.where(facing > 0.0, -normals, normals)
 
 
 def close_grasps(grasps: Grasps, felt: TriangleMesh, gripper: GripperShape, max_opening_m: float) -> Grasps:

@@ -66,8 +66,7 @@ def _fetch_answer(question: Mapping[str, Any], config: TrajectoriesConfig, servi
     key = compute_answer_key(endpoint, (Message("user", json.dumps(question)),), {})
     kept = cache.get(key)
     if kept is not None:
-        body: Mapping[str, Any] = json.loads(kept.text)
-        return body
+        return json.loads(kept.text)
     cache.check()
     body = post_json(endpoint, "grasps", question)
     _check_answer(body)

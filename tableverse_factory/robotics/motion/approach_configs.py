@@ -83,8 +83,7 @@ class ApproachConfig(Frozen):
     @property
     def q(self) -> JointVector:
         """The configuration itself."""
-        first: JointVector = self.hand.path[0]
-        return first
+        return self.hand.path[0]
 
     def list_fallbacks(self, hand: Phase, load: Phase) -> tuple[str, ...]:
         """List lines that are shorter than usual or slanted, in words."""

@@ -62,5 +62,4 @@ class ArmDynamics:
         data = self._data
         data.qpos[self._qpos], data.qvel[self._dof], data.qacc[self._dof] = q, velocity, acceleration
         mujoco.mj_inverse(self._model, data)
-        needed: JointVector = data.qfrc_inverse[self._dof].copy()
-        return needed
+        return data.qfrc_inverse[self._dof].copy()

@@ -237,8 +237,7 @@ def _generate_restarts(lower: JointVector, upper: JointVector) -> Configurations
         ratio = (1 + ratio) ** (1 / (len(lower) + 1))
     alphas = ratio ** -np.arange(1, len(lower) + 1)
     unit = (0.5 + np.arange(1, RESTARTS + 1)[:, None] * alphas) % 1.0
-    spread: Configurations = lower + (upper - lower) * (0.1 + 0.8 * unit)
-    return spread
+    return lower + (upper - lower) * (0.1 + 0.8 * unit)
 
 
 def _drop_duplicates(ranked: Configurations) -> Configurations:

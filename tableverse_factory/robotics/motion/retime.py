@@ -54,8 +54,7 @@ class _SplinePath(AbstractGeometricPath):  # type: ignore[misc]
         self._parts = (curve, curve.derivative(1), curve.derivative(2))
 
     def __call__(self, path_positions: np.ndarray, order: int = 0) -> np.ndarray:
-        values: np.ndarray = self._parts[order](path_positions)
-        return values
+        return self._parts[order](path_positions)
 
     @property
     def dof(self) -> int:

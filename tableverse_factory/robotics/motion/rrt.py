@@ -27,8 +27,7 @@ class _Tree:
         return int(np.argmin(((self._points[: len(self.parents)] - q) ** 2).sum(axis=1)))
 
     def at(self, index: int) -> JointVector:
-        point: JointVector = self._points[index]
-        return point
+        return self._points[index]
 
     def add(self, q: JointVector, parent: int) -> int:
         if len(self.parents) == len(self._points):
@@ -140,5 +139,4 @@ def _sees(start: JointVector, goal: JointVector, space: CollisionSpace) -> bool:
 def _interpolate_path(corners: JointPath, marks: np.ndarray, value: float) -> JointVector:
     index = min(int(np.searchsorted(marks, value, side="right")) - 1, len(corners) - 2)
     share = (value - marks[index]) / max(marks[index + 1] - marks[index], 1e-12)
-    point: JointVector = corners[index] + share * (corners[index + 1] - corners[index])
-    return point
+    return corners[index] + share * (corners[index + 1] - corners[index])

@@ -128,8 +128,7 @@ def _densify(path: JointPath) -> JointPath:
     at = np.concatenate([[0.0], *marks])
     low = np.minimum(at.astype(int), max(len(path) - 2, 0))
     high = np.minimum(low + 1, len(path) - 1)
-    dense: JointPath = path[low] + (at - low)[:, None] * (path[high] - path[low])
-    return dense
+    return path[low] + (at - low)[:, None] * (path[high] - path[low])
 
 
 def _find_last_sample(motion: Motion, phase: Phase) -> int:

@@ -41,8 +41,7 @@ def compute_least_gaps(
 ) -> Float64[np.ndarray, " n"]:
     """Compute the least gap of each box to any body [m], infinite without bodies; see `compute_box_gaps`."""
     gaps = compute_box_gaps(low, high, others, over_lower)
-    least: Float64[np.ndarray, " n"] = gaps.min(axis=1, initial=np.inf)
-    return least
+    return gaps.min(axis=1, initial=np.inf)
 
 
 def are_outlines_clear(

@@ -75,8 +75,7 @@ class PlacementRegion(Frozen):
 
     def contains(self, middles: Points2) -> Bool[np.ndarray, " n"]:
         """Test which points lie inside."""
-        held: Bool[np.ndarray, " n"] = np.all((middles >= self.low) & (middles <= self.high), axis=1)
-        return held
+        return np.all((middles >= self.low) & (middles <= self.high), axis=1)
 
 
 def build_domain(
@@ -114,5 +113,4 @@ def sample_regions(regions: tuple[PlacementRegion, ...], count: int, rng: np.ran
         return np.zeros((0, 2))
     chosen = rng.choice(len(regions), size=count, p=areas / areas.sum())
     low, high = (np.stack([getattr(region, end) for region in regions])[chosen] for end in ("low", "high"))
-    points: Points2 = low + rng.random((count, 2)) * (high - low)
-    return points
+    return low + rng.random((count, 2)) * (high - low)

@@ -96,8 +96,7 @@ def _compute_edge_gaps(table: Slab, low: Corners, high: Corners) -> Metres:
     along = np.array([[c, s], [-s, c]])
     middles = ((low + high)[:, :2] / 2 - table.center_xy) @ along.T
     halves = (high - low)[:, :2] / 2 @ np.abs(along).T
-    gaps: Metres = (table.half_size_xy - np.abs(middles) - halves).min(axis=1)
-    return gaps
+    return (table.half_size_xy - np.abs(middles) - halves).min(axis=1)
 
 
 def _compute_costs(request: PlacementRequest, turn: Orientation, middles: Points2, room: Metres) -> Metres:

@@ -154,8 +154,7 @@ class _ReferenceSurface:
             return self._y.heights.top
         half = (body.high - body.low)[:2] / 2
         size = np.maximum(np.rint(_CORE_SHARE * half / self._request.cell).astype(int), 0) * 2 + 1
-        level: Heights = ndimage.maximum_filter(self._ground, size=tuple(size), mode="nearest")
-        return level
+        return ndimage.maximum_filter(self._ground, size=tuple(size), mode="nearest")
 
     def _lower_object(
         self, turn: Orientation, cells: np.ndarray, lost: Counter[str]

@@ -95,8 +95,7 @@ class Arm(Frozen):
     def finger_positions(self, opening_m: float) -> JointVector:
         """Return positions of `finger_joints` at an opening. Shape (k,)."""
         share = opening_m / self.max_opening_m
-        positions: JointVector = self.finger_closed + share * (self.finger_open - self.finger_closed)
-        return positions
+        return self.finger_closed + share * (self.finger_open - self.finger_closed)
 
     def gripper_command(self, opening_m: float) -> float:
         """Return the gripper actuator's control for an opening."""

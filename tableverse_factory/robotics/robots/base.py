@@ -68,8 +68,7 @@ def _compute_least_margins(reach: ReachMap, feet: Points2, targets: Points) -> n
     distances = np.linalg.norm(feet[:, None] - targets[None, :, :2], axis=2)
     heights = np.broadcast_to(np.maximum(targets[:, 2], 0.0), distances.shape)
     low, high = reach.margin(distances, heights), reach.margin(distances, heights + LIFT_M)
-    least: np.ndarray = np.minimum(low, high).min(axis=1)
-    return least
+    return np.minimum(low, high).min(axis=1)
 
 
 def _has_footing(station: Station, feet: Points2) -> np.ndarray:
@@ -97,8 +96,7 @@ def _compute_table_margin(station: Station, feet: Points2) -> np.ndarray:
     along = (feet - model.body_pos[body][:2]) @ rotation_matrix(model.body_quat[body])[:2, :2]
     beyond = np.abs(along) - model.geom_size[tops[0]][:2]
     outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-    margin: np.ndarray = np.where(outside > 0.0, -outside, -beyond.max(axis=1))
-    return margin
+    return np.where(outside > 0.0, -outside, -beyond.max(axis=1))
 
 
 def _compute_outline_distance(outline: Points2, feet: Points2) -> np.ndarray:

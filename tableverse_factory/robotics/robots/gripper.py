@@ -173,8 +173,7 @@ def _measure_box(model: mujoco.MjModel, data: mujoco.MjData, site: int, geom: in
 
 def _to_gripper_frame(data: mujoco.MjData, site: int, points: Points) -> Points:
     """Transform world points into the gripper frame. Shape (n, 3) [m]."""
-    inside: Points = (points - data.site_xpos[site]) @ data.site_xmat[site].reshape(3, 3)
-    return inside
+    return (points - data.site_xpos[site]) @ data.site_xmat[site].reshape(3, 3)
 
 
 def _compute_distance(places: Points) -> float:

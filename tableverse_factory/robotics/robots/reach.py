@@ -126,5 +126,4 @@ class _IkSolver:
     def _turn(self) -> Vector3:
         """Compute the small-angle rotation vector from the gripper's direction to straight down."""
         now = self._data.site_xmat[self._site].reshape(3, 3)
-        turn: Vector3 = 0.5 * np.cross(now.T, _DOWNWARD.T).sum(axis=0)
-        return turn
+        return 0.5 * np.cross(now.T, _DOWNWARD.T).sum(axis=0)

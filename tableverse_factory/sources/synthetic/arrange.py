@@ -51,8 +51,7 @@ def _move_group(group: list[PlacedModel], offset: Float64[np.ndarray, "2"], yaw:
 def _find_footprint(group: list[PlacedModel]) -> Polygon:
     """Find the convex outline of a group seen from above."""
     points = np.concatenate([item.vertices()[:, :2] for item in group])
-    polygon: Polygon = points[ConvexHull(points).vertices]
-    return polygon
+    return points[ConvexHull(points).vertices]
 
 
 def _push_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: float) -> Float64[np.ndarray, "2"]:
@@ -65,8 +64,7 @@ def _push_in(footprint: Polygon, others: list[Polygon], azimuth: float, gap: flo
         if any(_is_closer(candidate, other, gap) for other in others):
             break
         distance -= STEP_M
-    offset: Float64[np.ndarray, "2"] = distance * direction - footprint.mean(axis=0)
-    return offset
+    return distance * direction - footprint.mean(axis=0)
 
 
 def _is_closer(a: Polygon, b: Polygon, gap: float) -> bool:

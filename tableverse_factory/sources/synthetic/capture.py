@@ -48,8 +48,7 @@ def write_files(files: dict[str, bytes], folder: Path) -> None:
 def make_instance_ids(scene: SyntheticScene) -> IdImage:
     """Make `masks.png`: object numbers from 1; 0 elsewhere and for objects seen too little to detect."""
     values = np.array([k + 1 if _is_seen(item) else 0 for k, item in enumerate(scene.objects)] + [0], dtype=np.int32)
-    ids: IdImage = values[scene.ids]
-    return ids
+    return values[scene.ids]
 
 
 def build_detections(scene: SyntheticScene, ids: IdImage) -> Detections:

@@ -106,10 +106,7 @@ def make_banana(rng: np.random.Generator) -> GeneratedObject:
 def _make_egg_profile(radius: float, height: float, sharpness: float) -> Profile:
     """Make an egg-like profile; a sharpness above 1 gives pointed ends, below 1 square shoulders."""
     t = np.linspace(-np.pi / 2, np.pi / 2, 15)
-    profile: Profile = np.column_stack(
-        [np.maximum(radius * np.cos(t) ** sharpness, 5e-4), height / 2 * (1 + np.sin(t))]
-    )
-    return profile
+    return np.column_stack([np.maximum(radius * np.cos(t) ** sharpness, 5e-4), height / 2 * (1 + np.sin(t))])
 
 
 def _draw_freckles(rng: np.random.Generator, skin: Color, blush: Color, weight: np.ndarray) -> Raster:

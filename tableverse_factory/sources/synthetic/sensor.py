@@ -97,8 +97,7 @@ def sense_color(rng: np.random.Generator, picture: Picture) -> Picture:
     gains = 1.0 + rng.normal(0.0, 0.02, 3)
     vignette = 1.0 - rng.uniform(0.0, 0.09) * (x * x + y * y)
     grain = rng.standard_normal(picture.shape, dtype=np.float32) * rng.uniform(1.0, 2.6)
-    sensed: Picture = np.clip(np.rint(picture * gains * vignette[..., None] + grain), 0, 255).astype(np.uint8)
-    return sensed
+    return np.clip(np.rint(picture * gains * vignette[..., None] + grain), 0, 255).astype(np.uint8)
 
 
 def _find_shadows(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
@@ -109,8 +108,7 @@ def _find_shadows(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
     """
     columns = np.arange(disparity.shape[1]) + disparity
     reached = np.maximum.accumulate(columns, axis=1)
-    shadow: np.ndarray = columns < reached - 0.75
-    return shadow
+    return columns < reached - 0.75
 
 
 def _find_holes(
@@ -129,8 +127,7 @@ def _find_holes(
     glare = _make_correlated_noise(rng, shape, 5.0) > 2.6 - 2.1 * shiny
     seeds = rng.random(shape) < sensor.dropout / 40.0
     blots = binary_dilation(seeds, iterations=3)
-    holes: np.ndarray = grazing | edge | (glare & (shiny > 0.05)) | blots | (rng.random(shape) < sensor.dropout / 2)
-    return holes
+    return grazing | edge | (glare & (shiny > 0.05)) | blots | (rng.random(shape) < sensor.dropout / 2)
 
 
 def _make_correlated_noise(
@@ -138,5 +135,4 @@ def _make_correlated_noise(
 ) -> Float64[np.ndarray, "h w"]:
     """Make noise of unit variance, correlated over `radius` pixels."""
     smooth = gaussian_filter(rng.standard_normal(shape), radius, mode="wrap")
-    patches: Float64[np.ndarray, "h w"] = smooth / smooth.std()
-    return patches
+    return smooth / smooth.std()

@@ -152,12 +152,11 @@ def make_tube(
     v = np.cross(tangents, u)
     angles = 2 * np.pi * (np.arange(around) + 0.5) / around
     circle_u, circle_v = np.cos(angles)[None, :, None], np.sin(angles)[None, :, None]
-    rings: Rings = (
+    return (
         centers[:, None]
         + radii_uv[:, 0, None, None] * circle_u * u
         + radii_uv[:, 1, None, None] * circle_v * v[:, None]
     )
-    return rings
 
 
 def _revolve_outline(outline: Profile) -> Manifold:
@@ -166,8 +165,7 @@ def _revolve_outline(outline: Profile) -> Manifold:
 
 
 def _find_distinct(outline: Profile) -> np.ndarray:
-    keep: np.ndarray = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-7
-    return keep
+    return np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-7
 
 
 def _revolve_profile(profile: Profile) -> Points:

@@ -123,8 +123,7 @@ def _is_in_view(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
 def _pick_muted_color(rng: np.random.Generator, names: Sequence[str]) -> Color:
     _, color = pick_color(rng, tuple(names))
     grey = color.mean()
-    muted: Color = grey + 0.7 * (color - grey)
-    return muted
+    return grey + 0.7 * (color - grey)
 
 
 def _make_quad(corners: Points) -> TriangleMesh:

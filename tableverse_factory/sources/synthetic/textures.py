@@ -36,15 +36,13 @@ def make_lattice_noise(
         lattice = Image.fromarray(rng.random(shape, dtype=np.float32))
         total += np.asarray(lattice.resize(size, Image.Resampling.BICUBIC)) * np.float32(0.5**octave)
     low, high = total.min(), total.max()
-    heights: np.ndarray = (total - low) / max(high - low, 1e-9)
-    return heights
+    return (total - low) / max(high - low, 1e-9)
 
 
 def blend_colors(a: Color, b: Color, weight: np.ndarray) -> Raster:
     """Blend from `a` where the weight is 0 to `b` where it is 1."""
     share = np.clip(weight, 0.0, 1.0).astype(np.float32)[..., None]
-    mixed: Raster = a.astype(np.float32) + (b - a).astype(np.float32) * share
-    return mixed
+    return a.astype(np.float32) + (b - a).astype(np.float32) * share
 
 
 def sample_raster(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
@@ -52,8 +50,7 @@ def sample_raster(raster: Raster, u: np.ndarray, v: np.ndarray) -> Points:
     height, width = raster.shape[:2]
     column = np.clip((u * width).astype(np.intp), 0, width - 1)
     row = np.clip(((1.0 - v) * height).astype(np.intp), 0, height - 1)
-    colors: Points = raster[row, column]
-    return colors
+    return raster[row, column]
 
 
 def wrap_around_z(raster: Raster, low: float, high: float) -> Texture:

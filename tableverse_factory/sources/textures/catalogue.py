@@ -115,8 +115,7 @@ def make_texture(seed: int, size: int = 512) -> Picture:
         size,
         start=0.618034 * (seed % len(FAMILIES)),
     )
-    picture: Picture = np.rint(np.clip(FAMILIES[family](draw), 0, 255)).astype(np.uint8)
-    return picture
+    return np.rint(np.clip(FAMILIES[family](draw), 0, 255)).astype(np.uint8)
 
 
 def name_texture(seed: int) -> str:

@@ -185,8 +185,7 @@ def _draw_contrast_color(draw: TextureSampler, ground: Color) -> Color:
 def _make_plain_weave(draw: TextureSampler, threads: int) -> Field:
     """Make the heights of a plain weave."""
     u, v = pixel_grid(draw.size)
-    woven: Field = wave(u * threads) * wave(v * threads)
-    return woven
+    return wave(u * threads) * wave(v * threads)
 
 
 def _add_weave(draw: TextureSampler, raster: Raster) -> Raster:

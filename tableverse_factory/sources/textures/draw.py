@@ -64,8 +64,7 @@ class TextureSampler:
     def near(self, color: Color, far: float = 10.0) -> Color:
         """Draw a similar colour: lighter or darker by up to `far`, and half of that off in each channel."""
         shift = self.rng.random(4) * 2 - 1
-        moved: Color = np.clip(np.rint(color + far * shift[0] + 0.5 * far * shift[1:]), 3, 252).astype(np.float32)
-        return moved
+        return np.clip(np.rint(color + far * shift[0] + 0.5 * far * shift[1:]), 3, 252).astype(np.float32)
 
     def each(self, count: int, far: float) -> np.ndarray:
         """Draw a number from -far to far for each cell or board. Shape (count,)."""

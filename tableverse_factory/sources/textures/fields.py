@@ -48,8 +48,7 @@ class Cells(Frozen):
     @property
     def border(self) -> Field:
         """Distance to the border between two cells, growing inwards from 0."""
-        grown: Field = self.second - self.nearest
-        return grown
+        return self.second - self.nearest
 
 
 def pixel_centers(size: int) -> Float32[np.ndarray, " n"]:
@@ -145,15 +144,13 @@ def wave(turns: Field) -> Field:
 
 def take_fraction(values: Field) -> Field:
     """Take the fractional part, 0–1."""
-    part: Field = values - np.floor(values)
-    return part
+    return values - np.floor(values)
 
 
 def smoothstep(values: Field, low: float, high: float) -> Field:
     """Rise smoothly from 0 at `low` to 1 at `high`; `low` may be the larger one."""
     t = np.clip((values - np.float32(low)) / np.float32(high - low), 0, 1)
-    step: Field = t * t * (3 - 2 * t)
-    return step
+    return t * t * (3 - 2 * t)
 
 
 def bell(values: Field, width: float) -> Field:
@@ -166,8 +163,7 @@ def bell(values: Field, width: float) -> Field:
 def shade_relief(height: Field, strength: float) -> Field:
     """Compute the brightness gained by a height in light from the upper left; the same at any size."""
     steep = (np.roll(height, 1, axis=0) - height) + (np.roll(height, 1, axis=1) - height)
-    gain: Field = np.clip(-steep * np.float32(strength * len(height) / 512), -0.6, 0.6)
-    return gain
+    return np.clip(-steep * np.float32(strength * len(height) / 512), -0.6, 0.6)
 
 
 def map_colors(weight: Field, colors: Sequence[Color]) -> Raster:
@@ -178,25 +174,21 @@ def map_colors(weight: Field, colors: Sequence[Color]) -> Raster:
     stops = np.asarray(colors, dtype=np.float64)
     table = ((1 - share) * stops[left] + share * stops[left + 1]).astype(np.float32)
     index = (np.clip(weight, 0, 1) * np.float32(_SHADES - 1)).astype(np.int32)
-    raster: Raster = table[index]
-    return raster
+    return table[index]
 
 
 def paint(raster: Raster, color: Color, weight: Field) -> Raster:
     """Cover a raster with a coat as thick as the weight, 0–1."""
     coat = np.clip(weight, 0, 1)[..., None]
-    mixed: Raster = raster + (color - raster) * coat
-    return mixed
+    return raster + (color - raster) * coat
 
 
 def brighten(raster: Raster, gain: Field) -> Raster:
     """Brighten by the gain: 0 changes nothing, -1 is black."""
-    brighter: Raster = raster * (1 + gain)[..., None]
-    return brighter
+    return raster * (1 + gain)[..., None]
 
 
 def gather_wrapped(field: np.ndarray, right: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Look a field up at other pixels, which wrap round. Shape of the places."""
     size = len(field)
-    taken: np.ndarray = field.reshape(size * size, *field.shape[2:])[(down % size) * size + right % size]
-    return taken
+    return field.reshape(size * size, *field.shape[2:])[(down % size) * size + right % size]

@@ -57,8 +57,7 @@ class TextureLibrary:
                 raise InputError(
                     f"no texture {sanitize_line(which, 60)!r} among the {len(self)} usable ones of the index"
                 )
-        row: dict[str, Any] = self.table.slice(index, 1).to_pylist()[0]
-        return row
+        return self.table.slice(index, 1).to_pylist()[0]
 
     def read_picture(self, which: int | str, most_px: int = DEFAULT_PX) -> Picture:
         """Read the colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`.

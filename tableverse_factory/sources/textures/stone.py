@@ -108,8 +108,7 @@ def _draw_chips(draw: TextureSampler, raster: Raster, count: int, share: float, 
     kinds = draw.rng.integers(0, len(stones), chips.count)
     tint = draw.each(chips.count, 0.08)
     colors = np.asarray(stones, dtype=np.float32)[kinds] * (1 + tint)[:, None]
-    covered: Raster = raster + (colors[chips.ids] - raster) * inside[..., None]
-    return covered
+    return raster + (colors[chips.ids] - raster) * inside[..., None]
 
 
 def draw_travertine(draw: TextureSampler) -> Raster:
@@ -159,8 +158,7 @@ def draw_concrete(draw: TextureSampler) -> Raster:
 
 def _draw_cracks(draw: TextureSampler) -> Field:
     path = draw.noise((2, 2), 6, 0.6)
-    thin: Field = bell(path, 0.008) * smoothstep(draw.noise((2, 2), 2), 0.0, 0.8)
-    return thin
+    return bell(path, 0.008) * smoothstep(draw.noise((2, 2), 2), 0.0, 0.8)
 
 
 def _draw_colors(draw: TextureSampler, palettes: Sequence[tuple[str, ...]]) -> list[Color]:

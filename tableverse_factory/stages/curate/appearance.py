@@ -48,8 +48,7 @@ def _compute_vertex_areas(mesh: TriangleMesh) -> np.ndarray:
     area = np.linalg.norm(cross_rows(b - a, c - a), axis=1) / 6.0
     count = len(mesh.vertices)
     of_corner = [np.bincount(mesh.faces[:, k], weights=area, minlength=count) for k in range(3)]
-    around: np.ndarray = of_corner[0] + of_corner[1] + of_corner[2]
-    return around
+    return of_corner[0] + of_corner[1] + of_corner[2]
 
 
 def _classify_colors(rgb: np.ndarray) -> np.ndarray:
@@ -120,5 +119,4 @@ def _measure_widths(cells: np.ndarray) -> np.ndarray:
     """Measure the width in each of eight directions [cells]."""
     angles = np.arange(8) * np.pi / 8
     along = cells @ np.stack([np.cos(angles), np.sin(angles)])
-    widths: np.ndarray = np.ptp(along, axis=0) + 1.0
-    return widths
+    return np.ptp(along, axis=0) + 1.0

@@ -171,8 +171,7 @@ def _choose_name(item: JudgedObject, confidence: float) -> str:
 
 
 def _compute_middle(item: JudgedObject) -> np.ndarray:
-    middle: np.ndarray = (item.body.low + item.body.high) / 2
-    return middle
+    return (item.body.low + item.body.high) / 2
 
 
 _SUPERLATIVES: tuple[tuple[str, Callable[[JudgedObject], float], bool], ...] = (

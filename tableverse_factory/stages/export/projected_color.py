@@ -103,5 +103,4 @@ def _sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Fl
     right_share, low_share = (u - left)[:, None], (v - top)[:, None]
     upper = picture[top, left] * (1 - right_share) + picture[top, left + 1] * right_share
     lower = picture[top + 1, left] * (1 - right_share) + picture[top + 1, left + 1] * right_share
-    mixed: Float64[np.ndarray, "n 3"] = upper * (1 - low_share) + lower * low_share
-    return mixed
+    return upper * (1 - low_share) + lower * low_share

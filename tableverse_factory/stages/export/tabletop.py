@@ -52,10 +52,8 @@ def _tint(picture: Picture, wanted: np.ndarray) -> Picture:
     calm = min(1.0, float((most / np.maximum(gain * np.std(picture, axis=(0, 1)), 1e-9)).min()))
     shown = np.arange(256)[:, None] * (gain * calm) + (1.0 - calm) * wanted
     near = np.clip(shown, wanted - BOLDEST * most, wanted + BOLDEST * most)
-    tinted: Picture = np.rint(np.clip(near, 0, 255)).astype(np.uint8)[picture, np.arange(3)]
-    return tinted
+    return np.rint(np.clip(near, 0, 255)).astype(np.uint8)[picture, np.arange(3)]
 
 
 def _compute_mean(picture: Picture) -> np.ndarray:
-    mean: np.ndarray = picture.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (picture.size // 3)
-    return mean
+    return picture.reshape(-1, 3).sum(axis=0, dtype=np.int64) / (picture.size // 3)

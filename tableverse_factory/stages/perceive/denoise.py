@@ -26,5 +26,4 @@ def find_inlier_points(points: Points) -> Bool[np.ndarray, " n"]:
     usual = mean <= mean.mean() + DEVIATIONS * mean.std()
     crowd = distances[:, MIN_IN_RADIUS]
     crowded = crowd <= max(RADIUS_OF_MEDIAN * float(np.median(crowd)), 1e-6)
-    result: Bool[np.ndarray, " n"] = usual & crowded
-    return result
+    return usual & crowded

@@ -115,8 +115,7 @@ def _build_objects(
 
 
 def _select_mask(candidate: Candidate, ids: IdImage) -> Mask:
-    mask: Mask = (ids == candidate.instance) & (ids > 0)
-    return mask
+    return (ids == candidate.instance) & (ids > 0)
 
 
 def _clean_points(view: TableView, mask: Mask) -> tuple[Points, Colors]:

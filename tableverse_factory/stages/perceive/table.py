@@ -269,8 +269,7 @@ def _remove_strips(flat: Mask, tolerance_px: float) -> Mask:
     """Remove strips as narrow as those where an upright face crosses the plane's height."""
     size = 2 * int(np.ceil(1.2 * tolerance_px)) + 1
     core = ndimage.minimum_filter(flat.astype(np.uint8), size, mode="nearest")
-    wide: Mask = flat & (ndimage.maximum_filter(core, size) > 0)
-    return wide
+    return flat & (ndimage.maximum_filter(core, size) > 0)
 
 
 def compute_camera_to_table(view: TableView, object_points: Points) -> Pose:

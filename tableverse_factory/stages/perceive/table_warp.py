@@ -31,8 +31,7 @@ def fit_warp(
     for _ in range(4):
         weights = np.linalg.lstsq(terms[keep], h[keep], rcond=None)[0]
         keep = np.abs(terms @ weights - h) <= np.maximum(2.0 * np.std(h[keep] - terms[keep] @ weights), 0.002)
-    warp: np.ndarray = np.clip(_evaluate_polynomial((xy - center) / size, weights, degree), -most, most)
-    return warp
+    return np.clip(_evaluate_polynomial((xy - center) / size, weights, degree), -most, most)
 
 
 def _evaluate_polynomial(

@@ -49,8 +49,7 @@ def compute_vertex_normals(mesh: TriangleMesh) -> Points:
     for k in range(3):
         np.add.at(normals, mesh.faces[:, k], weighted)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit: Points = normals / np.where(length > 0.0, length, 1.0)
-    return unit
+    return normals / np.where(length > 0.0, length, 1.0)
 
 
 def _extract_heading(pose: Pose) -> Float64[np.ndarray, "4"]:

@@ -215,8 +215,7 @@ class _PlaceClearance:
 
     def anywhere(self) -> Mask:
         """Test which grasps have clearance at any placement. Shape (n,)."""
-        found: Mask = np.any([self.at(place) for place in range(len(self.places))], axis=0)
-        return found
+        return np.any([self.at(place) for place in range(len(self.places))], axis=0)
 
     def settled_for(self, place: int) -> tuple[str, ...]:
         """List compromises of a placement, in words."""

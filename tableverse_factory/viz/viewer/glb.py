@@ -89,5 +89,4 @@ def _convert_to_linear(colors: np.ndarray) -> np.ndarray:
 
 
 def _export_glb(scene: trimesh.Scene, normals: bool) -> bytes:
-    data: bytes = scene.export(file_type="glb", include_normals=normals) if scene.geometry else b""
-    return data
+    return scene.export(file_type="glb", include_normals=normals) if scene.geometry else b""

@@ -118,8 +118,7 @@ def mask_unreliable_depth(depth: _Map, sky: _Map | None, confidence: _Map | None
         is_reliable &= np.asarray(sky, dtype=np.float32) < SKY
     if confidence is not None and is_reliable.any():
         is_reliable &= confidence >= MIN_CONFIDENCE * float(np.median(confidence[is_reliable]))
-    result: _Map = np.where(is_reliable, depth, 0.0).astype(np.float32)
-    return result
+    return np.where(is_reliable, depth, 0.0).astype(np.float32)
 
 
 def _run_inference(color: Picture, config: Config, weights: str) -> Any:

@@ -38,8 +38,7 @@ def resample_depth(depth: DepthImage, width: int, height: int, *, smeared: bool 
     smooth = above * (1 - down) + below * down
     nearest = source[np.ix_(np.rint(rows).astype(np.intp), np.rint(columns).astype(np.intp))]
     one_surface = (low > 0.0) & (high - low <= STEP * low)
-    result: Float32[np.ndarray, "h w"] = np.where(one_surface, smooth, nearest)
-    return result
+    return np.where(one_surface, smooth, nearest)
 
 
 def find_step_pixels(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
@@ -48,14 +47,10 @@ def find_step_pixels(depth: DepthImage) -> Bool[np.ndarray, "h w"]:
     low = ndimage.minimum_filter(np.where(known, depth, np.inf), 3, mode="nearest")
     high = ndimage.maximum_filter(np.where(known, depth, 0.0), 3, mode="nearest")
     beside = STEP / 2 * depth
-    between: Bool[np.ndarray, "h w"] = (
-        known & (high > (1 + 2 * STEP) * low) & (depth - low > beside) & (high - depth > beside)
-    )
-    return between
+    return known & (high > (1 + 2 * STEP) * low) & (depth - low > beside) & (high - depth > beside)
 
 
 def _map_centers(source: int, target: int) -> Float64[np.ndarray, " n"]:
     """Map the centres of target pixels to coordinates of the source, which covers the same picture."""
     centres = (np.arange(target) + 0.5) * (source / target) - 0.5
-    within: Float64[np.ndarray, " n"] = np.clip(centres, 0.0, source - 1.0)
-    return within
+    return np.clip(centres, 0.0, source - 1.0)

@@ -16,8 +16,7 @@ MIN_NEIGHBOURS = 3
 def compute_depth_noise(depth: Float[np.ndarray, "*shape"]) -> Float64[np.ndarray, "*shape"]:
     """Compute the standard deviation of a structured-light sensor's axial noise [m] (Nguyen, Izadi and Lovell 2012)."""
     z = np.asarray(depth, dtype=np.float64)
-    noise: Float64[np.ndarray, "*shape"] = 0.0012 + 0.0019 * (z - 0.4) ** 2
-    return noise
+    return 0.0012 + 0.0019 * (z - 0.4) ** 2
 
 
 def fill_depth_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
@@ -72,8 +71,7 @@ class TableView(Frozen):
 
     def xy(self, points_camera: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 2"]:
         """Compute coordinates along the table, their origin below the camera [m]."""
-        along: Float64[np.ndarray, "*shape 2"] = points_camera @ self.axes[:2].T
-        return along
+        return points_camera @ self.axes[:2].T
 
 
 @dataclass(frozen=True, slots=True)

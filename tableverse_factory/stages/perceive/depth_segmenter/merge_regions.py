@@ -115,8 +115,7 @@ def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdI
     ids = _add_floors(ids, regions, into, view)
     roots = np.array([_find_root(into, k) for k in range(len(into))])
     values, numbered = np.unique(roots[ids], return_inverse=True)
-    result: IdImage = numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
-    return result
+    return numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
 
 
 def _find_other_part(regions: list[MergedRegion], b: int, surface: Surface) -> int | None:

@@ -50,8 +50,7 @@ def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:
     """Renumber the kept ids as 1, 2, … in the order given; the others become 0."""
     number = np.zeros(int(ids.max(initial=0)) + 1, dtype=np.int32)
     number[kept] = np.arange(1, len(kept) + 1)
-    result: IdImage = number[ids]
-    return result
+    return number[ids]
 
 
 def measure_area(mask: Mask, view: TableView) -> float:
@@ -72,8 +71,7 @@ def _find_feet_below_image(view: TableView) -> Mask:
     """Find pixels whose foot on the table lies below the picture, where the table may well continue."""
     feet = view.points_camera - view.heights[..., None] * view.plane.normal
     rows = project(feet.reshape(-1, 3), view.observation.camera)[:, 1].reshape(view.valid.shape)
-    below: Mask = np.nan_to_num(rows, nan=np.inf) > view.valid.shape[0] - 1
-    return below
+    return np.nan_to_num(rows, nan=np.inf) > view.valid.shape[0] - 1
 
 
 def is_carried(mask: Mask, view: TableView) -> bool:

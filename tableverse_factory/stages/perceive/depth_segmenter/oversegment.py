@@ -32,8 +32,7 @@ def oversegment(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
     grid[...] = np.arange(1, grid.size + 1).reshape(grid.shape)
     found = watershed(surface.borders, seeds * mask, mask=mask, compactness=COMPACTNESS)
     values, numbered = np.unique(found, return_inverse=True)
-    ids: IdImage = numbered.reshape(mask.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
-    return ids
+    return numbered.reshape(mask.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
 
 
 def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
@@ -72,8 +71,7 @@ def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
     for k in range(len(into)):  # a patch only ever goes into one with a lower or equal final root: follow the chain
         while into[root[k]] != root[k]:
             root[k] = into[root[k]]
-    result: IdImage = root[ids].astype(np.int32)
-    return result
+    return root[ids].astype(np.int32)
 
 
 def _compute_strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
@@ -106,8 +104,7 @@ def _build_links(ids: IdImage, surface: Surface) -> Links:
 
 def _encode_pairs(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int64[np.ndarray, " n"]:
     low, high = np.minimum(ids, other)[where], np.maximum(ids, other)[where]
-    key: Int64[np.ndarray, " n"] = low.astype(np.int64) * count + high
-    return key
+    return low.astype(np.int64) * count + high
 
 
 def _find_gap_links(

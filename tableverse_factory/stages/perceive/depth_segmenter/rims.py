@@ -132,8 +132,7 @@ def _find_circle(
 def _is_on_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Mask:
     x, y, radius, height = circle
     off = np.hypot(xy[:, 0] - x, xy[:, 1] - y) - radius
-    near: Mask = (np.abs(off) < tolerance) & (np.abs(heights - height) < tolerance)
-    return near
+    return (np.abs(off) < tolerance) & (np.abs(heights - height) < tolerance)
 
 
 def _refine_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
@@ -179,8 +178,7 @@ def _validate_rim(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h 
 def _compute_length(
     x: Float64[np.ndarray, "*shape"], y: Float64[np.ndarray, "*shape"]
 ) -> Float64[np.ndarray, "*shape"]:
-    length: Float64[np.ndarray, "*shape"] = np.sqrt(x * x + y * y)
-    return length
+    return np.sqrt(x * x + y * y)
 
 
 def _measure_missing(circle: Circle, view: TableView) -> float:

@@ -152,5 +152,4 @@ def _slice_box(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 def _count_pixels(regions: IdImage, box: PixelBox, count: int) -> Int64[np.ndarray, " k"]:
-    counts: Int64[np.ndarray, " k"] = np.bincount(regions[_slice_box(box, regions.shape)].ravel(), minlength=count)
-    return counts
+    return np.bincount(regions[_slice_box(box, regions.shape)].ravel(), minlength=count)

@@ -144,8 +144,7 @@ def fit_normals(
 
 
 def _has_normal(normals: Float64[np.ndarray, "h w 3"]) -> Mask:
-    known: Mask = normals[..., 2] < 0
-    return known
+    return normals[..., 2] < 0
 
 
 def _measure_concavity(

@@ -72,8 +72,7 @@ def _find_unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
     index = np.ravel_multi_index(tuple(np.moveaxis(bins, -1, 0)), sizes, mode="clip")
     counts = np.bincount(index[table], minlength=int(np.prod(sizes))).astype(np.float64)
     density = ndimage.gaussian_filter(counts.reshape(sizes), 1.0).ravel()[index]
-    unlike: Mask = density < np.quantile(density[table], RARE_ON_TABLE)
-    return unlike
+    return density < np.quantile(density[table], RARE_ON_TABLE)
 
 
 def is_wall_of_floor(floor: Mask, region: Mask, color: Picture) -> bool:

@@ -78,8 +78,7 @@ def _find_own_pixels(rim: Rim, off: Distances, level: Mask, view: TableView) -> 
     within, heights = rim.within[rim.window], view.heights[rim.window]
     beside = view.valid[rim.window] & (off < rim.radius + WALL_M) & (heights < rim.height + WALL_M)
     within_circle = (off < rim.radius - WALL_M) & (heights > rim.height - WALL_M)
-    own: Mask = (beside & ~within & ~within_circle) | _find_lining(rim, off, level, heights)
-    return own
+    return (beside & ~within & ~within_circle) | _find_lining(rim, off, level, heights)
 
 
 def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
@@ -93,8 +92,7 @@ def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> M
             wall[k] = min(float(np.percentile(distances, OUTERMOST)), rim.radius)
     wall = np.maximum.accumulate(wall)
     floor = level & (heights < rim.floor + WALL_M)
-    lining: Mask = within & (floor | (off > wall[step] - WALL_M))
-    return lining
+    return within & (floor | (off > wall[step] - WALL_M))
 
 
 def _split_contents(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:

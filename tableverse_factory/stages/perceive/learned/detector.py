@@ -90,8 +90,7 @@ def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
 
 def compute_table_points(view: TableView) -> Points:
     """Compute the picture's points, x and y along the table, z above its plane [m]. Shape (h, w, 3)."""
-    points: Points = np.concatenate([view.xy(view.points_camera), view.heights[..., None]], axis=-1)
-    return points
+    return np.concatenate([view.xy(view.points_camera), view.heights[..., None]], axis=-1)
 
 
 def _run_network(net: SegmentationNet, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:

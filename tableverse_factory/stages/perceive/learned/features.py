@@ -53,5 +53,4 @@ def _compute_normals(points: Float32[np.ndarray, "h w 3"], valid: Mask) -> Float
     padded = np.pad(smooth, ((1, 1), (1, 1), (0, 0)), mode="edge")
     down, right = padded[2:, 1:-1] - padded[:-2, 1:-1], padded[1:-1, 2:] - padded[1:-1, :-2]
     normals = np.cross(down, right)
-    result: Float32[np.ndarray, "h w 3"] = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return result
+    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)

@@ -35,8 +35,7 @@ def cluster_votes(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
     rank = np.empty(len(sizes), dtype=np.int64)
     rank[order] = np.arange(len(sizes))
     rank[sizes < least] = -1
-    result: Int64[np.ndarray, " n"] = rank[peak_of]
-    return result
+    return rank[peak_of]
 
 
 def _climb(middles: Points, counts: Float64[np.ndarray, " c"]) -> Points:

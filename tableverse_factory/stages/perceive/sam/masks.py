@@ -146,5 +146,4 @@ def _to_tensor(values: Any, like: Tensor) -> Any:
 
 def to_id_image(ids: np.ndarray) -> IdImage:
     """Convert an array of ids to an id image."""
-    result: IdImage = ids.astype(np.int32)
-    return result
+    return ids.astype(np.int32)

@@ -115,8 +115,7 @@ class Sam:
         """Scale boxes to the model's square input, shape (k, 4)."""
         height, width = question.color.shape[:2]
         scale = self._side / np.array([width, height, width, height], dtype=np.float64)
-        scaled: np.ndarray = (clip_boxes(question.boxes, height, width) * scale).astype(np.float32)
-        return scaled
+        return (clip_boxes(question.boxes, height, width) * scale).astype(np.float32)
 
     def scores(self, pixels: Tensor, boxes: Sequence[np.ndarray]) -> Tensor:
         """Compute a low-resolution score image for each box, in float32; above 0 is inside.
@@ -140,8 +139,7 @@ class Sam:
 
     def _encode_images(self, pixels: Tensor) -> tuple[Tensor, ...]:
         """Compute the feature maps of pictures, the finest first."""
-        features: tuple[Tensor, ...] = tuple(self._model.get_image_embeddings(pixels))
-        return features
+        return tuple(self._model.get_image_embeddings(pixels))
 
     def _decode(self, boxes: Tensor, *features: Tensor) -> tuple[Tensor, ...]:
         """Compute the score images of `BOXES` boxes of each picture, shape (n, `BOXES`, s, s), in float32."""

@@ -47,5 +47,4 @@ def extend_to_floor(mesh: TriangleMesh, pose: Pose, points: Points, support_z: f
 
 def _find_downward_axis(points: Points) -> Vector3:
     _, _, directions = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    down: Vector3 = -directions[0] if directions[0, 2] > 0.0 else directions[0]
-    return down
+    return -directions[0] if directions[0, 2] > 0.0 else directions[0]

@@ -75,8 +75,7 @@ def _find_protrusions(view: ObjectView, body: Manifold) -> IdImage:
     kept = [k for k in range(1, count + 1) if sizes[k] >= least]
     number = np.zeros(count + 1, dtype=np.int32)
     number[kept] = np.arange(1, len(kept) + 1)
-    result: IdImage = number[labels]
-    return result
+    return number[labels]
 
 
 def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarray]:

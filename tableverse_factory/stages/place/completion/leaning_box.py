@@ -86,5 +86,4 @@ def _estimate_axes(view: ObjectView) -> Matrix3:
 
 def _average_direction(normals: Points) -> Vector3:
     _, vectors = np.linalg.eigh(normals.T @ normals)
-    direction: Vector3 = vectors[:, 2]
-    return direction
+    return vectors[:, 2]

@@ -78,8 +78,7 @@ def cast_on_mesh(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> Depths:
     """Cast the rays on a placed mesh: the depth of each hit [m], infinite for a miss."""
     scene = make_raycasting_scene(TriangleMesh(transform_points(pose, mesh.vertices), mesh.faces))
     packed = pack_rays(rays.eye, rays.directions)
-    hits: Depths = scene.cast_rays(packed, nthreads=1)["t_hit"].numpy().astype(np.float64)
-    return hits
+    return scene.cast_rays(packed, nthreads=1)["t_hit"].numpy().astype(np.float64)
 
 
 def intersect_box(rays: RaySample, pose: Pose, half_size: Vector3) -> Depths:

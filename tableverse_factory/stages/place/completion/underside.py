@@ -97,8 +97,7 @@ def estimate_underside(footprint: Footprint, support: float) -> Map:
     mirrored = np.minimum(twice - top, top - MIN_THICKNESS_M)
     thin = top - np.maximum(across, MIN_THICKNESS_M) / upright[at]
     under[at] = np.maximum(np.where(bar, mirrored, np.where(sheet, thin, support)), support)
-    smooth: Map = ndimage.median_filter(under, size=MEDIAN_CELLS)
-    return smooth
+    return ndimage.median_filter(under, size=MEDIAN_CELLS)
 
 
 def _find_edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _Edges:
@@ -138,8 +137,7 @@ def _sample_inward(
     inner = np.rint(at + inward * steps[:, None]).astype(int)
     inner = np.clip(inner, 0, np.array(footprint.top.shape) - 1)
     inside = footprint.closed[tuple(inner.T)]
-    found: Values = np.where(inside, heights[tuple(inner.T)], heights[tuple(at.T)])
-    return found
+    return np.where(inside, heights[tuple(inner.T)], heights[tuple(at.T)])
 
 
 def _compute_uprightness(footprint: Footprint) -> Map:

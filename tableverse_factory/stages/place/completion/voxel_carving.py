@@ -188,8 +188,7 @@ def _compute_column_field(
     under = estimate_underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
     top = np.maximum(top, under + MIN_THICKNESS_M)
     column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
-    field: Field = np.minimum(column, footprint[:, :, None])
-    return field
+    return np.minimum(column, footprint[:, :, None])
 
 
 def _bridge_gaps(

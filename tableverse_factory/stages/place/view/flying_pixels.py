@@ -74,8 +74,7 @@ def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) 
     steep = trusted & (facing < RAMP_FACING)
     at_edge = steep & ~ndimage.binary_erosion(own, iterations=RAMP_START_PX)
     near = own & ~ndimage.binary_erosion(own, iterations=RAMP_PX)
-    ramp: Mask = ndimage.binary_propagation(at_edge, mask=steep & near)
-    return ramp
+    return ndimage.binary_propagation(at_edge, mask=steep & near)
 
 
 def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Mask:
@@ -89,5 +88,4 @@ def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Ma
     flush = np.abs(raw - raw[nearest[0], nearest[1]]) < CONTINUOUS_M
     whole = np.bincount(labels[border], minlength=count + 1)
     smooth = np.bincount(labels[border & flush], minlength=count + 1)
-    runs: Mask = ((smooth >= MOSTLY * whole) & (whole > 0))[labels] & patches
-    return runs
+    return ((smooth >= MOSTLY * whole) & (whole > 0))[labels] & patches

@@ -38,8 +38,7 @@ def find_denoised_pixels(points_camera: Points, window: Camera, raw: DepthImage)
         return hit
     away, nearest = ndimage.distance_transform_edt(~hit, return_indices=True)
     beside = np.abs(raw - raw[nearest[0], nearest[1]]) < THINNED_STEP_M
-    near: Mask = (raw > 0.0) & (away <= THINNED_PX) & beside
-    return near
+    return (raw > 0.0) & (away <= THINNED_PX) & beside
 
 
 def filter_depth(raw: DepthImage, trusted: Mask) -> DepthImage:
@@ -91,8 +90,7 @@ def _intersect_table(window: Camera, camera_to_table: Pose) -> DepthImage:
     """Compute the depth at which each ray meets the table's plane [m], infinite where it does not."""
     rays = backproject(np.ones((window.height, window.width)), window)
     down = rays @ rotation_matrix(camera_to_table.quaternion_wxyz)[2]
-    depth: DepthImage = np.where(down < -1e-6, -camera_to_table.position[2] / np.minimum(down, -1e-6), np.inf)
-    return depth
+    return np.where(down < -1e-6, -camera_to_table.position[2] / np.minimum(down, -1e-6), np.inf)
 
 
 def compute_outline_distance(past: Mask) -> DepthImage:
@@ -101,8 +99,7 @@ def compute_outline_distance(past: Mask) -> DepthImage:
         return np.full(past.shape, 1e6)
     inside = ndimage.distance_transform_edt(~past)
     outside = ndimage.distance_transform_edt(past)
-    signed: DepthImage = np.where(past, 0.5 - outside, inside - 0.5)
-    return signed
+    return np.where(past, 0.5 - outside, inside - 0.5)
 
 
 def compute_pixel_normals(
@@ -135,10 +132,7 @@ def _compute_slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[n
     jump = np.linalg.norm(forward, axis=-1, keepdims=True) > 3 * np.linalg.norm(backward, axis=-1, keepdims=True)
     jump_back = np.linalg.norm(backward, axis=-1, keepdims=True) > 3 * np.linalg.norm(forward, axis=-1, keepdims=True)
     both = np.where(jump, backward, np.where(jump_back, forward, (forward + backward) / 2))
-    slope: Float64[np.ndarray, "h w 3"] = np.where(
-        np.isfinite(both), both, np.where(np.isfinite(forward), forward, backward)
-    )
-    return slope
+    return np.where(np.isfinite(both), both, np.where(np.isfinite(forward), forward, backward))
 
 
 def find_background_bleed(points: Points, support_z: float) -> Mask:

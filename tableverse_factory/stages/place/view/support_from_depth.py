@@ -105,8 +105,7 @@ def _shrink_footprint(footprint: Points2) -> Points2:
     low, high = np.quantile(footprint, 0.02, axis=0), np.quantile(footprint, 0.98, axis=0)
     middle, half = (low + high) / 2, CORE * (high - low) / 2
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    core: Points2 = middle + corners * half
-    return core
+    return middle + corners * half
 
 
 def _is_long(cloud: Points) -> bool:
