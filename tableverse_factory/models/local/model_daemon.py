@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-import tableverse_factory
 from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.core.source_hash import compute_source_hash
 from tableverse_factory.models.local.batch_server import BatchModel, Heartbeat, serve_batches
@@ -102,7 +101,7 @@ def compute_socket_path(module: str, spec: Spec) -> Path:
         json.dumps(spec, sort_keys=True),
         stat_weights(str(spec.get("weights", ""))),
         gpu,
-        str(Path(tableverse_factory.__file__).resolve()),
+        str(Path(__file__).resolve()),
         compute_source_hash(),
         sys.prefix,
     ]
