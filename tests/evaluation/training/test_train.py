@@ -143,7 +143,7 @@ def test_a_checkpoint_of_another_training_or_net_or_of_nothing_is_refused(
     with monkeypatch.context() as older:
         older.setattr("tableverse_factory.evaluation.training.network.WIDTHS", (16, 32, 64, 128))
         with pytest.raises(
-            InputError, match=rf"{CHECKPOINT} is of another network .* remove it, or give another folder"
+            InputError, match=rf"{CHECKPOINT} is of another network .* remove it, or give another"
         ):
             train_network(views, tmp_path, replace(SHORT, steps=1), CPU)
     (tmp_path / CHECKPOINT).write_bytes(b"\x80\x04 no safetensors")
