@@ -353,7 +353,9 @@ def test_pointers_left_behind_are_never_taken_for_more_than_they_are(copy, marks
     run_build(afterwards(copy, "short", limit=1), Silent())
     records = CheckpointStore(copy / "short" / CHECKPOINTS)
     pointers = [
-        n for n, at in records.index(0).items() if (records._stored(at.place) or b"").startswith(TOMBSTONE_PREFIX)
+        n
+        for n, at in records.index(0).items()
+        if (records._read_stored(at.location) or b"").startswith(TOMBSTONE_PREFIX)
     ]
     assert len(pointers) == 2
     marks()
