@@ -14,7 +14,15 @@ from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Scene, open_dataset
 from tableverse_factory.dataset.shards import TarShard, shard_path
 from tableverse_factory.dataset.trajectory_files import add_digests
-from tests.helpers.recorded_dataset import CAMERA, X_ID, Y_ID, encode_recording, recording, scene_members, trajectory_row
+from tests.helpers.recorded_dataset import (
+    CAMERA,
+    X_ID,
+    Y_ID,
+    encode_recording,
+    recording,
+    scene_members,
+    trajectory_row,
+)
 
 HOSTILE = "</div><script>alert(1)</script>\"'><img src=x onerror=alert(2)> **b** &amp;"
 ASIDE_M, ABOVE_M = 0.1, 0.05

@@ -94,7 +94,7 @@ def test_a_dataset_goes_to_another_process(server):
     """As the workers of a DataLoader get it."""
     opened = open_dataset(server.address)
     opened.scene("s-1-0")
-    copy = pickle.loads(pickle.dumps(opened))  # noqa: S301
+    copy = pickle.loads(pickle.dumps(opened))
     assert copy.scene("s-1-1").files() == dict(files_of("s-1-1", SCENE_BYTES))
     assert copy.objects.count_rows() == 4
 
