@@ -96,7 +96,6 @@ def _raise_without_access(status: int, error: Any, endpoint: Endpoint, message: 
 
 
 def _read_codes(error: Any) -> set[str]:
-    """Collect the codes by which servers name the kind of an error."""
     details = get_path(error, "details")
     reasons = [get_path(detail, "reason") for detail in (details if isinstance(details, list) else [])]
     return {word for word in (get_path(error, "code"), get_path(error, "type"), *reasons) if isinstance(word, str)}

@@ -141,6 +141,5 @@ def _run_inference(color: Picture, config: Config, weights: str) -> Any:
 
 
 def _get_map(prediction: Any, name: str) -> Any:
-    """Return the first picture's map of a prediction, None if there is none."""
     value = getattr(prediction, name, None)
     return None if value is None else np.asarray(value[0])

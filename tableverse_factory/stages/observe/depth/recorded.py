@@ -90,7 +90,6 @@ def read_recorded_camera(uri: str) -> tuple[Camera, float]:
 
 
 def _get_file_name(uri: str) -> str:
-    """Return the name of a file for messages."""
     return sanitize_line(redact_uri(uri).rpartition("/")[2], 100)
 
 

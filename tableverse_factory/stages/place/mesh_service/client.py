@@ -116,7 +116,6 @@ class MeshClient:
         raise ModelError("cached meshes disappear while they are made, or the mesh process changes again and again")
 
     def _read_cached(self, key: str) -> MeshFile | None:
-        """Read a cached mesh, whose checksum was verified."""
         if (data := self._cache.get(key)) is None:
             return None
         frame = MeshFrame.decode(data)

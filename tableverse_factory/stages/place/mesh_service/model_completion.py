@@ -90,7 +90,6 @@ def _convert_answer(answer: MeshAnswer, name: str) -> Completion | GeometryError
 
 
 def _sample_vertex_colors(mesh: TriangleMesh) -> Colors | None:
-    """Return the vertex colours, sampled from the texture if there is one."""
     if mesh.texture is None:
         return mesh.vertex_colors
     height, width = mesh.texture.picture.shape[:2]

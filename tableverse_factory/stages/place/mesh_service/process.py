@@ -230,7 +230,6 @@ class MeshProcess:
         return data
 
     def _wait(self, until: float, within_s: float, *, writing: bool) -> None:
-        """Wait until the pipe can be read, or written."""
         while (left := until - time.monotonic()) > 0.0:
             reads, writes = ([], [self._to]) if writing else ([self._from], [])
             if any(select.select(reads, writes, [], min(left, _POLL_S))):
@@ -263,7 +262,6 @@ def select_environment() -> dict[str, str]:
 
 
 def _parse_sizes(head: Any) -> list[int]:
-    """Read the lengths of the parts that follow a head."""
     sizes = head.get("parts", []) if isinstance(head, dict) else None
     if not isinstance(sizes, list) or len(sizes) > 1 or not all(type(size) is int and size >= 0 for size in sizes):
         raise ProcessFaultError("it sent a message that says not what follows it")
