@@ -16,6 +16,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.bench.free_simulation import BURST_SPEED, is_stable, measure_burst_speed
 from tableverse_factory.evaluation.bench.layouts import LayoutCase, read_case
 from tableverse_factory.evaluation.bench.rectifiers import DEFAULT_METHODS, RECTIFICATION_METHODS, MethodResult
+from tableverse_factory.evaluation.bench.support_by_force import TrueSupport, find_support_by_force, find_true_support
 from tableverse_factory.geometry.collision.penetration import measure_mesh_penetrations, measure_piece_penetrations
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center
@@ -33,6 +34,10 @@ class LayoutScore:
         from_observed_m: Displacement of the box centre of each observed object from the layout [m].
         from_truth_m: The same from the true pose, where it is known [m].
         kept: True relations that still hold.
+        by_force: Number of true supports by force, where a method has simulated.
+        by_force_kept: Number of them that still hold.
+        by_force_left_out: Number of further pairs of which one moved too far until the truth rested.
+        by_force_unknown: Scenes whose true support by force is not known.
         azimuth_changes_rad: Change of the azimuth of each group about the root [rad].
         burst_speeds: Largest speed in each scene just after its release [m/s].
         fallen: Number of objects that are no longer on the table.
@@ -46,6 +51,10 @@ class LayoutScore:
     from_observed_m: list[float] = field(default_factory=list)
     from_truth_m: list[float] = field(default_factory=list)
     kept: PreservedRelations = field(default_factory=PreservedRelations)
+    by_force: int = 0
+    by_force_kept: int = 0
+    by_force_left_out: int = 0
+    by_force_unknown: int = 0
     azimuth_changes_rad: list[float] = field(default_factory=list)
     burst_speeds: list[float] = field(default_factory=list)
     fallen: int = 0
@@ -80,8 +89,12 @@ def bench_lccr(
     for path in paths:
         case = read_case(path, truth, config, cache_dir)
         results = {name: RECTIFICATION_METHODS[name](case, config) for name in methods}
+        simulated = any(result.simulated for result in results.values())
+        support = find_true_support(case, config.settle) if simulated else None
         for name, result in results.items():
             _add_result(scores[name], case, result, config.settle.timestep_s)
+            if result.simulated:
+                _add_support(scores[name], case, result, support, config.settle.timestep_s)
         if on_layout is not None:
             on_layout(case, results)
     return scores
@@ -110,6 +123,10 @@ def summarize_scores(score: LayoutScore, epsilons_m: Sequence[float]) -> dict[st
         "from truth, p90 [mm]": _percentile(score.from_truth_m, 90.0, 1e3),
         "true relations": score.kept.carried + score.kept.contained,
         "support kept [%]": _percent(score.kept.carried_kept, score.kept.carried),
+        "pairs by force": score.by_force,
+        "pairs by force, left out": score.by_force_left_out,
+        "scenes not known by force": score.by_force_unknown,
+        "support kept, by force [%]": _percent(score.by_force_kept, score.by_force),
         "containment kept [%]": _percent(score.kept.contained_kept, score.kept.contained),
         "azimuth change, p90 [°]": _percentile(azimuths_known, 90.0, 180.0 / np.pi),
         "azimuth change, largest [°]": _percentile(azimuths_known, 100.0, 180.0 / np.pi),
@@ -168,6 +185,21 @@ def _add_observed(score: LayoutScore, case: LayoutCase, result: MethodResult) ->
             score.from_truth_m.append(
                 float(np.linalg.norm(center - _compute_center(placed, *case.truth[placed.object_id])))
             )
+
+
+def _add_support(
+    score: LayoutScore, case: LayoutCase, result: MethodResult, truth: TrueSupport | None, timestep_s: float
+) -> None:
+    """Compare support by force with the truth; objects that were left out carry nothing."""
+    if truth is None:
+        score.by_force_unknown += 1
+        return
+    number = {placed.object_id: index for index, placed in enumerate(case.item.objects)}
+    ids = [placed.copy_of or placed.object_id for placed in result.layout.placed.objects]
+    found = {(number[ids[i]], number[ids[j]]) for i, j in find_support_by_force(result.scene, timestep_s)}
+    score.by_force += len(truth.pairs)
+    score.by_force_kept += len(truth.pairs & found)
+    score.by_force_left_out += truth.left_out
 
 
 def _find_deepest(depths: Sequence[tuple[int, int, float]]) -> float:

@@ -31,12 +31,14 @@ class MethodResult(Frozen):
         scene: The same objects in the same order at their resulting poses.
         seconds: CPU time, without decomposition [s].
         restless: Whether an object still moved when the time limit of the simulation was reached.
+        simulated: Whether the method simulates.
     """
 
     layout: AssembledLayout
     scene: ReleasedScene
     seconds: float
     restless: bool = False
+    simulated: bool = False
 
 
 Method = Callable[[LayoutCase, Config], MethodResult]
@@ -100,7 +102,7 @@ def _make_simulation(before: Method, gentle: bool) -> Method:
         start = time.process_time()
         given = before(case, config)
         scene, resting = simulate_to_rest(given.scene, config.settle, gentle)
-        return MethodResult(given.layout, scene, time.process_time() - start, not resting)
+        return MethodResult(given.layout, scene, time.process_time() - start, not resting, simulated=True)
 
     return method
 

@@ -23,6 +23,7 @@ from tableverse_factory.evaluation.bench.free_simulation import (
 from tableverse_factory.evaluation.bench.layouts import find_layouts, make_parts, read_case
 from tableverse_factory.evaluation.bench.lccr import bench_lccr, summarize_scores
 from tableverse_factory.evaluation.bench.rectifiers import RECTIFICATION_METHODS, STEP_M, rectify_in_steps
+from tableverse_factory.evaluation.bench.support_by_force import TrueSupport, find_true_support
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.geometry.relations.preserved import PreservedRelations, Relations, compare_relations
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj
@@ -82,7 +83,10 @@ def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     assert ours["azimuth change, largest [°]"] == 0.0
     assert ours["support kept [%]"] == settled["support kept [%]"] == 100.0
     assert settled["scenes at rest [%]"] == 100.0
-    assert settled["containment kept [%]"] is None
+    assert settled["pairs by force"] == 1
+    assert settled["pairs by force, left out"] == settled["scenes not known by force"] == 0
+    assert settled["support kept, by force [%]"] == 100.0
+    assert ours["support kept, by force [%]"] is settled["containment kept [%]"] is None
     assert max(scores["LCCR"].from_observed_m) == pytest.approx(0.02 + config.rectify.clearance_m, abs=1e-6)
     assert alone["from observed, p90 [mm]"] is not None
     assert alone["from observed, p90 [mm]"] > 5.0
@@ -143,6 +147,20 @@ def test_things_that_pass_through_one_another_in_the_truth_have_no_relation(fold
         case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
         assert case.relations is not None
         assert len(case.relations.carried) == known
+
+
+def test_support_by_force_is_unknown_where_the_truth_finds_no_rest(folder: Path, tmp_path: Path) -> None:
+    config = Config.model_validate({"settle": {"max_time_s": 0.5}})  # a fall of 3 m takes longer
+    write_truth(folder, "stacked", {"a": (0, 0, 0.05), "b": (0, 0, 3.0)})
+    scores = bench_lccr([folder / "stacked.json"], folder / "truth", config, tmp_path / "cache", ["LCCR + sim"])
+    row = summarize_scores(scores["LCCR + sim"], [])
+    assert (row["scenes not known by force"], row["pairs by force"]) == (1, 0)
+
+
+def test_a_pair_that_moves_until_it_rests_is_left_out_by_force(folder: Path, tmp_path: Path) -> None:
+    write_truth(folder, "stacked", {"a": (0, 0, 0.05), "b": (0, 0, 0.18)})  # hangs 3 cm too high
+    case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
+    assert find_true_support(case, Config().settle) == TrueSupport(frozenset(), 1)
 
 
 def test_the_picture_shows_each_method_before_and_after_it_is_let_go(
