@@ -36,7 +36,7 @@ class TrueSupport:
 
 
 def find_support_by_force(scene: ReleasedScene, timestep_s: float) -> Pairs:
-    """Find pairs (carried, carrier) of a scene at rest by the upward part of their contact forces, friction included."""
+    """Find pairs (carried, carrier) of a scene at rest by their upward contact forces, friction included."""
     shares = _measure_borne_shares(scene.model(timestep_s), round(MEAN_OVER_S / timestep_s))
     return frozenset((int(i), int(j)) for i, j in np.argwhere(shares >= LEAST_SHARE))
 

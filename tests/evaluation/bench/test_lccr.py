@@ -50,6 +50,11 @@ def write(folder: Path, layouts: dict[str, Boxes]) -> None:
         (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
 
 
+def write_truth(folder: Path, name: str, boxes: Boxes) -> None:
+    poses = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in boxes.items()}
+    (folder / "truth" / f"{name}.json").write_text(json.dumps(poses))
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "meshes").mkdir()
@@ -142,8 +147,7 @@ def test_relations_kept_are_counted_once_each() -> None:
 def test_things_that_pass_through_one_another_in_the_truth_have_no_relation(folder: Path, tmp_path: Path) -> None:
     for sunk, known in ((0.0005, 1), (0.004, 0)):
         poses = {"a": (0, 0, 0.05), "b": (0, 0, 0.15 - sunk)}
-        truth = {key: {"position": at, "quaternion_wxyz": [1, 0, 0, 0]} for key, at in poses.items()}
-        (folder / "truth" / "stacked.json").write_text(json.dumps(truth))
+        write_truth(folder, "stacked", poses)
         case = read_case(folder / "stacked.json", folder / "truth", Config(), tmp_path / "cache")
         assert case.relations is not None
         assert len(case.relations.carried) == known
