@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -260,4 +261,14 @@ def _make_environment() -> dict[str, str]:
     found = [path for path in sys.path if path and not any(Path(path).is_relative_to(folder) for folder in installed)]
     added = dict.fromkeys([*wanted, *(path for path in found if path in wanted or Path(path).resolve() != Path.cwd())])
     pinned = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONPATH": os.pathsep.join(added)}
+    if _has_avx2():  # OpenBLAS chooses its kernels by the processor, and they differ in last digits
+        pinned["OPENBLAS_CORETYPE"] = "Haswell"
     return {**os.environ, **pinned}
+
+
+@cache
+def _has_avx2() -> bool:
+    try:
+        return " avx2 " in Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return False
