@@ -25,7 +25,7 @@ from tests.helpers.paths import HELPERS
 from workers.driver.budget import NO_LIMITS, SpendingLimits
 from workers.progress.build_state import read_build_state
 from workers.run import BuildRequest, run_build
-from workers.state.checkpoint_pack import frames, unpacked_at
+from workers.state.checkpoint_pack import read_packed_checkpoint, scan_pack
 from workers.state.cost_log import sum_costs
 
 PRICES = {"usd_per_million_input": 100.0, "usd_per_million_output": 1000.0}
@@ -287,4 +287,4 @@ def assert_nowhere(folder: Path) -> None:
         if path.suffix == ".parquet":
             assert KEY not in str(pq.read_table(path, partitioning=None).to_pylist()), path
         if path.suffix == ".pack":
-            assert all(KEY.encode() not in unpacked_at(path, offset) for _, offset, _ in frames(path)), path
+            assert all(KEY.encode() not in read_packed_checkpoint(path, span.start) for _, span in scan_pack(path)), path

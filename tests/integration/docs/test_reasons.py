@@ -12,7 +12,7 @@ from tests.helpers.paths import ROOT
 
 SECTION = "## Why a task has none"
 FOLDERS = ("robotics/motion", "robotics/placements", "robotics/execution", "stages/trajectories")
-PLACES = {"NoMotion": 1, "Failure": 1, "NoPlacement": 0, "PlannedTask": None, "Verdict": 2}
+PLACES = {"NoMotion": 1, "RolloutFailure": 1, "NoPlacement": 0, "PlannedTask": None, "Verdict": 2}
 """Where the reason stands among the arguments of what says it; None where it is named."""
 
 LOST = "lost"
