@@ -43,26 +43,13 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
-    """Load the configuration: defaults, then the file, then overrides such as `rectify.clearance_m=0.001`.
-
-    Raises:
-        ConfigError: naming the key, its value and what is allowed; an unknown key comes with the nearest known one.
-    """
+    """Load the configuration: defaults, then the file, then overrides such as `rectify.clearance_m=0.001`."""
     tree: dict[str, Any] = {} if path is None else load_yaml(path)
     return build_config(tree, overrides, "" if path is None else f"{path}: ")
 
 
 def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), origin: str = "") -> Config:
-    """Build the configuration from sections with keys, and overrides.
-
-    Args:
-        tree: Sections with the keys that differ.
-        overrides: Such as `rectify.clearance_m=0.001`.
-        origin: Start of messages about the sections; those about overrides name `--set`.
-
-    Raises:
-        ConfigError: as `load_config`.
-    """
+    """Build the configuration from sections and `overrides`; `origin` starts messages about the sections."""
     sections, overridden = dict(tree), set[str]()
     for override in overrides:
         key, value = _parse_override(override)
@@ -158,11 +145,7 @@ def describe_allowed_values(field: Mapping[str, Any]) -> str:
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
-    """Load sections with keys from a small YAML file; sections without any key are left out.
-
-    Raises:
-        ConfigError: if it is not such a file.
-    """
+    """Load sections with keys from a small YAML file; sections without any key are left out."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_FILE_BYTES + 1)
@@ -210,7 +193,6 @@ def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _is_overridden(location: tuple[int | str, ...], changed: set[str]) -> bool:
-    """Check whether an override set the value at a problem's location, or a key of that section."""
     place = ".".join(str(part) for part in location[:2])
     return any(key == place or key.startswith(f"{place}.") or not place for key in changed)
 

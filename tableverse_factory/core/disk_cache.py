@@ -12,13 +12,7 @@ _DIGEST_BYTES = 64
 
 @dataclass(frozen=True, slots=True)
 class DiskCache:
-    """Files in a folder under keys, which are hashes.
-
-    Attributes:
-        folder: Made when the first file is written.
-        suffix: Suffix of file names, with the dot.
-        durable: Flush each file to the disk, so that it survives a loss of power.
-    """
+    """Files in a folder under keys, which are hashes; `durable` flushes each file to the disk."""
 
     folder: Path
     suffix: str
@@ -34,11 +28,7 @@ class DiskCache:
         return payload if digest == content_hash(payload).encode() else None
 
     def put(self, key: str, payload: bytes) -> None:
-        """Write the bytes of a key, whole or not at all, also when other processes write the same.
-
-        Raises:
-            OSError: if the disk refuses; nothing is left behind then.
-        """
+        """Write the bytes of a key, whole or not at all, also when other processes write the same."""
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")

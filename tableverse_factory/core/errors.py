@@ -96,11 +96,7 @@ class BudgetSpentError(ModelError):
 
 
 class AnswerInvalidError(_ReasonedError, ModelError):
-    """A model gave no answer, or one beyond repair.
-
-    Attributes:
-        reason: Stable snake_case code to count by.
-    """
+    """A model gave no answer, or one beyond repair."""
 
     topic = "model-answer"
     reason = "answer_invalid"

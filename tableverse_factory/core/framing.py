@@ -29,13 +29,7 @@ class FrameError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class FrameSpan:
-    """Position of a frame in its file [bytes].
-
-    Attributes:
-        start: Where the header begins.
-        offset: Where the payload begins.
-        size: Length of the payload.
-    """
+    """Position of a frame in its file, from the start of its header, and the size of its payload [bytes]."""
 
     label: bytes
     start: int
@@ -59,15 +53,7 @@ def encode_header(payload: bytes, label: bytes = b"") -> bytes:
 
 
 def read_frame(read: Callable[[int], bytes], max_bytes: int = MAX_PAYLOAD_BYTES) -> tuple[bytes, bytes]:
-    """Read one frame.
-
-    Args:
-        read: Returns the next n bytes, or fewer at the end: `file.read`, `io.BytesIO(data).read`, or a function that
-            reads exactly n bytes from a socket.
-        max_bytes: Longest payload to accept.
-
-    Returns:
-        The label and the payload.
+    """Read label and payload of one frame; `read(n)` returns fewer than n bytes at the end alone.
 
     Raises:
         FrameError: if the bytes are torn or damaged, or the payload is longer than `max_bytes`.
@@ -86,15 +72,9 @@ def read_frame(read: Callable[[int], bytes], max_bytes: int = MAX_PAYLOAD_BYTES)
 
 
 def scan_frames(file: BinaryIO, start: int = 0, *, verify: bool = True) -> Iterator[FrameSpan]:
-    """Find the whole frames of a file, up to the first that is torn or damaged.
+    """Find the whole frames of a seekable file from the one at `start` up to the first that is torn or damaged.
 
-    Args:
-        file: Seekable.
-        start: Where to begin: 0, or the `end` of a frame [bytes].
-        verify: Whether to read payloads and check their checksums; otherwise only headers and labels are read.
-
-    Raises:
-        BuildError: if an older version wrote the file.
+    Without `verify`, only headers and labels are read.
     """
     file_end = file.seek(0, os.SEEK_END)
     while True:
@@ -114,7 +94,6 @@ def scan_frames(file: BinaryIO, start: int = 0, *, verify: bool = True) -> Itera
 
 
 def _decode_header(header: bytes) -> tuple[int, int, int]:
-    """Decode the checksum and the lengths of label and payload."""
     if bytes(header[:4]) in _OLDER_MAGICS:
         raise BuildError(
             "an older version of TableVerse Factory began this build, and its intermediate files have another format: "

@@ -23,11 +23,7 @@ _CACHES: list[OrderedDict[str, Any]] = []
 
 
 def memoize_by_content(max_bytes: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Memoize a pure function of records, arrays and scalars in this process.
-
-    Args:
-        max_bytes: Bound on all results together; a larger one is not kept.
-    """
+    """Memoize a pure function of records, arrays and scalars, keeping at most `max_bytes` of results."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         cache: OrderedDict[str, tuple[R, int]] = OrderedDict()  # each with its size

@@ -7,16 +7,7 @@ from tableverse_factory.core.errors import InputError
 
 
 def import_extra(module: str, what: str, extra: str) -> ModuleType:
-    """Import a module of an optional package.
-
-    Args:
-        module: Dotted name.
-        what: Feature that needs it, for the error: `the viewer`.
-        extra: Extra of this project that installs it.
-
-    Raises:
-        InputError: `no_extra`, saying what to type, if it is not installed.
-    """
+    """Import a module, or raise `no_extra`, saying that `what` (`the viewer`) needs this project's `extra`."""
     try:
         return importlib.import_module(module)
     except ImportError:

@@ -16,15 +16,7 @@ IDLE_ACTOR_CPUS = 0.25
 
 
 def load_pools(path: Path | None, config: Config) -> Pools:
-    """Load the pools of a build.
-
-    Args:
-        path: YAML with a section per pool; None for none.
-        config: Of the build: pools that ask a remote model take fewer CPUs.
-
-    Raises:
-        ConfigError: naming the key, its value and what is allowed.
-    """
+    """Load the pools of a build from YAML, a section per pool; those that ask a remote model take fewer CPUs."""
     tree = {} if path is None else load_yaml(path)
     for pool, section in (("perception", config.perceive), ("curation", config.curate)):
         if section.protocol:
@@ -39,7 +31,6 @@ def load_pools(path: Path | None, config: Config) -> Pools:
 
 
 def _suggest_name(error: ValidationError) -> str:
-    """Suggest the known name closest to an unknown one, if the first problem is an unknown name."""
     first = error.errors(include_url=False)[0]
     if first["type"] != "extra_forbidden":
         return ""

@@ -35,15 +35,7 @@ def parallel_map(
 ) -> Iterator[Result]:
     """Yield the result for each item in order, each computed on one thread so that bytes do not depend on `jobs`.
 
-    Args:
-        work: A function that other processes can import, or a `partial` of one.
-        items: Arguments of the calls.
-        jobs: Processes; with 1, all is done in this one.
-        doing: Predicate for the error: `draws scenes`.
-        chunk: Items that a process is given at a time.
-
-    Raises:
-        InputError: if a process died.
+    Other processes must be able to import `work`; `doing` is a predicate for the error: `draws scenes`.
     """
     if jobs <= 1 or len(items) < 2:
         with threadpool_limits(1):

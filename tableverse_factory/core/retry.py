@@ -10,11 +10,7 @@ TRANSIENT_STATUSES = frozenset({408, 425, 429, 500, 502, 503, 504})
 
 
 class TransientError(Exception):
-    """A request failed in a way that another attempt may heal; caught by the loop that makes the attempts.
-
-    Attributes:
-        wait_s: How long the server asks to wait, or None [s].
-    """
+    """A request failed in a way that another attempt may heal; `wait_s` is what the server asks to wait [s]."""
 
     def __init__(self, message: str, wait_s: float | None = None) -> None:
         super().__init__(message)
@@ -26,7 +22,6 @@ class RetryPolicy:
     """Bounds on the attempts of one request.
 
     Attributes:
-        attempts: Number of attempts in all.
         backoff_s: Wait before the second attempt; it doubles before each further one [s].
         max_backoff_s: Longest wait by backoff [s].
         max_asked_s: Longest wait that a server may ask for; a longer one ends the attempts [s].
@@ -40,16 +35,9 @@ class RetryPolicy:
     def next_wait(
         self, attempt: int, asked_s: float | None = None, left_s: float = math.inf, jitter: float = 1.0
     ) -> float | None:
-        """Compute the wait after a failed attempt.
+        """Compute the wait after the failed attempt number `attempt`, from 1 [s]; None when no other is due.
 
-        Args:
-            attempt: Number of the failed attempt, from 1.
-            asked_s: Wait that the server asks for; it replaces the backoff [s].
-            left_s: Time left for waits and attempts [s].
-            jitter: Factor on the backoff, to spread clients.
-
-        Returns:
-            Seconds to wait, or None when no further attempt is due.
+        The wait `asked_s` of the server replaces the backoff; `jitter` scales it; `left_s` remains for all.
         """
         if attempt >= self.attempts or (asked_s is not None and asked_s > self.max_asked_s):
             return None
@@ -58,12 +46,7 @@ class RetryPolicy:
 
 
 def parse_retry_after(value: str | None, now: datetime | None = None) -> float | None:
-    """Parse a Retry-After header, in seconds or as a date; None if there is none or it is malformed [s].
-
-    Args:
-        value: Header as the server sent it, untrusted.
-        now: Time to count from, the clock's by default.
-    """
+    """Parse an untrusted Retry-After header, in seconds or as a date; None if it is missing or malformed [s]."""
     try:
         if value is None or value.strip().isdecimal():
             return None if value is None else float(value)

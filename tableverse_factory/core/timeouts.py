@@ -9,14 +9,9 @@ T = TypeVar("T")
 
 
 def call_with_timeout(seconds: float, question: Callable[[], T], late: Exception) -> T:
-    """Call `question` in another thread and wait for its result no longer than `seconds`.
+    """Call `question` in another thread and wait for its result at most `seconds` [s]; then raise `late`.
 
     What waits in a library without end, or in its native part, ends neither by itself nor on Ctrl-C.
-
-    Args:
-        seconds: Longest wait [s].
-        question: Function to call; it goes on in its thread after a timeout.
-        late: Raised after a timeout.
     """
     answer: Future[T] = Future()
 

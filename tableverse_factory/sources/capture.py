@@ -44,10 +44,7 @@ class Capture:
     """Validated, pixel-aligned content of a capture folder.
 
     Attributes:
-        color: Shape (h, w, 3) sRGB.
         depth: Shape (h, w) float32 [m], 0 where there is no reading or it lies beyond `observe.max_depth_m`.
-        camera: Intrinsics of both.
-        detections: Of `detections.json`, or None.
         ids: Of `masks.png`, shape (h, w), 0 background; or None.
         bend: Share of the distance by which the depth may be bent smoothly; 0 of a sensor.
     """
@@ -76,11 +73,7 @@ def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:
 
 
 def read_color(folder: str, bounds: ObserveConfig) -> Picture:
-    """Read the first of `COLOR_NAMES` that exists, not turned by its EXIF, as the depth is not. Shape (h, w, 3) sRGB.
-
-    Raises:
-        InputError: see `read_capture`.
-    """
+    """Read the first of `COLOR_NAMES` that exists, not turned by its EXIF, as the depth is not. Shape (h, w, 3)."""
     for name in COLOR_NAMES:
         if exists(f"{folder}/{name}"):
             data = read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_color")
@@ -122,11 +115,7 @@ def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> fl
 
 
 def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: float) -> DepthImage:
-    """Read the depth in metres; 0 where it is not finite or beyond `observe.max_depth_m`. Shape (h, w) float32.
-
-    Raises:
-        InputError: see `read_capture`.
-    """
+    """Read the depth in metres; 0 where it is not finite or beyond `observe.max_depth_m`. Shape (h, w) float32."""
     data = read_bytes(f"{folder}/{DEPTH_NAME}", bounds.max_file_bytes, "missing_depth")
     image = open_image(data, DEPTH_NAME, bounds, "unreadable_depth")
     if image.mode not in DEPTH_MODES:
@@ -153,11 +142,7 @@ def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: 
 
 
 def read_detections(folder: str) -> Detections | None:
-    """Read the recorded answer of a detector; None if there is none.
-
-    Raises:
-        InputError: `bad_detections`.
-    """
+    """Read the recorded answer of a detector; None if there is none."""
     uri = f"{folder}/{DETECTIONS_NAME}"
     if not exists(uri):
         return None
@@ -169,21 +154,13 @@ def read_detections(folder: str) -> Detections | None:
 
 
 def read_ids(folder: str, bounds: ObserveConfig, camera: Camera) -> IdImage | None:
-    """Read the recorded instance masks; None if there are none. Shape (h, w) int32.
-
-    Raises:
-        InputError: `bad_masks`.
-    """
+    """Read the recorded instance masks; None if there are none. Shape (h, w) int32."""
     uri = f"{folder}/{MASKS_NAME}"
     return read_id_image(uri, bounds, camera) if exists(uri) else None
 
 
 def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
-    """Read instance ids from an 8- or 16-bit PNG. Shape (h, w) int32.
-
-    Raises:
-        InputError: `bad_masks`, `picture_too_large`.
-    """
+    """Read instance ids from an 8- or 16-bit PNG. Shape (h, w) int32."""
     name = uri.rsplit("/", 1)[-1]
     image = open_image(read_bytes(uri, bounds.max_file_bytes, "bad_masks"), name, bounds, "bad_masks")
     if image.mode not in ("L", "P", *DEPTH_MODES):
@@ -197,11 +174,7 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
 
 
 def list_recorded_meshes(folder: str) -> tuple[str, ...]:
-    """List the names in `meshes/` that `read_recorded_meshes` may read, sorted; none over HTTP.
-
-    Raises:
-        InputError: `too_many_meshes`, `unreachable_uri`.
-    """
+    """List the names in `meshes/` that `read_recorded_meshes` may read, sorted; none over HTTP."""
     names = tuple(name for name in list_file_names(f"{folder}/{MESHES_NAME}") if _RECORDED_MESH.fullmatch(name))
     if len(names) > MAX_RECORDED_MESHES:
         raise InputError(
@@ -213,11 +186,7 @@ def list_recorded_meshes(folder: str) -> tuple[str, ...]:
 def read_recorded_meshes(
     folder: str, ids: IdImage | None, bounds: ObserveConfig
 ) -> tuple[tuple[int, TriangleMesh], ...]:
-    """Read the recorded `meshes/<instance id>.obj` of the ids in the masks, where they exist.
-
-    Raises:
-        InputError: `bad_mesh` where one does not decode, `file_too_large`.
-    """
+    """Read the recorded `meshes/<instance id>.obj` of the ids in the masks, where they exist."""
     found: list[tuple[int, TriangleMesh]] = []
     for instance_id in [] if ids is None else np.unique(ids[ids > 0]).tolist():
         name = f"{MESHES_NAME}/{instance_id}.obj"

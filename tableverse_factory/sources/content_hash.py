@@ -26,17 +26,7 @@ _CAPTURE_FILES = (*COLOR_NAMES, DEPTH_NAME, CAMERA_NAME, DETECTIONS_NAME, MASKS_
 
 
 def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str, str] | None = None) -> str:
-    """Hash the files of an entry (sha256).
-
-    Args:
-        kind: Kind of the entry.
-        uri: Its uri.
-        bounds: Bounds on files.
-        known: Digests of meshes by uri, to be read from and added to: many layouts name the same mesh.
-
-    Raises:
-        InputError: where a file cannot be read, or a layout does not say what belongs to it.
-    """
+    """Hash the files of an entry (sha256); `known` collects digests of meshes by uri, which layouts share."""
     if kind is SceneKind.IMAGE:
         return _hash_image(uri, bounds)
     if kind is SceneKind.CAPTURE:
@@ -46,8 +36,6 @@ def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str
 
 def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
     """Compare an entry with the hash in the manifest, if the manifest has one.
-
-    Ids of scenes and checkpoints stand for this content.
 
     Raises:
         InputError: `content_changed`, or as `hash_entry`.
@@ -61,11 +49,7 @@ def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
 
 
 def find_sidecars(uri: str) -> dict[str, str]:
-    """Find the depth and the camera recorded beside a picture, by suffix; none over HTTP.
-
-    Raises:
-        InputError: `unreachable_uri` if the place cannot be asked.
-    """
+    """Find the depth and the camera recorded beside a picture, by suffix; none over HTTP."""
     if uri.startswith(("http://", "https://")):
         return {}
     stem = uri.rpartition(".")[0]
@@ -73,7 +57,6 @@ def find_sidecars(uri: str) -> dict[str, str]:
 
 
 def _hash_image(uri: str, bounds: ObserveConfig) -> str:
-    """Hash the picture, and the depth and the camera recorded beside it."""
     picture = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
     parts: list[bytes] = []
     for name, sidecar in find_sidecars(uri).items():

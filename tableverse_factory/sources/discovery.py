@@ -48,12 +48,7 @@ class ManifestEntry:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """Entries found, and what was ignored.
-
-    Attributes:
-        entries: Sorted by uri, each once.
-        ignored: Numbers of ignored files and hidden folders, by kind.
-    """
+    """Entries, sorted by uri, each once, and numbers of ignored files and hidden folders by kind."""
 
     entries: tuple[ManifestEntry, ...]
     ignored: dict[str, int]
@@ -68,11 +63,7 @@ class _Folder:
 
 
 def discover_entries(paths: Sequence[str]) -> Discovery:
-    """Search folders for entries, and take files as they are named.
-
-    Raises:
-        InputError: if a path does not exist, or a file that was named is neither a picture nor a layout.
-    """
+    """Search folders for entries, and take files as they are named."""
     entries: dict[str, ManifestEntry] = {}
     ignored: Counter[str] = Counter()
     for path in paths:
@@ -203,7 +194,6 @@ def _holds_assets(folder: _Folder) -> bool:
 
 
 def _find_image_cameras(folder: _Folder) -> frozenset[str]:
-    """Name the cameras that may be recorded beside the pictures of a folder."""
     parts = map(posixpath.splitext, folder.files)
     return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES)
 

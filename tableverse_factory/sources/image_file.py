@@ -29,11 +29,7 @@ _TRANSPOSE_BY_ORIENTATION = {
 
 
 def read_image(uri: str, bounds: ObserveConfig) -> Picture:
-    """Read a bare picture as sRGB, turned upright as its EXIF says. Shape (h, w, 3).
-
-    Raises:
-        InputError: see `decode_upright`, and `file_too_large`.
-    """
+    """Read a bare picture as sRGB, turned upright as its EXIF says. Shape (h, w, 3)."""
     return decode_upright(read_bytes(uri, bounds.max_file_bytes, "unreadable_color"), uri.rsplit("/", 1)[-1], bounds)
 
 

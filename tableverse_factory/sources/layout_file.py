@@ -18,11 +18,7 @@ from tableverse_factory.sources.mesh_file import read_mesh_with_colors
 
 
 def read_layout_file(uri: str) -> Layout:
-    """Read and validate a layout; its meshes are not opened.
-
-    Raises:
-        InputError: `bad_layout` if it is no such file (`schemas.layout`), `file_too_large`.
-    """
+    """Read and validate a layout; its meshes are not opened."""
     value = parse_json(read_bytes(uri, MAX_JSON_BYTES, "bad_layout"), uri.rsplit("/", 1)[-1], "bad_layout")
     try:
         return Layout.model_validate(value)
@@ -53,12 +49,7 @@ def resolve_mesh_uri(layout_uri: str, mesh: str) -> str:
 
 
 def read_layout_meshes(uri: str, layout: Layout, bounds: ObserveConfig) -> dict[str, TriangleMesh]:
-    """Read every mesh of the layout once, by its path there, with the textures beside it.
-
-    Raises:
-        InputError: `bad_mesh_path`, `missing_mesh`, `bad_mesh` where it does not decode to finite triangles,
-            `bad_texture` or `picture_too_large`.
-    """
+    """Read every mesh of the layout once, by its path there, with the textures beside it."""
     meshes: dict[str, TriangleMesh] = {}
     for item in layout.objects:
         if item.mesh in meshes:

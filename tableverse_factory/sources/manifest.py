@@ -45,17 +45,9 @@ def make_manifest(
     criteria: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> Manifest:
-    """Make a manifest of `paths`: every entry is decoded, and a bad one becomes a row that says why.
+    """Make a manifest of `paths` and `listed`: every entry is decoded, and a bad one becomes a row that says why.
 
-    Args:
-        paths: Folders and files.
-        bounds: Bounds on what is decoded.
-        listed: Entries of lists of addresses.
-        criteria: Criteria for bare pictures; None accepts all that decode.
-        on_checked: Called with how many entries are checked, of how many.
-
-    Raises:
-        InputError: if a path itself is not there.
+    `criteria` are for bare pictures; None accepts all that decode. `on_checked` gets how many are done, of how many.
     """
     found = discover_entries(paths)
     entries = [*((entry, NO_ORIGIN) for entry in found.entries), *listed.entries]
@@ -113,11 +105,7 @@ def create_manifest(
 
 
 def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
-    """Write the rows as Parquet: equal rows give equal bytes.
-
-    Raises:
-        InputError: if nothing can be written there.
-    """
+    """Write the rows as Parquet: equal rows give equal bytes."""
     data = encode_parquet(build_table((row.model_dump(mode="json") for row in rows), MANIFEST))
     try:
         write_atomic(path, data)
@@ -126,13 +114,7 @@ def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
 
 
 class _EntryChecker:
-    """Checks of entries, with results for files that several entries name.
-
-    Attributes:
-        bounds: Bounds on what is read.
-        digests: Digests of meshes, by uri.
-        refused: Why a mesh cannot be used, empty where it can, by uri.
-    """
+    """Checks of entries, with results for files that several entries name."""
 
     def __init__(self, bounds: ObserveConfig) -> None:
         self.bounds = bounds
@@ -140,7 +122,6 @@ class _EntryChecker:
         self.refused: dict[str, str] = {}
 
     def make_row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
-        """Make the row of an entry, and statistics of a bare picture if they are asked for."""
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
         stats = None
@@ -169,11 +150,7 @@ class _EntryChecker:
         return row, stats
 
     def _decode(self, entry: ManifestEntry) -> Picture | None:
-        """Decode everything that belongs to an entry; returns the pixels of a bare picture.
-
-        Raises:
-            InputError: if anything does not decode.
-        """
+        """Decode everything that belongs to an entry; returns the pixels of a bare picture."""
         if entry.kind is SceneKind.IMAGE:
             return read_image(entry.uri, self.bounds)
         if entry.kind is SceneKind.CAPTURE:

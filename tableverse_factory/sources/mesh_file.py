@@ -20,12 +20,7 @@ Locate = Callable[[str], str]
 
 
 def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> TriangleMesh:
-    """Read a mesh with its materials and pictures.
-
-    Raises:
-        GeometryError: as `read_mesh`.
-        InputError: what `locate` raises, `bad_texture`, `picture_too_large` or `file_too_large`.
-    """
+    """Read a mesh with its materials and pictures."""
     materials = read_material_files(name, data, locate, bounds)
     for picture in sorted(set(materials) - set(_find_names(_MATERIAL_FILE, data, 1) if materials else ())):
         open_image(materials[picture], f"{name}: texture {picture[:200]!r}", bounds, "bad_texture")
@@ -33,11 +28,7 @@ def read_mesh_with_colors(name: str, data: bytes, locate: Locate, bounds: Observ
 
 
 def read_material_files(name: str, data: bytes, locate: Locate, bounds: ObserveConfig) -> Mapping[str, bytes]:
-    """Read the material file of an OBJ and the pictures it names, by their names there; missing ones are left out.
-
-    Raises:
-        InputError: what `locate` raises, or `file_too_large`.
-    """
+    """Read the material file of an OBJ and the pictures it names, by their names there; missing ones are left out."""
     found: dict[str, bytes] = {}
     if not name.lower().endswith(".obj") or b"mtllib" not in data:
         return found

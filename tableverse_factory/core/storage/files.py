@@ -66,12 +66,7 @@ def parse_path(text: str) -> StoragePath:
 
 
 def resolve_filesystem(uri: str) -> tuple[fsspec.AbstractFileSystem, str]:
-    """Find the file system of a path or fsspec URI, and the path in it.
-
-    Raises:
-        ValueError: if there is no such scheme.
-        ImportError: if a package for it is missing.
-    """
+    """Find the file system of a path or fsspec URI, and the path in it."""
     filesystem, path = fsspec.core.url_to_fs(uri)
     return filesystem, path
 
@@ -112,9 +107,6 @@ def atomic_file(path: StoragePath) -> Iterator[BinaryIO]:
     """Open a file for writing that appears at `path` only if the block ends without an error.
 
     Missing parent folders are made; an older file at `path` is replaced in one step.
-
-    Raises:
-        BuildError: if the disk is full or refuses; nothing is left behind.
     """
     try:
         with _write_multipart(path) if isinstance(path, UPath) else _write_and_rename(path) as file:
@@ -155,11 +147,7 @@ def _write_multipart(path: UPath) -> Iterator[BinaryIO]:
 
 
 def write_atomic(path: StoragePath, data: bytes) -> None:
-    """Write a small file, whole or not at all.
-
-    Raises:
-        BuildError: if the file system or the store refuses.
-    """
+    """Write a small file, whole or not at all."""
     if not isinstance(path, UPath):
         with atomic_file(path) as file:
             file.write(data)
@@ -171,11 +159,7 @@ def write_atomic(path: StoragePath, data: bytes) -> None:
 
 
 def move(source: StoragePath, target: StoragePath) -> None:
-    """Move a finished file over `target` in one step; in a store it is copied, and `source` stays.
-
-    Raises:
-        BuildError: if the file system or the store refuses.
-    """
+    """Move a finished file over `target` in one step; in a store it is copied, and `source` stays."""
     try:
         if isinstance(source, UPath) and isinstance(target, UPath):
             source.fs.cp_file(source.path, target.path)
@@ -190,11 +174,7 @@ def move(source: StoragePath, target: StoragePath) -> None:
 
 
 def remove(path: StoragePath) -> None:
-    """Remove a file if it exists.
-
-    Raises:
-        BuildError: if the file system or the store refuses.
-    """
+    """Remove a file if it exists."""
     try:
         if isinstance(path, UPath):
             get_store(path).remove(path.path)
@@ -205,15 +185,7 @@ def remove(path: StoragePath) -> None:
 
 
 def remove_folder(folder: StoragePath, keep: str = "") -> None:
-    """Remove a folder and everything below it, if it exists.
-
-    Args:
-        folder: The folder.
-        keep: Name of an entry of it that stays, and the folder with it.
-
-    Raises:
-        BuildError: if the file system or the store refuses.
-    """
+    """Remove a folder and everything below it, if it exists, except the entry named `keep`."""
     try:
         if isinstance(folder, UPath):
             get_store(folder).remove_all(folder.path, keep)
@@ -234,11 +206,7 @@ def open_stream(path: StoragePath) -> BinaryIO:
 
 
 def read_whole(path: StoragePath) -> bytes:
-    """Read all of a file.
-
-    Raises:
-        FileNotFoundError: if there is none.
-    """
+    """Read all of a file."""
     if isinstance(path, UPath):
         return path.fs.cat_file(path.path)
     return path.read_bytes()
@@ -254,11 +222,7 @@ def read_range(path: StoragePath, offset: int, size: int) -> bytes:
 
 
 def abort_uploads(folder: StoragePath) -> None:
-    """Abort incomplete uploads below a folder of a store, whose parts would be billed.
-
-    Raises:
-        BuildError: if the store refuses.
-    """
+    """Abort incomplete uploads below a folder of a store, whose parts would be billed."""
     if isinstance(folder, UPath):
         get_store(folder).abort_uploads(folder.path)
 

@@ -33,7 +33,6 @@ class ByteRange:
 
     Attributes:
         data: Fewer than requested where the file ends earlier.
-        total: Length of the whole file [bytes].
         version: ETag or Last-Modified; empty where the server sends neither.
     """
 
@@ -50,11 +49,7 @@ class HttpRangeReader:
     """Reader of byte ranges with one connection pool per process; safe in threads and after a fork."""
 
     def __init__(self, headers: Callable[[], Mapping[str, str]] = dict) -> None:
-        """Open nothing yet.
-
-        Args:
-            headers: Gives further headers, such as a token, for the named host alone.
-        """
+        """Open nothing yet; `headers` gives further headers, such as a token, for the named host alone."""
         self._headers = headers
         self._clients: dict[int, httpx.Client] = {}
         self._by_proxy = False
@@ -80,12 +75,7 @@ class HttpRangeReader:
         return _retry(address, resume)
 
     def read_size(self, address: str) -> ByteRange:
-        """Read length and version of a file, and none of its bytes.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            StoreError: if the server refuses, fails five times, or does not say.
-        """
+        """Read length and version of a file, and none of its bytes."""
 
         def ask() -> ByteRange:
             with self._request(address, 0, 1) as response:
@@ -98,7 +88,6 @@ class HttpRangeReader:
 
     @contextmanager
     def _request(self, address: str, start: int, stop: int) -> Iterator[httpx.Response]:
-        """Send one request and follow its redirects."""
         headers = {"Range": f"bytes={start}-{stop - 1}", "Accept-Encoding": "identity"}
         target, first_peer, client = address, "", self._client(address)
         for _ in range(MAX_REDIRECTS + 1):
@@ -139,7 +128,6 @@ class HttpRangeReader:
 
 
 def _retry(address: str, ask: Callable[[], ByteRange]) -> ByteRange:
-    """Call `ask` until it succeeds or the policy ends the attempts."""
     for attempt in itertools.count(1):
         try:
             return ask()
@@ -199,7 +187,6 @@ def _read_version(response: httpx.Response) -> str:
 
 
 def _receive(response: httpx.Response, data: bytearray, wanted: int, address: str) -> None:
-    """Append the body to `data` until it has `wanted` bytes."""
     if response.status_code == 416:
         return
     deadline = time.monotonic() + 60.0 + (wanted - len(data)) / _SLOWEST_BYTES_PER_S

@@ -17,12 +17,7 @@ _METADATA_HOSTS = frozenset({ipaddress.ip_address("168.63.129.16")})
 
 
 def resolve_redirect(first: str, here: str, location: str) -> str:
-    """Resolve and check the target of a redirect.
-
-    Args:
-        first: The address that a person named.
-        here: The one that answered.
-        location: Its Location header, untrusted.
+    """Resolve and check the untrusted `location` of a redirect by `here`; a person named `first`.
 
     Raises:
         StoreError: if it is no address on the web, leaves https, or leads to another kind of network than `first` is
@@ -47,19 +42,10 @@ def resolve_redirect(first: str, here: str, location: str) -> str:
 
 
 def check_peer(first: str, here: str, home: str, peer: str) -> None:
-    """Refuse an answer from a network that `resolve_redirect` would not have led into.
+    """Refuse an answer from a `peer` that is neither public nor in the network of `home`, which answered for `first`.
 
     A name may lead elsewhere a moment later, when the connection is made; the machine that answered is what counts. A
     request without headers of ours has reached it by then, and nothing of its answer is read.
-
-    Args:
-        first: The address that a person named.
-        here: The one that answered.
-        home: The machine that answered for `first`.
-        peer: The machine that answered for `here`.
-
-    Raises:
-        StoreError: if it is in another kind of network than `home`, and not in the open one.
     """
     kind = classify_address(peer)
     if kind not in ("public", classify_address(home)):

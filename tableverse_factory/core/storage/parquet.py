@@ -67,19 +67,7 @@ def make_arrow_filesystem(filesystem: fsspec.AbstractFileSystem) -> pa.fs.FileSy
 def read_remote_table(
     filesystem: fsspec.AbstractFileSystem, path: str, schema: pa.Schema, columns: Sequence[str] | None = None
 ) -> pa.Table:
-    """Read a small remote Parquet file in one request.
-
-    Args:
-        filesystem: File system of the path.
-        path: The file.
-        schema: Columns that the file lacks are null.
-        columns: Some of them; all without.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        OSError: if it does not read.
-        pa.ArrowException: if it is no such table.
-    """
+    """Read a small remote Parquet file in one request; columns of the schema that the file lacks are null."""
     names = list(columns or schema.names)
     wanted = pa.schema([schema.field(name) for name in names])
     with pq.ParquetFile(pa.BufferReader(filesystem.cat_file(path)), pre_buffer=False) as file:

@@ -46,12 +46,7 @@ class PreconditionFailedError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class VersionedObject:
-    """A small object with its version.
-
-    Attributes:
-        etag: Identifier of the version, for conditional writes.
-        age_s: Time since it was written, by the clock of the store alone, in whole seconds [s].
-    """
+    """A small object, its etag for conditional writes, and its age by the clock of the store alone [s]."""
 
     data: bytes
     etag: str
@@ -110,9 +105,7 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
     def list_sizes(self, folder: str, recursive: bool = False) -> dict[str, int]:
         """List the objects in a folder by name, sorted, with their sizes [bytes]; folders in it have size 0.
 
-        Args:
-            folder: Bucket and prefix; a missing one is empty.
-            recursive: List all objects below the folder instead, by relative path.
+        With `recursive`, list all objects below it by relative path. A missing folder is empty.
         """
         bucket, key, _ = self.split_path(folder)
         prefix = f"{key.rstrip('/')}/" if key else ""

@@ -52,9 +52,6 @@ def find_type(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
     """Find what lies at a path: `file`, `directory`, or another type of the file system; empty where there is nothing.
 
     fsspec's own `isfile` and `exists` say no to whatever goes wrong; here only what is absent is absent.
-
-    Raises:
-        OSError: if the place does not answer; of an object store, a StoreError.
     """
     try:
         with _translate_errors():
@@ -70,12 +67,7 @@ def find_type(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
 
 
 def exists(uri: str) -> bool:
-    """Check whether a file exists.
-
-    Raises:
-        InputError: `unreachable_uri` if the place cannot be asked.
-        StoreError: if an object store does not answer: that says nothing about the file.
-    """
+    """Check whether a file exists; a place that does not answer raises, as it says nothing about the file."""
     try:
         filesystem, path = resolve_filesystem(uri)
         return find_type(filesystem, path) == "file"
@@ -86,12 +78,7 @@ def exists(uri: str) -> bool:
 
 
 def list_file_names(folder_uri: str) -> tuple[str, ...]:
-    """List the names of the files in a folder, sorted; empty for a missing folder and over HTTP, which has no listings.
-
-    Raises:
-        InputError: `unreachable_uri` if the place cannot be asked.
-        StoreError: if an object store does not answer.
-    """
+    """List the names of the files in a folder, sorted; none for a missing folder or over HTTP, which has no listings."""
     try:
         filesystem, folder = resolve_filesystem(folder_uri)
         if folder.startswith(_HTTP_SCHEMES):

@@ -16,14 +16,7 @@ a mug, a leaner leans on a prop, flat objects are laid across an edge."""
 
 @dataclass(frozen=True, slots=True)
 class Category:
-    """A category of objects.
-
-    Attributes:
-        make: Generator of one object.
-        roles: Uses in recipes.
-        weight: Relative frequency of standing alone.
-        may_lie: Whether it is also found on its side.
-    """
+    """Generator of a category, its uses in recipes, weight of standing alone, and whether it may lie on its side."""
 
     make: Callable[[np.random.Generator], GeneratedObject]
     roles: frozenset[Role]

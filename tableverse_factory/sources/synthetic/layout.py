@@ -41,22 +41,9 @@ SCALE_NOISE = 0.03
 def synthesize_layouts(
     out: Path, scenes: int, seed: int, on_scene: Callable[[Path, bool], None] | None = None
 ) -> list[Path]:
-    """Write layouts to `out/layouts/synth_000000.json` and so on, meshes to `out/meshes`, ground truth to `out/truth`.
+    """Write layouts to `out/layouts/synth_000000.json` and so on, meshes to `out/meshes`, truth to `out/truth`.
 
     Layout k has the same bytes whatever the number of layouts; those that are there already, of the same seed, stay.
-
-    Args:
-        out: A new or empty folder, or one that an earlier call with the same seed filled.
-        scenes: Number of layouts.
-        seed: Not negative.
-        on_scene: Called after each layout with its file and whether it was made now.
-
-    Returns:
-        The layout files.
-
-    Raises:
-        InputError: if a number is out of range, or `out` holds anything else.
-        GeometryError: if a scene cannot be arranged.
     """
     check_numbers(scenes, seed)
     check_output_folder(out, lambda path: path.name in (LAYOUTS, MESHES, TRUTH))

@@ -16,14 +16,7 @@ Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
 
 @dataclass(frozen=True, slots=True)
 class GeneratorCavity:
-    """The cavity of a container, round about the object's z axis.
-
-    Attributes:
-        floor: Height of the inner floor [m].
-        rim: Height of the rim [m].
-        floor_radius: Inner radius at the floor [m].
-        rim_radius: Inner radius at the rim [m].
-    """
+    """The cavity of a container, round about the object's z axis: heights of floor and rim, and radii there [m]."""
 
     floor: float
     rim: float
@@ -33,13 +26,7 @@ class GeneratorCavity:
 
 @dataclass(frozen=True, slots=True)
 class GeneratorTop:
-    """A flat surface that objects can stand on, centred on the object's z axis.
-
-    Attributes:
-        height: Above the object's own origin [m].
-        half_x: Half its extent along the object's x axis [m].
-        half_y: Half its extent along the object's y axis [m].
-    """
+    """A flat surface that objects can stand on, centred on the object's z axis: height and half extents [m]."""
 
     height: float
     half_x: float
@@ -51,15 +38,9 @@ class GeneratedObject(Frozen):
     """One generated object, z up, resting on z = 0 as it naturally does, its foot about the origin.
 
     Attributes:
-        label: Common name: `bowl`, `cereal box`.
-        description: Label with its colour: `a red bowl`.
         mesh: Closed surface [m], without colours.
         pieces: Corners of convex bodies whose union is the object, cavities left open. Each of shape (k, 3) [m].
-        texture: Colours over the surface.
-        mass_kg: Mass, contents included.
         shiny: 0 for matt to 1 for polished metal: how often a depth sensor fails on it.
-        cavity: Of containers.
-        top: Of objects that others are stacked on.
     """
 
     label: str

@@ -30,9 +30,7 @@ class SyntheticObject(Frozen):
     """An object of a synthetic scene, at rest.
 
     Attributes:
-        placed: The model and its pose in the table frame.
         contained_in: Index of its container among the scene's objects, or None.
-        visible_pixels: Number of pixels that show it.
         visible_fraction: Their share of its silhouette, 0 to 1.
     """
 
@@ -48,15 +46,12 @@ class SyntheticScene(Frozen):
 
     Attributes:
         objects: In the order of their instance ids, which start at 1.
-        color: Shape (h, w, 3) sRGB, with a camera's grain.
         depth: Shape (h, w), with a sensor's noise and holes; metres are `depth * depth_scale`, 0 is no reading.
         depth_scale: Metres per unit of depth.
         true_depth: Shape (h, w) float32 [m], without noise; 0 where nothing is.
         ids: Shape (h, w), index of the object at each pixel, -1 elsewhere.
         table_pixels: Shape (h, w), where the table is seen.
-        camera: Intrinsics of all images.
         camera_to_table: Pose of the camera; the table frame has z up and its origin amid the table's upper face.
-        table_half_xy: Half extents of the table [m].
     """
 
     objects: tuple[SyntheticObject, ...]
@@ -72,11 +67,7 @@ class SyntheticScene(Frozen):
 
 
 def make_scene(seed: int, scene_id: str) -> SyntheticScene:
-    """Make a scene that depends on the two arguments alone.
-
-    Raises:
-        GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
-    """
+    """Make a scene that depends on the two arguments alone."""
     rng = make_rng(seed, scene_id, "synth")
     placed, half_xy = arrange_scene(rng, scene_id)
     objects = [place_mesh(item.model.mesh, item.pose) for item in placed]
@@ -110,11 +101,7 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
 
 
 def arrange_scene(rng: np.random.Generator, scene_id: str) -> tuple[list[PlacedModel], tuple[float, float]]:
-    """Arrange objects at rest on a table, in its frame; returns them and the half extents of the table [m].
-
-    Raises:
-        GeometryError: if no arrangement came to rest in `ATTEMPTS` tries.
-    """
+    """Arrange objects at rest on a table, in its frame; returns them and the half extents of the table [m]."""
     half_xy = (float(rng.uniform(0.42, 0.75)), float(rng.uniform(0.38, 0.55)))
     return _settle_arrangement(rng, half_xy, scene_id), half_xy
 
@@ -178,12 +165,6 @@ def _measure_visibility(
     """Measure visible pixels of each object, and their share of its silhouette in 0–1. Both of shape (n,).
 
     What the edge of the picture cuts off counts as hidden.
-
-    Args:
-        ids: Index of the object at each pixel; -1 or anything beyond the objects elsewhere.
-        objects: In the table frame [m].
-        camera: Intrinsics.
-        camera_to_table: Pose of the camera.
     """
     wide = Camera(
         camera.fx / SUBSAMPLING,

@@ -61,15 +61,9 @@ def sense_depth(
     facing: Float64[np.ndarray, "h w"],
     shiny: Float64[np.ndarray, "h w"],
 ) -> UInt16[np.ndarray, "h w"]:
-    """Simulate the depth image of a sensor, 0 where it has no reading.
+    """Simulate the depth image of a sensor, 0 where it has no reading, from the true depth [m], 0 for none.
 
-    Args:
-        rng: Draws the noise.
-        sensor: Its parameters.
-        camera: Intrinsics of the depth image.
-        truth: Depth along the optical axis [m], 0 for none.
-        facing: Cosine between the surface's normal and the line of sight.
-        shiny: 0 for matt to 1 for polished.
+    `facing` is the cosine between normal and line of sight; `shiny` is 0 for matt to 1 for polished.
     """
     readable = (truth > 0.0) & (truth < FARTHEST_M)
     rows, columns = (

@@ -27,14 +27,7 @@ MAX_PENETRATION_M = 0.001
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticRest(Frozen):
-    """Result of settling.
-
-    Attributes:
-        poses: Object to table, in the order given.
-        fallen: Indices of objects that fell off the table.
-        at_rest: Whether the others were still at the end.
-        penetration_m: Depth of the deepest contact [m].
-    """
+    """Poses object to table, indices of those that fell off, whether the others rest, and the deepest contact [m]."""
 
     poses: tuple[Pose, ...]
     fallen: tuple[int, ...]
@@ -43,12 +36,7 @@ class SyntheticRest(Frozen):
 
 
 def settle_arrangement(placed: Sequence[PlacedModel], table_half_xy: tuple[float, float]) -> SyntheticRest:
-    """Simulate until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`.
-
-    Args:
-        placed: Objects in the table frame, not overlapping.
-        table_half_xy: Half extents of the table, centred on the origin [m]; beyond it objects fall.
-    """
+    """Simulate until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`."""
     model = _build_spec(placed, table_half_xy).compile()
     data = mujoco.MjData(model)
     still, needed = 0, round(REST_TIME_S / TIMESTEP_S)

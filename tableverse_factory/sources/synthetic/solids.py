@@ -27,12 +27,7 @@ Rings = Float64[np.ndarray, "k m 3"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solid:
-    """A closed body and its convex pieces.
-
-    Attributes:
-        manifold: The body itself.
-        pieces: Corners of convex bodies, each of shape (k, 3) [m].
-    """
+    """A closed body, and corners of convex bodies that cover it, each of shape (k, 3) [m]."""
 
     manifold: Manifold
     pieces: tuple[Points, ...]
@@ -53,11 +48,7 @@ class Solid:
         return Solid(turned, tuple(piece @ rotation.T for piece in self.pieces))
 
     def to_mesh(self) -> TriangleMesh:
-        """Convert the surface to a triangle mesh.
-
-        Raises:
-            GeometryError: if the parameters gave an empty body.
-        """
+        """Convert the surface to a triangle mesh."""
         found = self.manifold.to_mesh64()
         if self.manifold.is_empty() or self.manifold.volume() <= 0.0:
             raise GeometryError(f"a generated solid is empty: {self.manifold.status()}")
@@ -91,13 +82,9 @@ def revolve(profile: Profile) -> Solid:
 
 
 def make_shell(outer: Profile, inner: Profile) -> Solid:
-    """Make a vessel of revolution: a floor between the first points, a wall along both profiles.
+    """Make a vessel of revolution: a floor between the first points, a wall along both profiles, which run abreast.
 
     The wall becomes `WEDGES` convex bodies per step of the profiles, so the cavity stays open.
-
-    Args:
-        outer: Outside from the foot to the rim. Shape (k, 2).
-        inner: Inside, point by point abreast of `outer`. Shape (k, 2).
     """
     outline = np.vstack([[0.0, outer[0, 1]], outer, inner[::-1], [0.0, inner[0, 1]]])
     step = SEGMENTS // WEDGES
@@ -138,13 +125,9 @@ def make_loft(rings: Rings, stride: int = 1) -> Solid:
 def make_tube(
     centers: Points, radii_uv: Float64[np.ndarray, "k 2"], normal: Sequence[float], around: int = 12
 ) -> Rings:
-    """Make elliptic rings about a planar curve.
+    """Make elliptic rings of `around` points about a planar curve, shape (k, 3) [m], whose plane has this unit normal.
 
-    Args:
-        centers: The curve [m]. Shape (k, 3).
-        radii_uv: Half widths of each ring along `normal`, and across it in the curve's plane [m]. Shape (k, 2).
-        normal: Unit normal of the curve's plane.
-        around: Points per ring.
+    `radii_uv`, shape (k, 2), are the half widths along the normal, and across the curve in its plane [m].
     """
     tangents = np.gradient(centers, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)

@@ -92,13 +92,9 @@ def make_camera(rng: np.random.Generator) -> Camera:
 
 
 def choose_viewpoint(rng: np.random.Generator, camera: Camera, azimuth: float, points: Points) -> Pose:
-    """Choose camera to table: 25–60° above the table, 0.6–1.3 m away, as near as shows all points.
+    """Choose camera to table: 25–60° above it, 0.6–1.3 m away, as near as shows all points, shape (n, 3).
 
-    Args:
-        rng: Draws height, distance and a slight roll.
-        camera: Intrinsics.
-        azimuth: Direction in which the camera looks, over the table [rad].
-        points: Points to show, in the table frame [m]. Shape (n, 3).
+    The camera looks along `azimuth` over the table [rad].
     """
     elevation = rng.uniform(LOWEST_RAD, HIGHEST_RAD)
     back = np.array([-np.cos(elevation) * np.cos(azimuth), -np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

@@ -24,16 +24,6 @@ def synthesize_captures(
     """Write captures to `out/synth_000000` and so on; existing ones of the same seed are kept.
 
     Scene k has the same bytes whatever the number of scenes.
-
-    Args:
-        out: A new or empty folder, or one that an earlier call with the same seed filled.
-        scenes: Number of scenes, 1 to `MAX_SCENES`.
-        seed: Not negative.
-        on_scene: Called after each scene with its folder and whether it was made now.
-
-    Raises:
-        InputError: if a number is out of range, or `out` holds anything else.
-        GeometryError: if a scene cannot be arranged.
     """
     check_numbers(scenes, seed)
     check_output_folder(out, _is_own_folder)
@@ -54,11 +44,7 @@ def synthesize_captures(
 
 
 def check_numbers(scenes: int, seed: int) -> None:
-    """Check the number of scenes and the seed.
-
-    Raises:
-        InputError: where it is.
-    """
+    """Check the number of scenes and the seed."""
     if not 1 <= scenes <= MAX_SCENES:
         raise InputError(f"scenes is {scenes}: give 1 to {MAX_SCENES}")
     if seed < 0:
@@ -66,11 +52,7 @@ def check_numbers(scenes: int, seed: int) -> None:
 
 
 def check_output_folder(out: Path, is_own: Callable[[Path], bool]) -> None:
-    """Check that a folder is new, or holds nothing but what an earlier call wrote.
-
-    Raises:
-        InputError: if it holds anything else.
-    """
+    """Check that a folder is new, or holds nothing but what an earlier call wrote."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{str(out)!r} is a file: give a new or empty folder")
     foreign = sorted(path.name for path in out.iterdir() if not is_own(path)) if out.exists() else []
@@ -81,17 +63,7 @@ def check_output_folder(out: Path, is_own: Callable[[Path], bool]) -> None:
 
 
 def check_origin(path: Path, file: Path, wanted: dict[str, Any], kind: str) -> None:
-    """Check that an existing capture or layout has the wanted origin.
-
-    Args:
-        path: The capture or layout, for messages.
-        file: JSON file with the origin.
-        wanted: Generator, seed and scene.
-        kind: `capture` or `layout`, for messages.
-
-    Raises:
-        InputError: if it has another origin.
-    """
+    """Check that an existing capture or layout has the wanted origin."""
     try:
         found = json.loads(file.read_bytes())["origin"]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -103,11 +75,7 @@ def check_origin(path: Path, file: Path, wanted: dict[str, Any], kind: str) -> N
 
 
 def make_synthetic_scene(seed: int, index: int) -> SyntheticScene:
-    """Make scene `index` of a seed in memory.
-
-    Raises:
-        GeometryError: if it cannot be arranged.
-    """
+    """Make scene `index` of a seed in memory."""
     return make_scene(seed, f"synth_{index:06d}")
 
 

@@ -24,11 +24,7 @@ def make_lattice_noise(
 ) -> np.ndarray:
     """Make smooth random heights in 0–1, each octave half as strong and twice as fine. Shape (h, w).
 
-    Args:
-        rng: Draws the lattice values.
-        size: Width and height [px].
-        cells: Lattice cells of the coarsest octave along width and height.
-        octaves: Number of octaves.
+    `size` is width and height [px]; the coarsest octave has `cells` along them.
     """
     total = np.zeros((size[1], size[0]), dtype=np.float32)
     for octave in range(octaves):

@@ -13,10 +13,7 @@ class BoardLayout(Frozen):
     """Place of each pixel within its board.
 
     Attributes:
-        ids: Number of the board.
-        count: Number of boards.
         along: Place along the board, 0–1.
-        across: Place across it, 0–1.
         edge: Distance to the nearest edge of the board, over the side of the square.
         upright: Whether the board runs downwards.
     """

@@ -95,15 +95,7 @@ _NUMBERS = {seed: number for number, seeds in _SUBSTITUTES.items() for seed in s
 
 
 def make_texture(seed: int, size: int = 512) -> Picture:
-    """Make the texture of a seed: the same bytes on every machine, and no seam where it repeats.
-
-    Args:
-        seed: From 0 on.
-        size: Pixels of a side.
-
-    Raises:
-        InputError: if seed or size is out of range.
-    """
+    """Make the texture of a seed, `size` pixels a side: the same bytes on every machine, and no seam."""
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise InputError(f"a texture of {size} px: give {MIN_SIZE} to {MAX_SIZE}")
     family, number = _split_seed(seed)
@@ -119,21 +111,13 @@ def make_texture(seed: int, size: int = 512) -> Picture:
 
 
 def name_texture(seed: int) -> str:
-    """Name a texture by family and number within it, as `marble-12`.
-
-    Raises:
-        InputError: if the seed is out of range.
-    """
+    """Name a texture by family and number within it, as `marble-12`."""
     family, number = _split_seed(seed)
     return f"{family}-{number}"
 
 
 def parse_texture_seed(name: int | str) -> int:
-    """Parse the name of a texture, or a seed, into a seed.
-
-    Raises:
-        InputError: if it is neither.
-    """
+    """Parse the name of a texture, or a seed, into a seed."""
     text = str(name)
     family, _, number = text.rpartition("-")
     strange = "-" in text and family not in FAMILIES
@@ -145,7 +129,6 @@ def parse_texture_seed(name: int | str) -> int:
 
 
 def _suggest_family(text: str) -> str:
-    """Suggest the families that contain or resemble a name, else list all."""
     letters = re.sub(r"[^a-z_]+", "_", text[:60].lower()).strip("_")
     within = [family for family in FAMILIES if len(letters) > 2 and letters in family]
     close = within[:4] or difflib.get_close_matches(letters, FAMILIES, n=2)

@@ -183,20 +183,17 @@ def _draw_contrast_color(draw: TextureSampler, ground: Color) -> Color:
 
 
 def _make_plain_weave(draw: TextureSampler, threads: int) -> Field:
-    """Make the heights of a plain weave."""
     u, v = pixel_grid(draw.size)
     return wave(u * threads) * wave(v * threads)
 
 
 def _add_weave(draw: TextureSampler, raster: Raster) -> Raster:
-    """Add weave and folds to printed or dyed colours."""
     threads = draw.pick(THREADS)
     yarn = draw.noise((6, threads), 1) + draw.noise((threads, 6), 1)
     return brighten(raster, 0.07 * _make_plain_weave(draw, threads) + 0.025 * yarn + _draw_folds(draw))
 
 
 def _draw_folds(draw: TextureSampler) -> Field:
-    """Draw soft folds."""
     return draw.between(0.0, 0.035) * draw.noise((2, 2), 2)
 
 

@@ -41,13 +41,7 @@ _MAX_CHARS = 200
 
 @dataclass(frozen=True, slots=True)
 class MapName:
-    """Parsed name of a map.
-
-    Attributes:
-        asset: The set that it belongs to, as written.
-        kind: A key of `MAPS`.
-        resolution: As `2K`; empty where the name does not say.
-    """
+    """Parsed name of a map: its set as written, a key of `MAPS`, and a resolution as `2K`, which may be empty."""
 
     asset: str
     kind: str

@@ -20,9 +20,7 @@ class TextureSampler:
     """Random choices of one texture.
 
     Attributes:
-        rng: Source of randomness.
         number: Number of the texture in its family: `spread` tells members apart by it.
-        size: Pixels of a side.
         start: Where the family starts to spread, so that families do not all begin with the same colour.
     """
 

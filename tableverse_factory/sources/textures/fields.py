@@ -36,8 +36,6 @@ class Cells(Frozen):
     Attributes:
         nearest: Distance to it, in cells.
         second: Distance to the second nearest.
-        ids: Its number.
-        count: Number of points.
     """
 
     nearest: Field
@@ -67,14 +65,9 @@ def make_noise(
 ) -> Field:
     """Make random hills of mean 0 and standard deviation about 1, by a periodic cubic spline.
 
-    Octaves too fine for the pixels are left out, but drawn: the same seed gives the same hills at any size.
+    The coarsest octave has `cells` to the right and downwards; each octave is twice as fine, with `gain` its weight.
 
-    Args:
-        rng: Draws the lattice.
-        size: Pixels of a side.
-        cells: Lattice cells of the coarsest octave to the right and downwards.
-        octaves: Number of octaves, each twice as fine.
-        gain: Weight of each against the one before.
+    Octaves too fine for the pixels are left out, but drawn: the same seed gives the same hills at any size.
     """
     total = np.zeros((size, size), dtype=np.float32)
     weight, power = np.float32(1.0), np.float32(0.0)
@@ -103,13 +96,9 @@ def _upsample(values: Float32[np.ndarray, "m k"], size: int) -> Float32[np.ndarr
 
 
 def find_cells(rng: np.random.Generator, size: int, count: tuple[int, int], jitter: float = 1.0) -> Cells:
-    """Find the cells of random points, one in each box of a grid.
+    """Find the cells of random points, one in each box of a grid of `count` boxes to the right and downwards.
 
-    Args:
-        rng: Draws the points.
-        size: Pixels of a side.
-        count: Boxes to the right and downwards.
-        jitter: 0 puts the points into the middle of their boxes, 1 anywhere within.
+    A jitter of 0 puts the points into the middle of their boxes, 1 anywhere within.
     """
     across, down = count
     offset = (rng.random((2, down, across), dtype=np.float32) - np.float32(0.5)) * np.float32(jitter) + np.float32(0.5)

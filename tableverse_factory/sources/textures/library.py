@@ -26,12 +26,7 @@ def write_index(path: Path, table: pa.Table) -> None:
 
 
 class TextureLibrary:
-    """The usable sets of an index.
-
-    Attributes:
-        table: Their rows, in the order of the index.
-        root: Folder that their paths start from.
-    """
+    """The usable sets of an index, in its order; their paths start from `root`."""
 
     def __init__(self, table: pa.Table, root: Path) -> None:
         self.table = table
@@ -41,11 +36,7 @@ class TextureLibrary:
         return int(self.table.num_rows)
 
     def get_row(self, which: int | str) -> dict[str, Any]:
-        """Get the row of a seed (modulo the number of sets), of a texture_id, or of the first set of a name.
-
-        Raises:
-            InputError: if there is none.
-        """
+        """Get the row of a seed (modulo the number of sets), of a texture_id, or of the first set of a name."""
         if not len(self):
             raise InputError("the index holds no usable texture")
         if isinstance(which, int):
@@ -60,11 +51,7 @@ class TextureLibrary:
         return self.table.slice(index, 1).to_pylist()[0]
 
     def read_picture(self, which: int | str, most_px: int = DEFAULT_PX) -> Picture:
-        """Read the colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`.
-
-        Raises:
-            InputError: if there is no such set, or its file is gone, broken or outside the repository.
-        """
+        """Read the colour map, its longer side reduced to `most_px`, for `Scene.model(texture=…)`."""
         file = str(self.get_row(which)["color"])
         path = (self.root / file).resolve()
         if not path.is_relative_to(self.root.resolve()):
@@ -81,15 +68,7 @@ class TextureLibrary:
 
 
 def open_library(path: Path, root: Path | None = None) -> TextureLibrary:
-    """Open an index that `tableverse textures index` wrote.
-
-    Args:
-        path: The Parquet file.
-        root: Folder of the repository; by default the one at the time of indexing.
-
-    Raises:
-        InputError: if the file is no index.
-    """
+    """Open an index that `tableverse textures index` wrote; `root` replaces the folder at the time of indexing."""
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:

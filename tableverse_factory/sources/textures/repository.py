@@ -55,8 +55,6 @@ _MIN_SIDE_PX = 64
 
 @dataclass(frozen=True, slots=True)
 class _TextureSet:
-    """Maps of one name and one resolution."""
-
     folder: str
     asset: str
     resolution: str
@@ -65,20 +63,10 @@ class _TextureSet:
 
 
 def index_textures(root: Path, source: str = "") -> pa.Table:
-    """Search a repository for sets of maps and read each set's colour map.
+    """Search a repository for sets of maps, read each set's colour map, and return rows of `INDEX_SCHEMA`.
 
     Links are not followed. The licence is that of the nearest `source.json` ({"source", "licence"}) at or above the
     set, else that of the source named here or by a folder; nothing else is taken for a licence.
-
-    Args:
-        root: The folder.
-        source: Source of sets without a sidecar: a key of `LICENCES`, or any other name.
-
-    Returns:
-        Rows of `INDEX_SCHEMA`, by folder and name; `root` stands in its metadata.
-
-    Raises:
-        InputError: if `root` is no folder, or holds more than `MAX_FILES` files.
     """
     if not root.is_dir():
         raise InputError(f"{sanitize_line(str(root))}: no such folder")
@@ -163,11 +151,7 @@ def _make_row(root: Path, found: _TextureSet, origin: tuple[str, str]) -> dict[s
 
 
 def _measure_maps(root: Path, found: _TextureSet) -> dict[str, Any]:
-    """Measure size and mean colour of the colour map; the other maps are opened, not decoded.
-
-    Raises:
-        InputError: with the reason why the set cannot be used.
-    """
+    """Measure size and mean colour of the colour map; the other maps are opened, not decoded."""
     if "color" not in found.maps:
         raise InputError(f"no colour map beside {', '.join(sorted(found.maps))}", "no_color_map")
     if found.doubled:

@@ -21,12 +21,9 @@ from tableverse_factory.sources.textures.fields import (
 
 
 def draw_glazed_tiles(draw: TextureSampler, layouts: Sequence[tuple[int, int]], steps: Sequence[float] = ()) -> Raster:
-    """Glazed tiles: squares, or bricks in a running bond; each fired a little differently.
+    """Draw squares, or bricks in a running bond, each fired a little differently.
 
-    Args:
-        draw: Choices of the texture.
-        layouts: Numbers of tiles downwards and to the right, to choose from.
-        steps: Shifts of each row against the one above, to draw from [tiles].
+    Layouts are numbers of tiles downwards and to the right, `steps` shifts of a row against the one above [tiles].
     """
     down, right = draw.choose(layouts)
     step = draw.pick(steps) if steps else 0.0
@@ -159,7 +156,6 @@ def _draw_grout_color(draw: TextureSampler) -> Color:
 
 
 def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Raster:
-    """Draw tiles with a glaze that pools."""
     tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
     pooled = draw.noise((16, 16), 4, 0.6)
     raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)

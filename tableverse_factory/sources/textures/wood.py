@@ -45,13 +45,8 @@ def draw_boards_in_rows(
 ) -> Raster:
     """Draw boards in rows: long planks, or short staves glued into a butcher block.
 
-    Args:
-        draw: Choices of the texture.
-        downs: Numbers of rows to choose from.
-        rights: Least and greatest number of boards in a row.
-        seam: Width of the seams, over the side of the square.
-        tones: How far boards differ in tone.
-        rings: Growth rings across half the width of a board.
+    A row has `rights` boards, from least to greatest; seams are measured over the side of the square; `rings` grow
+    across half the width of a board.
     """
     down, right = draw.choose(downs), draw.whole(*rights)
     return _draw_boards(draw, lay_rows(draw.size, down, right, draw.rng.random(down)), seam, tones, rings)
@@ -192,7 +187,6 @@ def _find_offsets(draw: TextureSampler, boards: BoardLayout) -> tuple[np.ndarray
 
 
 def _draw_patch(draw: TextureSampler, raster: Raster, color: Color) -> Raster:
-    """Draw an oval patch."""
     u, v = pixel_grid(len(raster))
     x, y = (take_fraction(t - np.float32(draw.between(0, 1))) - 0.5 for t in (u, v))
     distance = np.sqrt((x / 0.055) ** 2 + (y / 0.022) ** 2)

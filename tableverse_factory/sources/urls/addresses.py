@@ -56,7 +56,6 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
     """
 
     def __init__(self, allow_private: bool, connect_s: float, lookups: ThreadPoolExecutor) -> None:
-        """Take the policy, the time for all addresses of a host [s], and the threads for DNS look-ups."""
         self._allow_private, self._connect_s, self._lookups = allow_private, connect_s, lookups
         self._network = httpcore.AnyIOBackend()
 

@@ -24,13 +24,7 @@ _TASKS_PER_REQUEST = 8
 
 @dataclass(slots=True)
 class DownloadResult:
-    """Results of downloads by address.
-
-    Attributes:
-        paths: Picture of an address.
-        refused: Code and detail of why an address has none.
-        fetched: Number of pictures fetched now; the others of `paths` existed.
-    """
+    """Pictures by address, code and detail of why others have none, and how many pictures were fetched now."""
 
     paths: dict[str, Path] = field(default_factory=dict)
     refused: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -44,18 +38,7 @@ def download_images(
     pictures: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> DownloadResult:
-    """Download the pictures that are not in the store yet.
-
-    Args:
-        urls: Each once, untrusted.
-        store: Where pictures are kept.
-        bounds: Bounds on fetching.
-        pictures: Bounds on pictures that are stored.
-        on_done: Called with the numbers of finished and of all addresses.
-
-    Raises:
-        BuildError: if the disk refuses.
-    """
+    """Download the pictures of untrusted addresses, each named once, that are not in the store yet."""
     result = DownloadResult()
     missing: dict[bytes, _HostQueue] = {}
     for url in urls:
@@ -78,8 +61,6 @@ def download_images(
 
 @dataclass(slots=True)
 class _HostQueue:
-    """Addresses of a host, and how many in a row were unreachable."""
-
     urls: list[str] = field(default_factory=list)
     failures: int = 0
 
@@ -99,7 +80,6 @@ class _Fetcher:
         self._writing = asyncio.Lock()
 
     async def fetch_all(self, hosts: Collection[_HostQueue]) -> None:
-        """Fetch the addresses of every host, at most `per_host` of one at a time."""
         for host in hosts:
             host.urls.reverse()  # they are taken from the end
         waiting = deque(host for host in hosts for _ in range(min(self._bounds.per_host, len(host.urls))))
@@ -131,11 +111,6 @@ class _Fetcher:
 
 
 def _detect_suffix(data: bytes, bounds: ObserveConfig) -> str:
-    """Detect the suffix from the first bytes.
-
-    Raises:
-        InputError: `unreadable_color` if it is no picture of a format that is kept, `picture_too_large`.
-    """
     image = open_image(data, "what it gave", bounds, "unreadable_color")
     if image.format not in SUFFIXES:
         raise InputError(f"it gave {image.format}: JPEG, PNG and WebP are kept", "unreadable_color")

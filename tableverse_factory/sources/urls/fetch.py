@@ -34,8 +34,6 @@ class FetchBounds:
     Attributes:
         max_bytes: Of one picture; reading stops there.
         timeout_s: For one picture with all redirects, attempts and waits, but without waiting for its turn [s].
-        parallel: Concurrent requests.
-        per_host: Concurrent requests to one host.
         allow_private: Whether addresses of this machine and its network are allowed.
     """
 
@@ -91,13 +89,7 @@ async def open_connections(bounds: FetchBounds) -> AsyncIterator[httpcore.AsyncC
 async def fetch_bytes(
     pool: httpcore.AsyncConnectionPool, text: str, bounds: FetchBounds, turns: HostRateLimiter
 ) -> bytes:
-    """Fetch the bytes behind an address.
-
-    Args:
-        pool: Connection pool.
-        text: The address, untrusted.
-        bounds: Bounds on the answer.
-        turns: A slot is held during each request, and none during waits.
+    """Fetch the bytes behind an untrusted address; waits between attempts hold no slot of `turns`.
 
     Raises:
         InputError: reasons `bad_url`, `private_address`, `http_error`, `too_many_redirects`, `file_too_large`,

@@ -34,14 +34,7 @@ NO_ORIGIN = Origin("", "", "")
 
 @dataclass(frozen=True, slots=True)
 class FetchedLists:
-    """Entries of lists.
-
-    Attributes:
-        entries: An entry for each row, in order, with its origin.
-        ignored: Numbers of ignored columns, by list.
-        fetched: Pictures that came now.
-        earlier: Pictures that an earlier run had fetched.
-    """
+    """An entry with its origin per row, numbers of ignored columns by list, of new pictures and of earlier ones."""
 
     entries: tuple[tuple[ManifestEntry, Origin], ...]
     ignored: dict[str, int]
@@ -59,19 +52,7 @@ def fetch_lists(
     bounds: ObserveConfig,
     on_done: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> FetchedLists:
-    """Fetch every picture of some lists that is not in the folder yet.
-
-    Args:
-        lists: Paths or URIs.
-        pictures: Folder of what was fetched.
-        fetching: Bounds on fetching.
-        bounds: Bounds on pictures that are stored.
-        on_done: Called with how many addresses are done, of how many.
-
-    Raises:
-        InputError: if a list is none.
-        BuildError: if the disk refuses.
-    """
+    """Fetch every picture of some lists (paths or URIs) that is not in the folder `pictures` yet."""
     rows: list[ListRow] = []
     ignored: Counter[str] = Counter()
     for path in lists:
@@ -95,7 +76,6 @@ def _make_entry(row: ListRow, done: DownloadResult) -> ManifestEntry:
 
 
 def _display_name(url: str) -> str:
-    """Find a name for an address: the last part of its path, or its host."""
     try:
         parts = urlsplit(redact_url(url))
         return sanitize_line(unquote(posixpath.basename(parts.path.rstrip("/"))) or parts.netloc, MAX_NAME_CHARS)

@@ -57,11 +57,7 @@ class ImageStore:
             return None
 
     def store(self, url: str, data: bytes, suffix: str) -> Path:
-        """Store the bytes of an address.
-
-        Raises:
-            BuildError: if the disk refuses.
-        """
+        """Store the bytes of an address."""
         digest = content_hash(data)
         path = self._path(f"{digest}{suffix}")
         if path not in self._written:

@@ -38,8 +38,6 @@ class ListRow:
 
     Attributes:
         url: As it stands there, at most `MAX_URL_CHARS` characters; it may hold a secret and is never shown as it is.
-        source: Source of the picture, printable.
-        licence: Its licence, printable.
         problem: Code and detail of the reason why the row cannot be used; else None.
     """
 
@@ -99,7 +97,6 @@ def _parse_csv(name: str, text: str) -> UrlList:
 
 
 def _check_delimiter(name: str, header: list[str]) -> None:
-    """Refuse a header with another delimiter than the comma."""
     for sign, called in _OTHER_DELIMITERS.items():
         if len(header) == 1 and sign in header[0]:
             raise InputError(f"{name} has {called} between its columns: give commas", "unreadable_list")
@@ -180,11 +177,6 @@ def _measure_column(column: pa.Array) -> int:
 
 
 def _match_columns(name: str, header: list[str]) -> dict[str, str]:
-    """Match the given columns to the known ones.
-
-    Raises:
-        InputError: if none is the address, or two are the same.
-    """
     known: dict[str, str] = {}
     for given in header:
         column = _COLUMN_ALIASES.get(given.strip().lower())

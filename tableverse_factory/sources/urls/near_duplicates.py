@@ -58,18 +58,10 @@ class HashIndex:
 
 
 def find_near_duplicates(hashes: Sequence[int], worth: Sequence[int], bits: int) -> dict[int, tuple[int, int]]:
-    """Find pictures to drop because a kept one looks like them.
+    """Find pictures to drop, each with the picture that is kept in its place, and the distance [bits].
 
     From the one worth most to the one worth least, and in their order where they are worth the same, a picture is kept
     unless one that is kept already lies within `bits`. What is kept depends on this order alone.
-
-    Args:
-        hashes: Perceptual hashes of the pictures.
-        worth: Rank of each picture; the higher one is kept.
-        bits: Within which two pictures are the same; at most `MAX_BITS`.
-
-    Returns:
-        For each that goes, which is kept in its place, and the distance [bits].
     """
     index = HashIndex(bits, len(hashes))
     kept: list[int] = []

@@ -17,13 +17,10 @@ _FREQUENCIES = np.array(
 
 
 def compute_phash(picture: Picture) -> int:
-    """Compute 64 bits: which of the lowest frequencies of the grey picture exceed their median.
+    """Compute 64 bits of an upright picture: which of the lowest frequencies of its grey exceed their median.
 
     A discrete cosine transform (DCT-II) of 32 × 32 grey pixels, as in pHash (C. Zauner, 2010), with the waves taken by
     length instead of from a square. Half of the bits are set, so distances are even.
-
-    Args:
-        picture: Upright. Shape (h, w, 3) sRGB.
     """
     small = Image.fromarray(picture).convert("L").resize((_SIDE, _SIDE), Image.Resampling.LANCZOS)
     waves = scipy.fft.dctn(np.asarray(small, dtype=np.float64), norm="ortho")[_FREQUENCIES[:, 0], _FREQUENCIES[:, 1]]
