@@ -15,12 +15,9 @@ from tableverse_factory.core.errors import ConfigError
 
 MAX_FILE_BYTES = 1024 * 1024
 _MAX_REPR_CHARS = 80
-_MAX_PROBLEMS = 4
-"""Problems with one remedy that are listed."""
-RUNTIME_SECTIONS = frozenset({"asking"})
-"""Sections that may change between runs of a build."""
-_OVERRIDE_PREFIX = "--set: "
-"""Start of messages about overrides."""
+_MAX_PROBLEMS = 4  # Problems with one remedy that are listed
+RUNTIME_SECTIONS = frozenset({"asking"})  # Sections that may change between runs of a build
+_OVERRIDE_PREFIX = "--set: "  # Start of messages about overrides
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -16,11 +16,7 @@ TableverseError
 
 
 class TableverseError(Exception):
-    """Base of all errors; its message is one clear line for the user.
-
-    Attributes:
-        topic: Anchor in docs/troubleshooting.md that explains the error: the class's, or the one given when raising.
-    """
+    """Base of all errors: one clear line for the user, and `topic`, its anchor in docs/troubleshooting.md."""
 
     topic = "errors"
 
@@ -43,11 +39,7 @@ class _ReasonedError(TableverseError):
 
 
 class InputError(_ReasonedError):
-    """A file or row that a user gave is unusable.
-
-    Attributes:
-        reason: Stable snake_case code to count by, e.g. `depth_not_16_bit`.
-    """
+    """A file or row that a user gave is unusable; `reason` is a stable snake_case code to count by."""
 
     topic = "bad-input"
     reason = "bad_input"

@@ -11,8 +11,7 @@ from tableverse_factory.core.config import load_yaml
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.core.text import describe_validation_error
 
-IDLE_ACTOR_CPUS = 0.25
-"""CPUs of an actor that mostly waits for a model's answer."""
+IDLE_ACTOR_CPUS = 0.25  # CPUs of an actor that mostly waits for a model's answer
 
 
 def load_pools(path: Path | None, config: Config) -> Pools:

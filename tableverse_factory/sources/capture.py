@@ -82,12 +82,7 @@ def read_color(folder: str, bounds: ObserveConfig) -> Picture:
 
 
 def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
-    """Read intrinsics and metres per depth unit.
-
-    Raises:
-        InputError: `missing_camera`, or `bad_intrinsics` if a number is absent, not finite or not positive, the
-            principal point lies outside the picture, or the size is not that of the picture.
-    """
+    """Read intrinsics and metres per depth unit."""
     data = read_bytes(f"{folder}/{CAMERA_NAME}", MAX_CAMERA_BYTES, "missing_camera")
     value = parse_json(data, CAMERA_NAME, "bad_intrinsics")
     if not isinstance(value, dict):

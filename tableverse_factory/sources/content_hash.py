@@ -35,11 +35,7 @@ def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str
 
 
 def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
-    """Compare an entry with the hash in the manifest, if the manifest has one.
-
-    Raises:
-        InputError: `content_changed`, or as `hash_entry`.
-    """
+    """Compare an entry with the hash in the manifest, if there is one, else raise `content_changed`."""
     if row.content_sha256 and (found := hash_entry(row.kind, row.uri, bounds)) != row.content_sha256:
         raise InputError(
             f"its files are not those that the manifest saw (sha256 {found[:12]}, not {row.content_sha256[:12]}): "

@@ -131,9 +131,8 @@ def _walk_remote(uri: str) -> Iterator[_Folder | ManifestEntry]:
         else:
             yield from _walk_remote_folders(filesystem, root)
     except (OSError, ValueError, ImportError) as error:
-        reason = (
-            sanitize_line(str(error)) if redact_uri(uri) == uri else type(error).__name__
-        )  # it may repeat what is not shown
+        # The error may repeat what is not shown.
+        reason = sanitize_line(str(error)) if redact_uri(uri) == uri else type(error).__name__
         raise InputError(f"{redact_uri(uri)} cannot be reached: {reason}") from None
 
 
@@ -151,14 +150,12 @@ def _walk_remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> It
 
 def _make_file_entry(uri: str) -> ManifestEntry:
     suffix = posixpath.splitext(uri)[1].lower()
-    if suffix == ".json":
-        return _make_entry(SceneKind.LAYOUT, uri)
-    if suffix in IMAGE_SUFFIXES:
-        return _make_entry(SceneKind.IMAGE, uri)
-    known = ", ".join((".json", *IMAGE_SUFFIXES))
-    raise InputError(
-        f"{sanitize_line(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}"
-    )
+    if suffix not in (".json", *IMAGE_SUFFIXES):
+        known = ", ".join((".json", *IMAGE_SUFFIXES))
+        raise InputError(
+            f"{sanitize_line(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}"
+        )
+    return _make_entry(SceneKind.LAYOUT if suffix == ".json" else SceneKind.IMAGE, uri)
 
 
 def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str]) -> Iterator[ManifestEntry]:
@@ -199,7 +196,6 @@ def _find_image_cameras(folder: _Folder) -> frozenset[str]:
 
 
 def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
-    """Find the kind of a file, or why it is ignored, in words."""
     suffix = posixpath.splitext(name)[1].lower()
     if name.startswith("."):
         return "hidden file"

@@ -13,9 +13,7 @@ from tableverse_factory.core.storage.untrusted import decode_image, open_image, 
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Pillow's modes that convert to 8-bit sRGB. CMYK needs its printer's profile; 16-bit grey would clip."""
 
-_ORIENTATION = 0x0112
-"""EXIF tag."""
-
+_ORIENTATION = 0x0112  # EXIF tag
 _TRANSPOSE_BY_ORIENTATION = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -66,16 +64,6 @@ def _read_orientation(image: Image.Image) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # Pillow's, about notes that are cut off
             value = image.getexif().get(_ORIENTATION, 1)
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        OverflowError,
-        KeyError,
-        TypeError,
-        IndexError,
-        AttributeError,
-        struct.error,
-    ):
+    except (OSError, SyntaxError, ValueError, OverflowError, LookupError, TypeError, AttributeError, struct.error):
         return 1  # the pixels are sound: a broken note beside them says nothing
     return value if isinstance(value, int) else 1

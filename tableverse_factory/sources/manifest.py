@@ -73,7 +73,7 @@ def create_manifest(
     criteria: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
 ) -> Manifest:
-    """Make the image manifest of folders and files, and write it as Parquet.
+    """Make the image manifest of folders and files, with rows for rejected ones, and write it as Parquet.
 
     Args:
         paths: Folders, which are searched through, and files: captures, layouts and pictures.
@@ -82,9 +82,6 @@ def create_manifest(
         listed: Entries of lists of addresses.
         criteria: Criteria for bare pictures; None accepts all that decode.
         on_checked: Called with the number of checked entries and of all entries.
-
-    Returns:
-        The rows. Unusable entries are rows too, with the reason in `rejected`.
 
     Raises:
         InputError: if a path does not exist, nothing is found, or `out` cannot be written.

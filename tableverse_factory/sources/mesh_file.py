@@ -9,9 +9,7 @@ from schemas.geometry import TriangleMesh
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, exists, open_image, read_bytes
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 
-MAX_PICTURES = 64
-"""Pictures that one material file may name; further ones are not read."""
-
+MAX_PICTURES = 64  # Pictures that one material file may name; further ones are not read
 _MATERIAL_FILE = re.compile(rb"^[ \t]*mtllib[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 _DIFFUSE_MAP = re.compile(rb"^[ \t]*map_Kd[ \t]+(\S[^\r\n]*)", re.MULTILINE)
 

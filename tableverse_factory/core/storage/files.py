@@ -36,11 +36,7 @@ fsspec.register_implementation("s3", "tableverse_factory.core.storage.s3.ObjectS
 
 
 def parse_path(text: str) -> StoragePath:
-    """Parse a path that a user gave: a local path, `file:///path`, or `s3://bucket/prefix`.
-
-    Raises:
-        InputError: for another scheme, a malformed address, one that holds a secret, or where s3fs is not installed.
-    """
+    """Parse a path that a user gave: a local path, `file:///path`, or `s3://bucket/prefix` without secrets."""
     scheme, separator, rest = text.partition("://")
     if not separator:
         return Path(text)
@@ -104,13 +100,16 @@ def list_sizes(folder: StoragePath) -> dict[str, int]:
 
 @contextmanager
 def atomic_file(path: StoragePath) -> Iterator[BinaryIO]:
-    """Open a file for writing that appears at `path` only if the block ends without an error.
+    """Open a file, in folders made if missing, that replaces `path` only if the block ends without an error."""
+    write = _write_multipart(path) if isinstance(path, UPath) else _write_and_rename(path)
+    with _translate_write_errors(path), write as file:
+        yield file
 
-    Missing parent folders are made; an older file at `path` is replaced in one step.
-    """
+
+@contextmanager
+def _translate_write_errors(path: StoragePath) -> Iterator[None]:
     try:
-        with _write_multipart(path) if isinstance(path, UPath) else _write_and_rename(path) as file:
-            yield file
+        yield
     except OSError as error:
         raise make_write_error(path, error) from error
 
@@ -148,19 +147,17 @@ def _write_multipart(path: UPath) -> Iterator[BinaryIO]:
 
 def write_atomic(path: StoragePath, data: bytes) -> None:
     """Write a small file, whole or not at all."""
-    if not isinstance(path, UPath):
-        with atomic_file(path) as file:
-            file.write(data)
+    if isinstance(path, UPath):
+        with _translate_write_errors(path):
+            path.fs.pipe_file(path.path, data)
         return
-    try:
-        path.fs.pipe_file(path.path, data)
-    except OSError as error:
-        raise make_write_error(path, error) from error
+    with atomic_file(path) as file:
+        file.write(data)
 
 
 def move(source: StoragePath, target: StoragePath) -> None:
     """Move a finished file over `target` in one step; in a store it is copied, and `source` stays."""
-    try:
+    with _translate_write_errors(target):
         if isinstance(source, UPath) and isinstance(target, UPath):
             source.fs.cp_file(source.path, target.path)
         elif isinstance(source, Path) and isinstance(target, Path):
@@ -169,24 +166,20 @@ def move(source: StoragePath, target: StoragePath) -> None:
             sync_folder(target.parent)
         else:
             raise ValueError(f"{source} and {target} are not in the same store")
-    except OSError as error:
-        raise make_write_error(target, error) from error
 
 
 def remove(path: StoragePath) -> None:
     """Remove a file if it exists."""
-    try:
+    with _translate_write_errors(path):
         if isinstance(path, UPath):
             get_store(path).remove(path.path)
         else:
             path.unlink(missing_ok=True)
-    except OSError as error:
-        raise make_write_error(path, error) from error
 
 
 def remove_folder(folder: StoragePath, keep: str = "") -> None:
     """Remove a folder and everything below it, if it exists, except the entry named `keep`."""
-    try:
+    with _translate_write_errors(folder):
         if isinstance(folder, UPath):
             get_store(folder).remove_all(folder.path, keep)
         elif not keep and folder.exists():
@@ -194,8 +187,6 @@ def remove_folder(folder: StoragePath, keep: str = "") -> None:
         else:
             for path in (folder / name for name in list_names(folder) if name != keep):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
-    except OSError as error:
-        raise make_write_error(folder, error) from error
 
 
 def open_stream(path: StoragePath) -> BinaryIO:
@@ -207,9 +198,7 @@ def open_stream(path: StoragePath) -> BinaryIO:
 
 def read_whole(path: StoragePath) -> bytes:
     """Read all of a file."""
-    if isinstance(path, UPath):
-        return path.fs.cat_file(path.path)
-    return path.read_bytes()
+    return path.fs.cat_file(path.path) if isinstance(path, UPath) else path.read_bytes()
 
 
 def read_range(path: StoragePath, offset: int, size: int) -> bytes:

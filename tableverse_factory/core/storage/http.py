@@ -29,12 +29,7 @@ _PAST_THE_END = re.compile(r"bytes \*/(\d{1,18})")
 
 @dataclass(frozen=True, slots=True)
 class ByteRange:
-    """Bytes of a file, and what the server says of the whole file.
-
-    Attributes:
-        data: Fewer than requested where the file ends earlier.
-        version: ETag or Last-Modified; empty where the server sends neither.
-    """
+    """Bytes, fewer where the file ends earlier, its whole length, and its ETag or Last-Modified or nothing."""
 
     data: bytes
     total: int

@@ -23,9 +23,7 @@ ROW_GROUP = 64 * 1024
 PARQUET_OPTIONS: dict[str, Any] = {"compression": "zstd", "version": "2.6"}
 """Options that affect the bytes of a Parquet file."""
 
-_READ_AHEAD_BYTES = 64 * 1024
-"""Read-ahead beyond what Arrow asks for; s3fs would read 50 MB."""
-
+_READ_AHEAD_BYTES = 64 * 1024  # Read-ahead beyond what Arrow asks for; s3fs would read 50 MB
 _MAX_WAIT_S = 1.0
 _OPEN_FILES: WeakSet[Any] = WeakSet()
 

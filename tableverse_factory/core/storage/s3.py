@@ -182,7 +182,6 @@ class ObjectStore(S3FileSystem):  # type: ignore[misc]
 
 
 def _translate_error(error: Exception, bucket: str | None, key: str | None) -> Exception:
-    """Translate an error into a `StoreError`; a missing key stays as it is."""
     if isinstance(error, StoreError):
         return error
     cause = error.__cause__ if isinstance(error.__cause__, ClientError) else error

@@ -25,27 +25,11 @@ BLOCK_BYTES = 1024 * 1024
 MAX_JSON_BYTES = 16 * 1024 * 1024
 MAX_JSON_DEPTH = 64
 _HTTP_SCHEMES = ("http://", "https://")
-_ABSENT_STATUSES = (403, 410)
-"""Besides 404: public buckets that may not be listed answer 403 for missing files."""
-_BAD_NAME_ERRNOS = (errno.ENAMETOOLONG, errno.ELOOP)
-"""Errors of names that cannot exist on a disk."""
-IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
-"""Formats that are decoded; the last two serve textures alone."""
-
-LARGE_IMAGE_BOUNDS = ObserveConfig(max_pixels=100_000_000)
-"""Bounds on texture maps: 8K by 8K and a little more."""
-
-_DECODE_ERRORS = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    MemoryError,
-    OverflowError,
-    struct.error,
-    zlib.error,
-    UnidentifiedImageError,
-)
+_ABSENT_STATUSES = (403, 410)  # Besides 404: public buckets that may not be listed answer 403 for missing files
+_BAD_NAME_ERRNOS = (errno.ENAMETOOLONG, errno.ELOOP)  # Errors of names that cannot exist on a disk
+IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  # Formats that are decoded; the last two serve textures alone
+LARGE_IMAGE_BOUNDS = ObserveConfig(max_pixels=100_000_000)  # Bounds on texture maps: 8K by 8K and a little more
+_DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, MemoryError, OverflowError, struct.error, zlib.error)
 
 
 def find_type(filesystem: fsspec.AbstractFileSystem, path: str) -> str:
@@ -78,7 +62,7 @@ def exists(uri: str) -> bool:
 
 
 def list_file_names(folder_uri: str) -> tuple[str, ...]:
-    """List the names of the files in a folder, sorted; none for a missing folder or over HTTP, which has no listings."""
+    """List the names of the files in a folder, sorted; none for a missing folder or over HTTP, without listings."""
     try:
         filesystem, folder = resolve_filesystem(folder_uri)
         if folder.startswith(_HTTP_SCHEMES):
@@ -148,11 +132,7 @@ def _read_blocks(file: IO[bytes], most: int) -> Iterator[bytes]:
 
 
 def parse_json(data: bytes, name: str, reason: str) -> Any:
-    """Parse a JSON file; NaN and infinities come through as floats, for the caller to judge.
-
-    Raises:
-        InputError: with `reason` if it is no JSON, too long, or nested deeper than `MAX_JSON_DEPTH`.
-    """
+    """Parse a JSON file; NaN and infinities come through as floats, for the caller to judge."""
     if len(data) > MAX_JSON_BYTES:
         raise InputError(f"{name} is {len(data)} bytes; at most {MAX_JSON_BYTES} are parsed", reason)
     try:
@@ -201,11 +181,7 @@ def open_image(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Im
 
 
 def decode_image(image: Image.Image, name: str, mode: str | None, reason: str) -> np.ndarray[Any, Any]:
-    """Decode the pixels, converted to `mode` if given.
-
-    Raises:
-        InputError: with `reason` if the file is truncated or broken.
-    """
+    """Decode the pixels, converted to `mode` if given; broken files raise InputError with `reason`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about palettes whose transparency is left out, as asked

@@ -49,7 +49,6 @@ def _move_group(group: list[PlacedModel], offset: Float64[np.ndarray, "2"], yaw:
 
 
 def _find_footprint(group: list[PlacedModel]) -> Polygon:
-    """Find the convex outline of a group seen from above."""
     points = np.concatenate([item.vertices()[:, :2] for item in group])
     return points[ConvexHull(points).vertices]
 

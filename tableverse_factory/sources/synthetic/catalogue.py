@@ -19,44 +19,40 @@ class Category:
     """Generator of a category, its uses in recipes, weight of standing alone, and whether it may lie on its side."""
 
     make: Callable[[np.random.Generator], GeneratedObject]
-    roles: frozenset[Role]
+    roles: tuple[Role, ...]
     weight: float = 1.0
     may_lie: bool = False
 
 
-def _roles(*roles: Role) -> frozenset[Role]:
-    return frozenset(roles)
-
-
 CATEGORIES: dict[str, Category] = {
-    "apple": Category(food.make_apple, _roles("content", "rider")),
-    "banana": Category(food.make_banana, _roles("flat")),
-    "book": Category(packages.make_book, _roles("base", "leaner", "flat")),
-    "bottle": Category(packages.make_bottle, _roles("prop"), 1.5, may_lie=True),
-    "bowl": Category(vessels.make_bowl, _roles("container", "rider")),
-    "can": Category(packages.make_can, _roles("prop", "rider"), 1.5, may_lie=True),
-    "cereal box": Category(packages.make_cereal_box, _roles("prop", "leaner"), may_lie=True),
-    "cup": Category(vessels.make_cup, _roles("container", "rider")),
-    "fork": Category(utensils.make_fork, _roles("utensil", "flat"), 0.6),
-    "jar": Category(packages.make_jar, _roles("prop", "rider")),
-    "juice carton": Category(packages.make_juice_carton, _roles("prop"), may_lie=True),
-    "knife": Category(utensils.make_knife, _roles("flat"), 0.6),
-    "lemon": Category(food.make_lemon, _roles("content")),
-    "mug": Category(vessels.make_mug, _roles("container", "rider"), 1.5),
-    "orange": Category(food.make_orange, _roles("content")),
-    "pan": Category(vessels.make_pan, _roles("container"), 0.6),
-    "pear": Category(food.make_pear, _roles("content"), 0.6),
-    "pen": Category(utensils.make_pen, _roles("utensil", "flat")),
-    "phone": Category(utensils.make_phone, _roles("leaner", "flat", "rider"), 0.8),
-    "plate": Category(vessels.make_plate, _roles("dish"), 0.8),
-    "puzzle box": Category(packages.make_game_box, _roles("base"), 0.8),
-    "puzzle cube": Category(packages.make_puzzle_cube, _roles("content", "rider"), 0.6),
-    "remote control": Category(utensils.make_remote, _roles("leaner", "flat", "rider"), 0.8),
-    "sponge": Category(packages.make_sponge, _roles("rider"), 0.6),
-    "spoon": Category(utensils.make_spoon, _roles("utensil", "flat"), 0.8),
-    "tea box": Category(packages.make_tea_box, _roles("base", "rider", "prop")),
-    "wooden block": Category(packages.make_wooden_block, _roles("content", "rider"), 0.6),
-    "wooden spoon": Category(utensils.make_wooden_spoon, _roles("utensil", "flat"), 0.5),
+    "apple": Category(food.make_apple, ("content", "rider")),
+    "banana": Category(food.make_banana, ("flat",)),
+    "book": Category(packages.make_book, ("base", "leaner", "flat")),
+    "bottle": Category(packages.make_bottle, ("prop",), 1.5, may_lie=True),
+    "bowl": Category(vessels.make_bowl, ("container", "rider")),
+    "can": Category(packages.make_can, ("prop", "rider"), 1.5, may_lie=True),
+    "cereal box": Category(packages.make_cereal_box, ("prop", "leaner"), may_lie=True),
+    "cup": Category(vessels.make_cup, ("container", "rider")),
+    "fork": Category(utensils.make_fork, ("utensil", "flat"), 0.6),
+    "jar": Category(packages.make_jar, ("prop", "rider")),
+    "juice carton": Category(packages.make_juice_carton, ("prop",), may_lie=True),
+    "knife": Category(utensils.make_knife, ("flat",), 0.6),
+    "lemon": Category(food.make_lemon, ("content",)),
+    "mug": Category(vessels.make_mug, ("container", "rider"), 1.5),
+    "orange": Category(food.make_orange, ("content",)),
+    "pan": Category(vessels.make_pan, ("container",), 0.6),
+    "pear": Category(food.make_pear, ("content",), 0.6),
+    "pen": Category(utensils.make_pen, ("utensil", "flat")),
+    "phone": Category(utensils.make_phone, ("leaner", "flat", "rider"), 0.8),
+    "plate": Category(vessels.make_plate, ("dish",), 0.8),
+    "puzzle box": Category(packages.make_game_box, ("base",), 0.8),
+    "puzzle cube": Category(packages.make_puzzle_cube, ("content", "rider"), 0.6),
+    "remote control": Category(utensils.make_remote, ("leaner", "flat", "rider"), 0.8),
+    "sponge": Category(packages.make_sponge, ("rider",), 0.6),
+    "spoon": Category(utensils.make_spoon, ("utensil", "flat"), 0.8),
+    "tea box": Category(packages.make_tea_box, ("base", "rider", "prop")),
+    "wooden block": Category(packages.make_wooden_block, ("content", "rider"), 0.6),
+    "wooden spoon": Category(utensils.make_wooden_spoon, ("utensil", "flat"), 0.5),
 }
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-Color = Float64[np.ndarray, "3"]
-"""sRGB in 0–255."""
+Color = Float64[np.ndarray, "3"]  # sRGB in 0–255
 
 PALETTE: dict[str, tuple[int, int, int]] = {
     "red": (188, 48, 42),

@@ -32,9 +32,8 @@ def make_apple(rng: np.random.Generator) -> GeneratedObject:
     weight = make_lattice_noise(rng, (160, 120), (5, 3), 3)
     body = revolve(profile)
     fruit = wrap_around_z(_draw_freckles(rng, skin, blush, 0.6 * weight**1.5), 0.0, height)
-    stem_radius = 0.0021
-    whole, texture = body + stem, _paint_stem(fruit, stem_radius)
-    return make_object("apple", name, whole, texture, _compute_mass(body, 850.0), 0.15, convex=True)
+    texture = _paint_stem(fruit, 0.0021)
+    return make_object("apple", name, body + stem, texture, _compute_mass(body, 850.0), 0.15, convex=True)
 
 
 def make_orange(rng: np.random.Generator) -> GeneratedObject:
@@ -44,14 +43,8 @@ def make_orange(rng: np.random.Generator) -> GeneratedObject:
     body = revolve(profile)
     color = np.array([228.0, 126.0, 36.0]) + rng.normal(0.0, 6.0, 3)
     skin = draw_speckles(rng, (240, 140), color, 0.82 * color)
-    return GeneratedObject(
-        "orange",
-        "an orange",
-        body.to_mesh(),
-        (body.to_mesh().vertices,),
-        wrap_around_z(skin, 0.0, profile[-1, 1]),
-        _compute_mass(body, 900.0),
-    )
+    mesh, texture = body.to_mesh(), wrap_around_z(skin, 0.0, profile[-1, 1])
+    return GeneratedObject("orange", "an orange", mesh, (mesh.vertices,), texture, _compute_mass(body, 900.0))
 
 
 def make_lemon(rng: np.random.Generator) -> GeneratedObject:
@@ -86,12 +79,10 @@ def make_banana(rng: np.random.Generator) -> GeneratedObject:
     bend, arc = rng.uniform(0.085, 0.11), rng.uniform(1.5, 1.9)
     radius = rng.uniform(0.0165, 0.0195)
     t = np.linspace(-0.5, 0.5, 13)
-    width = radius * np.interp(
-        t, [-0.5, -0.42, -0.28, 0.0, 0.28, 0.4, 0.45, 0.5], [0.35, 0.6, 0.92, 1.0, 0.9, 0.5, 0.3, 0.32]
-    )
-    center = np.column_stack(
-        [bend * np.sin(arc * t), bend * (np.cos(arc * t) - np.cos(arc / 4)), np.full_like(t, radius)]
-    )
+    places = [-0.5, -0.42, -0.28, 0.0, 0.28, 0.4, 0.45, 0.5]
+    width = radius * np.interp(t, places, [0.35, 0.6, 0.92, 1.0, 0.9, 0.5, 0.3, 0.32])
+    x, y = bend * np.sin(arc * t), bend * (np.cos(arc * t) - np.cos(arc / 4))
+    center = np.column_stack([x, y, np.full_like(t, radius)])
     rings: Rings = make_tube(center, np.column_stack([width, width]), (0.0, 0.0, 1.0), around=10)
     body = make_loft(rings, stride=2)
     low, high = (float(x) for x in (rings[..., 0].min(), rings[..., 0].max()))

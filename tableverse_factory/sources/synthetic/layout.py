@@ -26,15 +26,13 @@ from tableverse_factory.sources.synthetic.recipes import PlacedModel
 from tableverse_factory.sources.synthetic.scene import arrange_scene, find_container
 from tableverse_factory.sources.synthetic.synthesize import check_numbers, check_origin, check_output_folder
 
-GENERATOR = "tableverse-synth-layout-1"
-"""Changes whenever the same seed no longer gives the same bytes."""
+GENERATOR = "tableverse-synth-layout-1"  # Changes whenever the same seed no longer gives the same bytes
 LAYOUTS, MESHES, TRUTH = "layouts", "meshes", "truth"
 
 POSITION_NOISE_M = (0.007, 0.007, 0.0035)
 """Standard deviation of the box centre along x, y and z; the visible table makes heights more accurate."""
 HEADING_NOISE = float(np.deg2rad(4.0))
-TILT_NOISE = float(np.deg2rad(1.0))
-"""About each horizontal axis."""
+TILT_NOISE = float(np.deg2rad(1.0))  # About each horizontal axis
 SCALE_NOISE = 0.03
 
 

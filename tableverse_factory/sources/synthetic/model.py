@@ -10,8 +10,7 @@ from schemas.geometry import Frozen, Points, TriangleMesh
 from tableverse_factory.sources.synthetic.colors import describe
 from tableverse_factory.sources.synthetic.solids import Solid
 
-Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]
-"""Positions in the object's own frame [m] to sRGB in 0–255."""
+Texture = Callable[[Points], Float64[np.ndarray, "n 3"]]  # Positions in the object's own frame [m] to sRGB in 0–255
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from tableverse_factory.sources.synthetic.colors import PRINT, Color, describe, pick_color
+from tableverse_factory.sources.synthetic.colors import PRINT, Color, pick_color
 from tableverse_factory.sources.synthetic.model import GeneratedObject, GeneratorTop, Texture, make_box_top, make_object
-from tableverse_factory.sources.synthetic.solids import make_block, make_hull, revolve
+from tableverse_factory.sources.synthetic.solids import Solid, make_block, make_hull, revolve
 from tableverse_factory.sources.synthetic.textures import (
     Raster,
     blend_colors,
@@ -22,6 +22,7 @@ from tableverse_factory.sources.synthetic.textures import (
 )
 
 Choice = TypeVar("Choice")
+Size = tuple[float, float, float]
 
 _TIN = np.array([188.0, 190.0, 194.0])
 
@@ -36,9 +37,8 @@ def make_cereal_box(rng: np.random.Generator) -> GeneratedObject:
 def make_tea_box(rng: np.random.Generator) -> GeneratedObject:
     """Make a low carton of tea or biscuits."""
     size = (rng.uniform(0.11, 0.15), rng.uniform(0.065, 0.085), rng.uniform(0.055, 0.08))
-    return _make_carton(
-        rng, "tea box", size, (("GREEN", "TEA"), ("EARL", "GREY"), ("MINT", "infusion"), ("CHAI",)), 0.16
-    )
+    words = (("GREEN", "TEA"), ("EARL", "GREY"), ("MINT", "infusion"), ("CHAI",))
+    return _make_carton(rng, "tea box", size, words, 0.16)
 
 
 def make_game_box(rng: np.random.Generator) -> GeneratedObject:
@@ -60,8 +60,7 @@ def make_juice_carton(rng: np.random.Generator) -> GeneratedObject:
     faces = [draw_label(rng, (128, 320), background, accent, words) for _ in range(2)]
     sides = (faces[0], faces[1], faces[0], faces[1], _fill_raster(background), _fill_raster(background))
     texture = split_bands((height,), (map_to_box(sides, (side, side, height)), fill_color(0.92 * background)))
-    body = make_hull(np.array(corners + ridge))
-    return make_object("juice carton", name, body, texture, 900.0 * side**2 * height)
+    return make_object("juice carton", name, make_hull(np.array(corners + ridge)), texture, 900.0 * side**2 * height)
 
 
 def make_can(rng: np.random.Generator) -> GeneratedObject:
@@ -75,9 +74,8 @@ def make_can(rng: np.random.Generator) -> GeneratedObject:
     label = wrap_around_z(draw_label(rng, (420, 200), background, accent, words), 0.004, height - 0.004)
     texture = split_bands((0.004, height - 0.004), (fill_color(_TIN), label, fill_color(_TIN)))
     top = GeneratorTop(height, 0.6 * radius, 0.6 * radius)
-    body = revolve(profile)
     mass = 1050.0 * np.pi * radius**2 * height
-    return make_object("can", name, body, texture, mass, 0.3, top=top)
+    return make_object("can", name, revolve(profile), texture, mass, 0.3, top=top)
 
 
 def make_bottle(rng: np.random.Generator) -> GeneratedObject:
@@ -95,12 +93,9 @@ def make_bottle(rng: np.random.Generator) -> GeneratedObject:
     low, high = 0.16 * shoulder, 0.92 * shoulder
     words = _choose(rng, (("KETCHUP",), ("WATER", "still"), ("SHAMPOO",), ("MUSTARD",), ("SYRUP",)))
     label = wrap_around_z(draw_label(rng, (420, 220), accent, body_color, words), low, high)
-    texture = split_bands(
-        (low, high, cap - 1e-4), (fill_color(body_color), label, fill_color(body_color), fill_color(lid))
-    )
-    body = revolve(profile)
-    mass = 900.0 * np.pi * radius**2 * shoulder
-    return make_object("bottle", name, body, texture, mass, 0.2)
+    plain = fill_color(body_color)
+    texture = split_bands((low, high, cap - 1e-4), (plain, label, plain, fill_color(lid)))
+    return make_object("bottle", name, revolve(profile), texture, 900.0 * np.pi * radius**2 * shoulder, 0.2)
 
 
 def make_jar(rng: np.random.Generator) -> GeneratedObject:
@@ -118,9 +113,8 @@ def make_jar(rng: np.random.Generator) -> GeneratedObject:
     label = wrap_around_z(draw_label(rng, (420, 160), np.array([238.0, 232.0, 214.0]), accent, words), low, high)
     texture = split_bands((low, high, lid - 1e-4), (fill_color(content), label, fill_color(content), fill_color(cap)))
     top = GeneratorTop(height, 0.6 * neck, 0.6 * neck)
-    body = revolve(profile)
     mass = 1300.0 * np.pi * radius**2 * height
-    return make_object("jar", name, body, texture, mass, 0.25, top=top)
+    return make_object("jar", name, revolve(profile), texture, mass, 0.25, top=top)
 
 
 def make_book(rng: np.random.Generator) -> GeneratedObject:
@@ -135,18 +129,14 @@ def make_book(rng: np.random.Generator) -> GeneratedObject:
     _, accent = pick_color(rng, PRINT)
     words = _choose(rng, (("THE SEA", "a novel"), ("ATLAS",), ("GARDEN", "year"), ("PHYSICS", "II"), ("POEMS",)))
     front = draw_label(rng, (220, 300), background, accent, words)
-    paper = blend_colors(
-        np.array([232.0, 226.0, 208.0]), np.array([196.0, 188.0, 168.0]), make_lattice_noise(rng, (64, 64), (1, 32), 1)
-    )
+    pages_noise = make_lattice_noise(rng, (64, 64), (1, 32), 1)
+    paper = blend_colors(np.array([232.0, 226.0, 208.0]), np.array([196.0, 188.0, 168.0]), pages_noise)
     side = _fill_raster(background)
     edges = map_to_box((paper, paper, paper, side, front, side), size)
     boards = map_to_box((side, side, side, side, front, side), size)
     texture = split_bands((board, size[2] - board), (boards, edges, boards))
-    top = make_box_top(size)
-    mass = 700.0 * float(np.prod(size))
-    return GeneratedObject(
-        "book", describe(name, "book"), body.to_mesh(), (np.concatenate(body.pieces),), texture, mass, top=top
-    )
+    whole = Solid(body.manifold, (np.concatenate(body.pieces),))
+    return make_object("book", name, whole, texture, 700.0 * float(np.prod(size)), top=make_box_top(size))
 
 
 def make_puzzle_cube(rng: np.random.Generator) -> GeneratedObject:
@@ -156,9 +146,8 @@ def make_puzzle_cube(rng: np.random.Generator) -> GeneratedObject:
     fields = [np.kron(colors[rng.integers(6, size=(3, 3))], np.ones((20, 20, 1))) for _ in range(6)]
     for field in fields:
         field[::20], field[19::20], field[:, ::20], field[:, 19::20] = 28.0, 28.0, 28.0, 28.0
-    body = make_block((side, side, side), 0.003)
-    top = GeneratorTop(side, side / 2, side / 2)
-    texture = map_to_box(fields, (side, side, side))
+    size = (side, side, side)
+    body, texture, top = make_block(size, 0.003), map_to_box(fields, size), make_box_top(size)
     return make_object("puzzle cube", "puzzle", body, texture, 0.09, top=top, noun="cube with coloured fields")
 
 
@@ -167,43 +156,32 @@ def make_sponge(rng: np.random.Generator) -> GeneratedObject:
     size = (rng.uniform(0.09, 0.115), rng.uniform(0.06, 0.075), rng.uniform(0.025, 0.035))
     name, color = pick_color(rng, ("yellow", "pink", "light blue", "orange"))
     soft = map_to_box([draw_speckles(rng, (90, 60), color, 0.65 * color)] * 6, size)
-    scourer = map_to_box(
-        [draw_speckles(rng, (90, 60), np.array([44.0, 96.0, 62.0]), np.array([24.0, 56.0, 36.0]))] * 6, size
-    )
-    body = make_block(size, 0.006)
-    texture = split_bands((0.75 * size[2],), (soft, scourer))
-    return make_object("sponge", name, body, texture, 0.02, noun="and green sponge")
+    green = draw_speckles(rng, (90, 60), np.array([44.0, 96.0, 62.0]), np.array([24.0, 56.0, 36.0]))
+    texture = split_bands((0.75 * size[2],), (soft, map_to_box([green] * 6, size)))
+    return make_object("sponge", name, make_block(size, 0.006), texture, 0.02, noun="and green sponge")
 
 
 def make_wooden_block(rng: np.random.Generator) -> GeneratedObject:
     """Make a toy brick of wood."""
     size = (rng.uniform(0.05, 0.1), rng.uniform(0.03, 0.05), rng.uniform(0.025, 0.05))
     name, tint = pick_color(rng, ("beige", "brown", "red", "blue", "green", "yellow"))
-    body = make_block(size)
     texture = map_to_box([draw_wood(rng, (120, 60), tint, 0.72 * tint)] * 6, size)
-    top = make_box_top(size)
     mass = 600.0 * float(np.prod(size))
-    return make_object("wooden block", name, body, texture, mass, top=top)
+    return make_object("wooden block", name, make_block(size), texture, mass, top=make_box_top(size))
 
 
 def _make_carton(
-    rng: np.random.Generator,
-    label: str,
-    size: tuple[float, float, float],
-    wordings: Sequence[Sequence[str]],
-    mass: float,
+    rng: np.random.Generator, label: str, size: Size, wordings: Sequence[Sequence[str]], mass: float
 ) -> GeneratedObject:
     name, background = pick_color(rng, PRINT)
     _, accent = pick_color(rng, PRINT)
-    words = _choose(rng, wordings)
-    body = make_block(size)
-    top = make_box_top(size)
-    texture = _make_faces(rng, size, background, accent, words)
-    return make_object(label, name, body, texture, mass * rng.uniform(0.8, 1.2), top=top)
+    texture = _make_faces(rng, size, background, accent, _choose(rng, wordings))
+    mass_kg = mass * rng.uniform(0.8, 1.2)
+    return make_object(label, name, make_block(size), texture, mass_kg, top=make_box_top(size))
 
 
 def _make_faces(
-    rng: np.random.Generator, size: tuple[float, float, float], background: Color, accent: Color, words: Sequence[str]
+    rng: np.random.Generator, size: Size, background: Color, accent: Color, words: Sequence[str]
 ) -> Texture:
     def face(width: float, height: float) -> Raster:
         return draw_label(rng, (max(32, round(width * 1600)), max(32, round(height * 1600))), background, accent, words)

@@ -14,8 +14,7 @@ from tableverse_factory.sources.synthetic.catalogue import CATEGORIES, Role, mak
 from tableverse_factory.sources.synthetic.model import GeneratedObject, GeneratorCavity
 
 GAP_M = 0.0008
-FOOT_M = 0.004
-"""Height of the part of an object that is its foot."""
+FOOT_M = 0.004  # Height of the part of an object that is its foot
 TRIES = 12
 
 

@@ -27,12 +27,7 @@ SUBSAMPLING = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticObject(Frozen):
-    """An object of a synthetic scene, at rest.
-
-    Attributes:
-        contained_in: Index of its container among the scene's objects, or None.
-        visible_fraction: Their share of its silhouette, 0 to 1.
-    """
+    """An object at rest, the index of its container or None, its visible pixels, and their share of its silhouette."""
 
     placed: PlacedModel
     contained_in: int | None
@@ -50,6 +45,7 @@ class SyntheticScene(Frozen):
         depth_scale: Metres per unit of depth.
         true_depth: Shape (h, w) float32 [m], without noise; 0 where nothing is.
         ids: Shape (h, w), index of the object at each pixel, -1 elsewhere.
+        table_half_xy: Half extents of the table [m].
         table_pixels: Shape (h, w), where the table is seen.
         camera_to_table: Pose of the camera; the table frame has z up and its origin amid the table's upper face.
     """
@@ -103,20 +99,13 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
 def arrange_scene(rng: np.random.Generator, scene_id: str) -> tuple[list[PlacedModel], tuple[float, float]]:
     """Arrange objects at rest on a table, in its frame; returns them and the half extents of the table [m]."""
     half_xy = (float(rng.uniform(0.42, 0.75)), float(rng.uniform(0.38, 0.55)))
-    return _settle_arrangement(rng, half_xy, scene_id), half_xy
-
-
-def _settle_arrangement(rng: np.random.Generator, half_xy: tuple[float, float], scene_id: str) -> list[PlacedModel]:
     for _ in range(ATTEMPTS):
         placed = arrange_groups(rng)
         rest = settle_arrangement(placed, half_xy)
         if not rest.at_rest or rest.penetration_m > MAX_PENETRATION_M or len(placed) - len(rest.fallen) < MIN_OBJECTS:
             continue
-        return [
-            PlacedModel(item.model, pose)
-            for index, (item, pose) in enumerate(zip(placed, rest.poses, strict=True))
-            if index not in rest.fallen
-        ]
+        poses = enumerate(zip(placed, rest.poses, strict=True))
+        return [PlacedModel(item.model, pose) for index, (item, pose) in poses if index not in rest.fallen], half_xy
     raise GeometryError(f"synthetic scene {scene_id!r}: none of {ATTEMPTS} arrangements came to rest")
 
 

@@ -14,8 +14,7 @@ from tableverse_factory.sources.synthetic.recipes import PlacedModel
 TIMESTEP_S = 0.002
 ARENA_BYTES = 256 * 1024 * 1024
 MAX_TIME_S = 5.0
-REST_SPEED = 0.01
-"""Largest speed [m/s] and turning rate [rad/s] of an object at rest."""
+REST_SPEED = 0.01  # Largest speed [m/s] and turning rate [rad/s] of an object at rest
 REST_TIME_S = 0.3
 FRICTION = (0.8, 0.01, 0.01)
 SOLREF = (0.006, 1.0)
@@ -36,7 +35,7 @@ class SyntheticRest(Frozen):
 
 
 def settle_arrangement(placed: Sequence[PlacedModel], table_half_xy: tuple[float, float]) -> SyntheticRest:
-    """Simulate until everything has been still for `REST_TIME_S`, at most `MAX_TIME_S`."""
+    """Simulate until all has been still for `REST_TIME_S`, at most `MAX_TIME_S`, on a table centred on the origin."""
     model = _build_spec(placed, table_half_xy).compile()
     data = mujoco.MjData(model)
     still, needed = 0, round(REST_TIME_S / TIMESTEP_S)

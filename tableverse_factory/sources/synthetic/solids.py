@@ -19,10 +19,8 @@ SEGMENTS = 48
 WEDGES = 16
 WALL_LIFT_M = 0.0006
 
-Profile = Float64[np.ndarray, "k 2"]
-"""Radius and height [m], from the bottom up."""
-Rings = Float64[np.ndarray, "k m 3"]
-"""Closed curves of equally many points [m], one after the other along a tube."""
+Profile = Float64[np.ndarray, "k 2"]  # Radius and height [m], from the bottom up
+Rings = Float64[np.ndarray, "k m 3"]  # Closed curves of equally many points [m], one after the other along a tube
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,12 +141,8 @@ def make_tube(
 
 
 def _revolve_outline(outline: Profile) -> Manifold:
-    section = CrossSection([np.ascontiguousarray(outline[_find_distinct(outline)])])
-    return Manifold.revolve(section, SEGMENTS)
-
-
-def _find_distinct(outline: Profile) -> np.ndarray:
-    return np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-7
+    distinct = np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1) > 1e-7
+    return Manifold.revolve(CrossSection([np.ascontiguousarray(outline[distinct])]), SEGMENTS)
 
 
 def _revolve_profile(profile: Profile) -> Points:

@@ -11,8 +11,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.synthetic.capture import encode_capture, write_files
 from tableverse_factory.sources.synthetic.scene import SyntheticScene, make_scene
 
-GENERATOR = "tableverse-synth-1"
-"""Changes whenever the same seed no longer gives the same bytes."""
+GENERATOR = "tableverse-synth-1"  # Changes whenever the same seed no longer gives the same bytes
 MAX_SCENES = 1_000_000
 _FOLDER_NAME = re.compile(r"synth_\d{6}")
 _PARTIAL = ".partial"

@@ -10,8 +10,7 @@ from schemas.geometry import Picture, Points
 from tableverse_factory.sources.synthetic.colors import Color, find_ink_color
 from tableverse_factory.sources.synthetic.model import Texture
 
-Raster = Float32[np.ndarray, "h w 3"]
-"""sRGB in 0–255, first row on top."""
+Raster = Float32[np.ndarray, "h w 3"]  # sRGB in 0–255, first row on top
 
 
 def fill_color(color: Color) -> Texture:
@@ -124,15 +123,12 @@ def draw_label(
     image = Image.fromarray(_draw_background(rng, size, background, accent).astype(np.uint8))
     draw = ImageDraw.Draw(image)
     ink = _round_color(find_ink_color(background))
-    center, radius = (
-        (width * rng.uniform(0.35, 0.65), height * rng.uniform(0.55, 0.68)),
-        min(size) * rng.uniform(0.16, 0.28),
-    )
+    center = (width * rng.uniform(0.35, 0.65), height * rng.uniform(0.55, 0.68))
+    radius = min(size) * rng.uniform(0.16, 0.28)
     box = (center[0] - radius, center[1] - radius, center[0] + radius, center[1] + radius)
-    (draw.ellipse if rng.random() < 0.6 else draw.rectangle)(box, fill=_round_color(find_ink_color(background)))
-    inner = tuple(
-        c + d for c, d in zip(box, (0.25 * radius, 0.25 * radius, -0.25 * radius, -0.25 * radius), strict=True)
-    )
+    (draw.ellipse if rng.random() < 0.6 else draw.rectangle)(box, fill=ink)
+    inset = 0.25 * radius
+    inner = (box[0] + inset, box[1] + inset, box[2] - inset, box[3] - inset)
     draw.ellipse(inner, fill=_round_color(accent))
     for line, word in enumerate(words):
         _draw_text(image, word, (width * 0.08, height * (0.08 + 0.15 * line)), (width * 0.84, height * 0.13), ink)
@@ -151,8 +147,7 @@ def _draw_background(rng: np.random.Generator, size: tuple[int, int], background
     elif kind == 1:
         weight = (y > 0.5 + 0.12 * np.sin(2 * np.pi * (x * rng.uniform(0.7, 1.6) + rng.random()))).astype(np.float64)
     elif kind == 2:
-        stripes = (x + y * rng.uniform(0.3, 1.0)) % 0.25 < 0.1
-        weight = (stripes & (y > 0.42)).astype(np.float64)
+        weight = (((x + y * rng.uniform(0.3, 1.0)) % 0.25 < 0.1) & (y > 0.42)).astype(np.float64)
     else:
         weight = np.clip(1.6 * y - 0.5, 0.0, 1.0)
     return blend_colors(background, accent, weight)
@@ -191,6 +186,5 @@ def draw_wood(rng: np.random.Generator, size: tuple[int, int], light: Color, dar
 def draw_speckles(rng: np.random.Generator, size: tuple[int, int], base: Color, grain: Color) -> Raster:
     """Draw fine speckles."""
     fine = make_lattice_noise(rng, size, (size[0] // 6, size[1] // 6), 2)
-    return blend_colors(
-        base, grain, np.clip(2.5 * (fine - 0.5), 0.0, 0.7) + 0.1 * make_lattice_noise(rng, size, (5, 5), 2)
-    )
+    weight = np.clip(2.5 * (fine - 0.5), 0.0, 0.7) + 0.1 * make_lattice_noise(rng, size, (5, 5), 2)
+    return blend_colors(base, grain, weight)

@@ -38,11 +38,10 @@ def make_fork(rng: np.random.Generator) -> GeneratedObject:
     palm += [[root, y * width, z] for y in (-0.5, 0.5) for z in (0.0, 0.0024)]
     body = make_hull(np.array(palm)) + _make_handle(-length / 2, neck + 0.003, 0.0046, rng.uniform(0.005, 0.0065))
     x = np.array([root - 0.002, root + 0.022, tip])
+    radii = np.array([[0.0018, 0.0013], [0.0016, 0.0012], [0.0008, 0.0008]])
     for y in (np.arange(4) - 1.5) * (width - 0.0036) / 3:
         center = np.column_stack([x, np.full(3, y), [0.0013, 0.0028, 0.0068]])
-        body += make_loft(
-            make_tube(center, np.array([[0.0018, 0.0013], [0.0016, 0.0012], [0.0008, 0.0008]]), (0.0, 1.0, 0.0), 6)
-        )
+        body += make_loft(make_tube(center, radii, (0.0, 1.0, 0.0), 6))
     return _make_cutlery(rng, "fork", body)
 
 
@@ -50,14 +49,8 @@ def make_knife(rng: np.random.Generator) -> GeneratedObject:
     """Make a table knife along x, its blade towards +x."""
     length, width = rng.uniform(0.19, 0.23), rng.uniform(0.018, 0.023)
     tip, neck = length / 2, -0.02
-    outline = [
-        (neck, -0.006),
-        (neck, 0.006),
-        (0.55 * tip, width / 2),
-        (0.9 * tip, width / 2),
-        (tip, -0.002),
-        (0.8 * tip, -width / 2),
-    ]
+    outline = [(neck, -0.006), (neck, 0.006), (0.55 * tip, width / 2), (0.9 * tip, width / 2)]
+    outline += [(tip, -0.002), (0.8 * tip, -width / 2)]
     blade = make_hull(np.array([(x, y, z) for x, y in outline for z in (0.0, 0.0022)]))
     body = blade + _make_handle(-tip, neck + 0.006, 0.0036, rng.uniform(0.006, 0.0085), arch=0.0)
     return _make_cutlery(rng, "knife", body, handle_end=neck + 0.004)
@@ -70,14 +63,12 @@ def make_pen(rng: np.random.Generator) -> GeneratedObject:
     x = np.array([-0.5, -0.47, 0.36, 0.43, 0.5]) * length
     width = radius * np.array([0.8, 1.0, 1.0, 0.75, 0.25])
     center = np.column_stack([x, np.zeros(5), np.full(5, radius * np.cos(np.pi / 12))])
-    rings = make_tube(center, np.column_stack([width, width]), (0.0, 1.0, 0.0))
+    body = make_loft(make_tube(center, np.column_stack([width, width]), (0.0, 1.0, 0.0)))
     name, color = pick_color(rng, ("blue", "black", "red", "green", "purple", "orange"))
     barrel = color if rng.random() < 0.5 else np.array([236.0, 236.0, 232.0])
-    texture = split_bands(
-        (-0.1 * length, 0.37 * length), (fill_color(color), fill_color(barrel), fill_color(0.6 * color)), axis=0
-    )
+    bands = (fill_color(color), fill_color(barrel), fill_color(0.6 * color))
+    texture = split_bands((-0.1 * length, 0.37 * length), bands, axis=0)
     label = "marker" if thick else "pen"
-    body = make_loft(rings)
     return make_object(label, name, body, texture, 0.02 if thick else 0.012, 0.1, convex=True)
 
 
@@ -96,9 +87,8 @@ def make_phone(rng: np.random.Generator) -> GeneratedObject:
 def make_remote(rng: np.random.Generator) -> GeneratedObject:
     """Make a remote control with rows of buttons."""
     size = (rng.uniform(0.042, 0.05), rng.uniform(0.15, 0.19), rng.uniform(0.016, 0.021))
-    body = make_prism(
-        [(0.8 * size[0], 0.97 * size[1]), (size[0], size[1]), (0.95 * size[0], 0.99 * size[1])], 0.008, size[2]
-    )
+    outlines = [(0.8 * size[0], 0.97 * size[1]), (size[0], size[1]), (0.95 * size[0], 0.99 * size[1])]
+    body = make_prism(outlines, 0.008, size[2])
     name, color = pick_color(rng, ("black", "black", "grey", "white"))
     texture = split_bands((size[2] - 5e-4,), (fill_color(color), _project_from_above(_draw_buttons(rng, color), size)))
     return make_object("remote control", name, body, texture, 0.12, 0.1)
@@ -111,9 +101,8 @@ def _make_handle(start: float, end: float, end_height: float, half_width: float,
     height = thick + (end_height - thick) * t + arch * np.sin(np.pi * t)
     center = np.column_stack([start + (end - start) * t, 0 * t, height])
     widths = half_width * np.interp(t, [0.0, 0.15, 0.6, 1.0], [0.75, 1.0, 0.6, 0.55])
-    return make_loft(
-        make_tube(center, np.column_stack([widths, np.full(6, thick)]), (0.0, 1.0, 0.0), around=8), stride=2
-    )
+    rings = make_tube(center, np.column_stack([widths, np.full(6, thick)]), (0.0, 1.0, 0.0), around=8)
+    return make_loft(rings, stride=2)
 
 
 def _stretch(solid: Solid, x: float, y: float) -> Solid:
@@ -133,12 +122,10 @@ def _make_cutlery(
         grain = draw_wood(rng, (160, 40), np.array([196.0, 152.0, 104.0]), np.array([146.0, 104.0, 66.0]))
         texture, material, density = project_along(grain, (0, 1), (-0.1, -0.03), (0.1, 0.03)), "wooden", 750.0
     if handle_end is not None:
-        texture = split_bands(
-            (handle_end,), (texture if kind > 1 else fill_color(0.4 * _STEEL), fill_color(_STEEL)), axis=0
-        )
+        handle = texture if kind > 1 else fill_color(0.4 * _STEEL)
+        texture = split_bands((handle_end,), (handle, fill_color(_STEEL)), axis=0)
     mass = max(float(body.manifold.volume()) * density, 0.008)
-    shiny = 0.6 if kind < 2 else 0.05
-    return make_object(label, material, body, texture, mass, shiny)
+    return make_object(label, material, body, texture, mass, 0.6 if kind < 2 else 0.05)
 
 
 def _project_from_above(raster: Raster, size: tuple[float, float, float]) -> Texture:

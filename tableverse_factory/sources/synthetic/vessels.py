@@ -35,8 +35,7 @@ def make_bowl(rng: np.random.Generator) -> GeneratedObject:
     name, color = pick_color(rng, CERAMIC)
     cavity = GeneratorCavity(inner[0, 1], height, inner[0, 0], inner[-1, 0])
     mass = rng.uniform(0.25, 0.45)
-    body = make_shell(outer, inner)
-    return make_object("bowl", name, body, _make_glaze(rng, outer, color), mass, 0.25, cavity)
+    return make_object("bowl", name, make_shell(outer, inner), _make_glaze(rng, outer, color), mass, 0.25, cavity)
 
 
 def make_plate(rng: np.random.Generator) -> GeneratedObject:
@@ -47,9 +46,8 @@ def make_plate(rng: np.random.Generator) -> GeneratedObject:
     inner = _make_inner_profile(outer, WALL_M, 0.004)
     name, color = pick_color(rng, CERAMIC)
     top = GeneratorTop(inner[0, 1], inner[0, 0] * 0.7, inner[0, 0] * 0.7)
-    body = make_shell(outer, inner)
     texture = _make_glaze(rng, outer, color)
-    return make_object("plate", name, body, texture, rng.uniform(0.3, 0.6), 0.25, top=top)
+    return make_object("plate", name, make_shell(outer, inner), texture, rng.uniform(0.3, 0.6), 0.25, top=top)
 
 
 def make_cup(rng: np.random.Generator) -> GeneratedObject:
@@ -60,9 +58,8 @@ def make_cup(rng: np.random.Generator) -> GeneratedObject:
     inner = np.array([[foot - 0.006, 0.005], [foot - 0.003, 0.008], [radius - 0.003, height]])
     name, color = pick_color(rng, CERAMIC)
     cavity = GeneratorCavity(0.005, height, float(inner[0, 0]), float(inner[-1, 0]))
-    body = make_shell(outer, inner)
     texture = _make_glaze(rng, outer, color)
-    return make_object("cup", name, body, texture, rng.uniform(0.15, 0.3), 0.2, cavity)
+    return make_object("cup", name, make_shell(outer, inner), texture, rng.uniform(0.15, 0.3), 0.2, cavity)
 
 
 def make_mug(rng: np.random.Generator) -> GeneratedObject:
@@ -92,18 +89,14 @@ def make_pan(rng: np.random.Generator) -> GeneratedObject:
     center = np.column_stack([radius - 0.0025 + reach * t, 0 * t, 0.8 * height + 0.022 * np.sin(t * np.pi / 2)])
     handle = make_loft(make_tube(center, np.column_stack([0.008 + 0.004 * t, 0.0045 + 0.002 * t]), (0.0, 1.0, 0.0)))
     name, color = pick_color(rng, ("black", "grey", "red", "teal", "navy"))
-    texture = split_bands(
-        (radius + 0.006,),
-        (_line_inside(outer, color, np.array([52.0, 52.0, 56.0])), fill_color(np.array([38.0, 36.0, 36.0]))),
-        axis=0,
-    )
+    vessel = _make_two_sided(outer, fill_color(color), fill_color(np.array([52.0, 52.0, 56.0])))
+    texture = split_bands((radius + 0.006,), (vessel, fill_color(np.array([38.0, 36.0, 36.0]))), axis=0)
     cavity = GeneratorCavity(float(inner[0, 1]), height, float(inner[0, 0]), float(inner[-1, 0]))
     body = make_shell(outer, inner) + handle
     return make_object("pan", name, body, texture, rng.uniform(0.6, 0.9), 0.35, cavity, noun="frying pan")
 
 
 def _make_inner_profile(outer: Profile, wall: float, floor: float) -> Profile:
-    """Make the inner profile of a vessel from its outer one [m]."""
     height = outer[-1, 1]
     return np.column_stack([outer[:, 0] - wall, floor + (height - floor) * outer[:, 1] / height])
 
@@ -122,15 +115,10 @@ def _make_glaze(rng: np.random.Generator, outer: Profile, color: Color) -> Textu
         outside = split_bands((low, low + 0.2 * height), (fill_color(color), fill_color(second), fill_color(color)))
     else:
         edge = make_lattice_noise(rng, (240, 120), (8, 1), 2) * 0.2 + np.linspace(1.0, 0.0, 120)[:, None]
-        outside = wrap_around_z(
-            blend_colors(color, second, (edge > rng.uniform(0.5, 0.8)).astype(np.float64)), 0.0, height
-        )
+        dipped = (edge > rng.uniform(0.5, 0.8)).astype(np.float64)
+        outside = wrap_around_z(blend_colors(color, second, dipped), 0.0, height)
     inside = color if rng.random() < 0.5 else np.array([240.0, 237.0, 228.0])
     return _make_two_sided(outer, outside, fill_color(inside))
-
-
-def _line_inside(outer: Profile, outside: Color, inside: Color) -> Texture:
-    return _make_two_sided(outer, fill_color(outside), fill_color(inside))
 
 
 def _make_two_sided(outer: Profile, outside: Texture, inside: Texture) -> Texture:

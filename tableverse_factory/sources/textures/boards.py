@@ -10,13 +10,7 @@ from tableverse_factory.sources.textures.fields import Field, Ids, pixel_grid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardLayout(Frozen):
-    """Place of each pixel within its board.
-
-    Attributes:
-        along: Place along the board, 0–1.
-        edge: Distance to the nearest edge of the board, over the side of the square.
-        upright: Whether the board runs downwards.
-    """
+    """Board of each pixel, its place along and across it, 0–1, and the distance to its edge, over the square's side."""
 
     ids: Ids
     count: int

@@ -14,12 +14,8 @@ from tableverse_factory.sources.textures import cloth, sheets, stone, tiles, woo
 from tableverse_factory.sources.textures.draw import TextureSampler
 from tableverse_factory.sources.textures.fields import Raster
 
-TEXTURE_COUNT = 1728
-"""Textures that are tested to be distinct; seeds beyond make more of the same families."""
-
-TILE_M = 0.6
-"""Length of table that a texture covers before it repeats [m]."""
-
+TEXTURE_COUNT = 1728  # Textures that are tested to be distinct; seeds beyond make more of the same families
+TILE_M = 0.6  # Length of table that a texture covers before it repeats [m]
 MIN_SIZE, MAX_SIZE = 16, 4096
 
 Family = Callable[[TextureSampler], Raster]

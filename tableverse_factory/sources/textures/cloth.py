@@ -18,8 +18,7 @@ from tableverse_factory.sources.textures.fields import (
     wave,
 )
 
-THREADS = (96, 128, 160)
-"""Threads across the square."""
+THREADS = (96, 128, 160)  # Threads across the square
 
 
 def draw_linen(draw: TextureSampler) -> Raster:
@@ -36,8 +35,7 @@ def draw_gingham(draw: TextureSampler) -> Raster:
     color, ground = _draw_bold_color(draw), oklch(draw.between(0.9, 0.98), draw.between(0, 0.03), draw.between(0, 1))
     checks = draw.choose((6, 8, 12, 16, 24))
     u, v = pixel_grid(draw.size)
-    stripes = (smoothstep(wave(t * checks), -0.03, 0.03) for t in (u, v))
-    across, down = stripes
+    across, down = (smoothstep(wave(t * checks), -0.03, 0.03) for t in (u, v))
     raster = paint(draw.fill(ground), color, 0.48 * (across + down))
     return _add_weave(draw, raster)
 
@@ -113,9 +111,8 @@ def draw_houndstooth(draw: TextureSampler) -> Raster:
     u, v = pixel_grid(draw.size)
     i, j = (np.floor(t * (8 * repeats)).astype(np.int32) for t in (u, v))
     warp_on_top = (i - j) % 4 < 2
-    dark_here = np.where(warp_on_top, i % 8 < 4, j % 8 < 4)
-    blurred = dark_here.astype(np.float32)
-    return _add_weave(draw, map_colors(blurred, (light, dark)))
+    weight = np.where(warp_on_top, i % 8 < 4, j % 8 < 4).astype(np.float32)
+    return _add_weave(draw, map_colors(weight, (light, dark)))
 
 
 def draw_dots(draw: TextureSampler) -> Raster:
@@ -136,9 +133,8 @@ def draw_felt(draw: TextureSampler) -> Raster:
     fibres = draw.noise((40, 120), 2) + draw.noise((120, 40), 2)
     melange = draw.between(0.06, 0.3)
     weight = 0.5 + melange * 0.5 * fibres + 0.06 * draw.noise((6, 6), 3)
-    raster = map_colors(
-        weight, (scale_color(base, 0.7), base, oklch(min(0.97, 0.4 + 0.66 * draw.spread(1)), 0.02, 0.0))
-    )
+    pale = oklch(min(0.97, 0.4 + 0.66 * draw.spread(1)), 0.02, 0.0)
+    raster = map_colors(weight, (scale_color(base, 0.7), base, pale))
     return brighten(raster, shade_relief(fibres, 0.05))
 
 

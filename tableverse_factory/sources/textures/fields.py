@@ -13,30 +13,18 @@ from jaxtyping import Float32, Int32
 
 from schemas.geometry import Frozen
 
-Field = Float32[np.ndarray, "n n"]
-"""Values over the square, the first row on top."""
-
-Raster = Float32[np.ndarray, "n n 3"]
-"""sRGB in 0–255, the first row on top."""
-
-Color = Float32[np.ndarray, "3"]
-"""sRGB in 0–255."""
-
+Field = Float32[np.ndarray, "n n"]  # Values over the square, the first row on top
+Raster = Float32[np.ndarray, "n n 3"]  # sRGB in 0–255, the first row on top
+Color = Float32[np.ndarray, "3"]  # sRGB in 0–255
 Ids = Int32[np.ndarray, "n n"]
 
 _SHADES = 1024
-_SPLINE_GAIN = np.float32(3.6)
-"""Scales values in -1 to 1, smoothed by the spline, to a standard deviation of about 1."""
+_SPLINE_GAIN = np.float32(3.6)  # Scales values in -1 to 1, smoothed by the spline, to a standard deviation of about 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells(Frozen):
-    """Nearest random point of each pixel (Worley, 1996).
-
-    Attributes:
-        nearest: Distance to it, in cells.
-        second: Distance to the second nearest.
-    """
+    """Distances of each pixel to the nearest two random points, in cells, and the nearest's number (Worley, 1996)."""
 
     nearest: Field
     second: Field

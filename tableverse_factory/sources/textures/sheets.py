@@ -73,15 +73,10 @@ def draw_patina(draw: TextureSampler) -> Raster:
     coarse = draw.whole(2, 4)
     eaten = draw.noise((coarse, coarse), 7, 0.65)
     grit = draw.noise((60, 60), 3, 0.8)
-    raster = map_colors(
-        0.5 + 0.14 * grit + 0.1 * eaten, [draw.near(scale_color(metal, tint * k), 8) for k in (0.85, 1.15)]
-    )
-    raster = paint(
-        raster, draw.near(scale_color(oxide, tint), 16), 0.95 * smoothstep(eaten + bias + 0.25 * grit, -0.2, 0.7)
-    )
-    raster = paint(
-        raster, draw.near(scale_color(crust, tint), 12), 0.8 * smoothstep(eaten + bias + 0.4 * grit, 1.0, 2.0)
-    )
+    metals = [draw.near(scale_color(metal, tint * k), 8) for k in (0.85, 1.15)]
+    raster, depth = map_colors(0.5 + 0.14 * grit + 0.1 * eaten, metals), eaten + bias
+    raster = paint(raster, draw.near(scale_color(oxide, tint), 16), 0.95 * smoothstep(depth + 0.25 * grit, -0.2, 0.7))
+    raster = paint(raster, draw.near(scale_color(crust, tint), 12), 0.8 * smoothstep(depth + 0.4 * grit, 1.0, 2.0))
     return brighten(raster, shade_relief(eaten + 0.4 * grit, 0.22))
 
 

@@ -88,10 +88,8 @@ def draw_terrazzo(draw: TextureSampler) -> Raster:
     """Draw chips of several stones in a ground."""
     ground = draw.color((0.25, 0.7), (0.0, 0.07))
     lively, hue = draw.between(0.01, 0.1), draw.spread(4)
-    stones = [
-        oklch(draw.between(0.25, 0.95), lively * draw.between(0.2, 1.0), hue + draw.between(-0.18, 0.18))
-        for _ in range(5)
-    ]
+    parts = ((draw.between(0.25, 0.95), draw.between(0.2, 1.0), draw.between(-0.18, 0.18)) for _ in range(5))
+    stones = [oklch(light, lively * share, hue + turn) for light, share, turn in parts]
     raster = brighten(draw.fill(ground), 0.025 * draw.noise((70, 70), 3, 0.8))
     coarse = draw.choose((7, 10, 14, 20))
     for count, share in ((3 * coarse, 0.45), (2 * coarse, 0.5), (coarse, draw.between(0.5, 0.95))):

@@ -90,9 +90,8 @@ def draw_checkers(draw: TextureSampler) -> Raster:
     odd = (boards.ids // count + boards.ids) % 2 == 1
     raster = np.where(odd[..., None], dark, light).astype(np.float32)
     clouds = draw.noise((5, 5), 6, 0.6)
-    return _draw_joints(
-        draw, brighten(raster, 0.06 * clouds), boards.edge, draw.pick((0.0008, 0.0025)), _draw_grout_color(draw)
-    )
+    width, grout = draw.pick((0.0008, 0.0025)), _draw_grout_color(draw)
+    return _draw_joints(draw, brighten(raster, 0.06 * clouds), boards.edge, width, grout)
 
 
 def draw_cement_tiles(draw: TextureSampler) -> Raster:
@@ -159,9 +158,8 @@ def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Rast
     tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
     pooled = draw.noise((16, 16), 4, 0.6)
     raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)
-    return _draw_joints(
-        draw, brighten(raster, tone), boards.edge, draw.pick((0.002, 0.003, 0.005)), _draw_grout_color(draw)
-    )
+    width, grout = draw.pick((0.002, 0.003, 0.005)), _draw_grout_color(draw)
+    return _draw_joints(draw, brighten(raster, tone), boards.edge, width, grout)
 
 
 def _draw_joints(draw: TextureSampler, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:

@@ -67,9 +67,8 @@ def draw_herringbone_parquet(draw: TextureSampler) -> Raster:
 def draw_veneer(draw: TextureSampler) -> Raster:
     """Draw wide leaves of one stem, side by side, as on the top of a good table."""
     down = draw.whole(1, 3)
-    raster = _draw_boards(
-        draw, lay_rows(draw.size, down, 1, draw.rng.random(down)), seam=0.0, tones=0.05, rings=26.0 / down
-    )
+    leaves = lay_rows(draw.size, down, 1, draw.rng.random(down))
+    raster = _draw_boards(draw, leaves, seam=0.0, tones=0.05, rings=26.0 / down)
     return brighten(raster, 0.05 * draw.noise((5, 2), 2))
 
 
@@ -117,10 +116,8 @@ def draw_strand_board(draw: TextureSampler) -> Raster:
     """Draw pressed flakes of wood (OSB): layers of long cells at several angles, of which the nearest one shows."""
     light, dark = _draw_species(draw, (0, 5, 9, 3, 14, 7))
     fine = draw.choose((10, 14, 18))
-    top, weight = (
-        np.full((draw.size, draw.size), 9.0, dtype=np.float32),
-        np.zeros((draw.size, draw.size), dtype=np.float32),
-    )
+    top = np.full((draw.size, draw.size), 9.0, dtype=np.float32)
+    weight = np.zeros_like(top)
     grain = draw.noise((12, 120), 2)
     index = np.arange(draw.size, dtype=np.int32)
     for slope in (0, 1, -1, 2):
@@ -130,10 +127,8 @@ def draw_strand_board(draw: TextureSampler) -> Raster:
         layer = height[flakes.ids] + 1.4 * flakes.nearest
         value = tone[flakes.ids] + 0.13 * grain + 0.9 * smoothstep(flakes.border, 0.12, 0.0)
         # A shear keeps the square periodic; a transposition turns the flakes upright.
-        layer, value = (
-            gather_wrapped(f, index[None, :], index[:, None] + (slope % 2) * slope * index[None, :])
-            for f in (layer, value)
-        )
+        sheared = index[:, None] + (slope % 2) * slope * index[None, :]
+        layer, value = (gather_wrapped(f, index[None, :], sheared) for f in (layer, value))
         if slope == 2:
             layer, value = layer.T, value.T
         nearer = layer < top

@@ -18,11 +18,7 @@ _MAX_ADDRESSES = 4
 
 
 def parse_url(text: str) -> httpx.URL:
-    """Parse and check an address.
-
-    Raises:
-        InputError: `bad_url`, in words that hold nothing secret of it.
-    """
+    """Parse and check an address, or raise `bad_url` in words that hold nothing secret of it."""
     try:
         url = httpx.URL(text)
     except (httpx.InvalidURL, ValueError, TypeError):

@@ -16,8 +16,7 @@ from tableverse_factory.sources.urls.addresses import parse_url
 from tableverse_factory.sources.urls.fetch import FetchBounds, HostRateLimiter, fetch_bytes, open_connections
 from tableverse_factory.sources.urls.image_store import SUFFIXES, ImageStore
 
-MAX_HOST_FAILURES = 5
-"""Unreachable addresses of a host in a row, after which the rest of them are skipped in this run."""
+MAX_HOST_FAILURES = 5  # Unreachable addresses of a host in a row, after which the rest of them are skipped in this run
 _TASKS_PER_REQUEST = 8
 """Pictures in flight for each request: most of them wait for a slot, or because their server asks to."""
 

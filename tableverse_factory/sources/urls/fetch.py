@@ -19,10 +19,8 @@ from tableverse_factory.sources.urls.addresses import CheckedNetworkBackend, par
 USER_AGENT = f"tableverse-factory/{__version__}"
 MAX_REDIRECTS = 5
 RETRY_POLICY = RetryPolicy(attempts=3, backoff_s=1.0)
-MAX_CONNECT_S = 20.0
-"""For a connection, over all addresses of a host [s]; at most half of the time for the picture."""
-_LOOKUPS = 4
-"""DNS look-ups at a time for each request; abandoned ones still occupy a thread."""
+MAX_CONNECT_S = 20.0  # For a connection, over all addresses of a host [s]; at most half of the time for the picture
+_LOOKUPS = 4  # DNS look-ups at a time for each request; abandoned ones still occupy a thread
 _REDIRECTS = (301, 302, 303, 307, 308)
 _HEADERS = [(b"Accept", b"image/*"), (b"Accept-Encoding", b"identity"), (b"User-Agent", USER_AGENT.encode())]
 

@@ -28,8 +28,7 @@ class Origin:
     licence: str
 
 
-NO_ORIGIN = Origin("", "", "")
-"""Origin of entries from folders: a sidecar may state another."""
+NO_ORIGIN = Origin("", "", "")  # Origin of entries from folders: a sidecar may state another
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,7 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.sources.urls.near_duplicates import find_near_duplicates
 from tableverse_factory.sources.urls.phash import compute_phash
 
-WORKING_SIDE_PX = 512
-"""Longer side at which sharpness is measured: large pictures are shrunk to it, none is enlarged."""
+WORKING_SIDE_PX = 512  # Longer side at which sharpness is measured: large pictures are shrunk to it, none is enlarged
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,21 +65,14 @@ def measure_image(picture: Picture) -> ImageStats:
 def find_rejection(stats: ImageStats, criteria: FilterCriteria) -> tuple[str, str] | None:
     """Find code and detail of the first reason against a picture."""
     short, long = sorted((stats.width, stats.height))
+    pixels = f"{stats.width} x {stats.height} pixels"
     if short < criteria.min_side_px:
-        return (
-            "too_small",
-            f"{stats.width} x {stats.height} pixels: the shorter side has less than {criteria.min_side_px}",
-        )
+        return "too_small", f"{pixels}: the shorter side has less than {criteria.min_side_px}"
     if long > criteria.max_aspect * short:
-        return (
-            "odd_shape",
-            f"{stats.width} x {stats.height} pixels: one side is over {criteria.max_aspect:g} times the other",
-        )
+        return "odd_shape", f"{pixels}: one side is over {criteria.max_aspect:g} times the other"
     if stats.contrast < criteria.min_contrast:
-        return (
-            "uniform",
-            f"its grey varies by {stats.contrast:.1f} of 255 around its mean: less than {criteria.min_contrast:g}",
-        )
+        spread = f"its grey varies by {stats.contrast:.1f} of 255 around its mean"
+        return "uniform", f"{spread}: less than {criteria.min_contrast:g}"
     if stats.sharpness < criteria.min_sharpness:
         return "blurred", f"its sharpness is {stats.sharpness:.4f}: less than {criteria.min_sharpness:g}"
     return None

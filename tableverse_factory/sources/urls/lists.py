@@ -6,7 +6,7 @@ import os
 import posixpath
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -30,6 +30,8 @@ _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
 _MAX_SHOWN_NAMES, _NAME_CHARS = 20, 60
 _BATCH_ROWS = 4096
+
+Row = TypeVar("Row")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +63,7 @@ def is_list(path: str) -> bool:
 
 
 def read_list(path: str) -> UrlList:
-    """Read a list; a row that cannot be used keeps its place and says why.
-
-    Raises:
-        InputError: if the file is no such list, has no column `url`, or is longer than the bounds.
-    """
+    """Read a list; a row that cannot be used keeps its place and says why."""
     name, data = redact_uri(path), read_bytes(path, MAX_LIST_BYTES, "unreadable_list")
     suffix = posixpath.splitext(path)[1].lower()
     try:
@@ -86,8 +84,8 @@ def _parse_csv(name: str, text: str) -> UrlList:
         known = _match_columns(name, header)
         cells = {column: header.index(given) for column, given in known.items()}
         rows = [
-            _make_row({column: _get_cell(line, cell) for column, cell in cells.items()})
-            for line in _limit_rows(name, reader)
+            _make_row({column: line[cell] for column, cell in cells.items() if cell < len(line)})
+            for line in _limit_rows(name, (line for line in reader if line))
         ]
     except csv.Error as error:
         raise InputError(f"{name} is no CSV: {describe_error(error)}", "unreadable_list") from None
@@ -102,30 +100,24 @@ def _check_delimiter(name: str, header: list[str]) -> None:
             raise InputError(f"{name} has {called} between its columns: give commas", "unreadable_list")
 
 
-def _limit_rows(name: str, reader: Iterator[list[str]]) -> Iterator[list[str]]:
-    for number, line in enumerate(line for line in reader if line):
+def _limit_rows(name: str, rows: Iterable[Row]) -> Iterator[Row]:
+    for number, row in enumerate(rows):
         if number == MAX_ROWS:
             raise _too_many_rows_error(name)
-        yield line
-
-
-def _get_cell(line: list[str], cell: int) -> str | None:
-    return line[cell] if cell < len(line) else None
+        yield row
 
 
 def _parse_json_lines(name: str, text: str) -> UrlList:
     rows: list[ListRow] = []
     others: dict[str, None] = {}
-    for number, line in enumerate(line for line in text.split("\n") if line.strip()):
-        if number == MAX_ROWS:
-            raise _too_many_rows_error(name)
+    for number, line in enumerate(_limit_rows(name, (line for line in text.split("\n") if line.strip())), 1):
         try:
-            value = parse_json(line.encode(), f"row {number + 1}", "bad_list_row")
+            value = parse_json(line.encode(), f"row {number}", "bad_list_row")
         except InputError as error:
             rows.append(ListRow("", problem=(error.reason, sanitize_line(str(error), 500))))
             continue
         if not isinstance(value, Mapping):
-            rows.append(ListRow("", problem=("bad_list_row", f"row {number + 1} is no object of names and texts")))
+            rows.append(ListRow("", problem=("bad_list_row", f"row {number} is no object of names and texts")))
             continue
         known = {column: given for given in value if (column := _COLUMN_ALIASES.get(given.strip().lower()))}
         others |= dict.fromkeys(given for given in value if given not in known.values())

@@ -6,15 +6,12 @@ import numpy as np
 
 from tableverse_factory.sources.urls.phash import HASH_BITS
 
-MAX_BITS = 7
-"""Beyond, different scenes look alike; up to it, one of four words differs in at most one bit."""
-
+MAX_BITS = 7  # Beyond, different scenes look alike; up to it, one of four words differs in at most one bit
 _WORDS = 4
 _WORD_BITS = HASH_BITS // _WORDS
 _WORD_SHIFTS = tuple(range(0, HASH_BITS, _WORD_BITS))
 _WORD_MASK = (1 << _WORD_BITS) - 1
-_SCAN_SHARE = 32
-"""A scan of all hashes is cheaper when more than one in this many shares a word."""
+_SCAN_SHARE = 32  # A scan of all hashes is cheaper when more than one in this many shares a word
 
 
 class HashIndex:

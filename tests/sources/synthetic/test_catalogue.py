@@ -106,7 +106,7 @@ def test_containers_and_roles_exist() -> None:
     containers = [name for name in CATEGORIES if specimens(name)[0].cavity is not None]
     assert {"bowl", "mug", "cup", "pan"} <= set(containers)
     assert all(("container" in CATEGORIES[name].roles) == (name in containers) for name in CATEGORIES)
-    assert all(specimens(name)[0].top is not None for name, c in CATEGORIES.items() if c.roles & {"base", "dish"})
+    assert all(specimens(name)[0].top is not None for name, c in CATEGORIES.items() if {*c.roles} & {"base", "dish"})
 
 
 @pytest.mark.parametrize("name", RECIPES)
