@@ -15,6 +15,12 @@ from tableverse_factory.core.errors import ConfigError
 
 MAX_FILE_BYTES = 1024 * 1024
 _MAX_REPR_CHARS = 80
+_BOUNDS = {
+    "exclusiveMinimum": "more than",
+    "minimum": "at least",
+    "exclusiveMaximum": "less than",
+    "maximum": "at most",
+}
 _MAX_PROBLEMS = 4  # Problems with one remedy that are listed
 RUNTIME_SECTIONS = frozenset({"asking"})  # Sections that may change between runs of a build
 _OVERRIDE_PREFIX = "--set: "  # Start of messages about overrides
@@ -130,14 +136,7 @@ def describe_allowed_values(field: Mapping[str, Any]) -> str:
         return "one of " + ", ".join(str(choice) for choice in field["enum"])
     kinds = {"number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "text"}
     words = [kinds.get(field.get("type", ""), {"null": "null"}.get(field.get("type", ""), "a list"))]
-    for bound, word in (
-        ("exclusiveMinimum", "more than"),
-        ("minimum", "at least"),
-        ("exclusiveMaximum", "less than"),
-        ("maximum", "at most"),
-    ):
-        if bound in field:
-            words.append(f"{word} {field[bound]:.15g}")
+    words += [f"{word} {field[bound]:.15g}" for bound, word in _BOUNDS.items() if bound in field]
     return ", ".join(words)
 
 

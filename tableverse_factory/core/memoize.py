@@ -1,8 +1,7 @@
 """In-process memoization of pure functions by the content of their arguments.
 
-The stages of a scene compute the same from equal copies of the same shapes, so results are found by the bytes of the
-arguments. Callers share a result, whose arrays must be read-only. Caches are bounded in bytes, as results differ in
-size by orders of magnitude.
+Callers share a result, whose arrays must be read-only. Caches are bounded in bytes, as results differ in size by orders
+of magnitude.
 """
 
 import sys

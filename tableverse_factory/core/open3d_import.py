@@ -16,9 +16,6 @@ class _StubModule(ModuleType):
 
 
 def stub_plotly() -> None:
-    """Keep Open3D from importing Dash and plotly: half of its import time, an eighth of a stage's.
-
-    For processes of this package only: a caller of the library may want to plot.
-    """
+    """Keep Open3D from importing Dash and plotly, half of its import time, in processes of this package alone."""
     for name in _PLOT_MODULES:
         sys.modules.setdefault(name, _StubModule(name))

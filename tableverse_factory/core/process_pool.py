@@ -5,7 +5,6 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
@@ -45,18 +44,11 @@ def parallel_map(
     context = get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(items)), context, threadpool_limits, (1,)) as pool:
         try:
-            with _ignore_sigint_in_children():
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children ignore Ctrl-C
+            try:
                 results = pool.map(work, items, chunksize=chunk)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             yield from results
         except BrokenProcessPool as error:
             raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
-
-
-@contextmanager
-def _ignore_sigint_in_children() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, which is for the parent."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

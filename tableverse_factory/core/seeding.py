@@ -7,8 +7,7 @@ import numpy as np
 
 def make_rng(run_seed: int, scene_id: str, stage: str) -> np.random.Generator:
     """Make a generator that depends on its three arguments alone, through stable hashes."""
-    words = [_hash_word(scene_id), _hash_word(stage)]
-    return np.random.default_rng(np.random.SeedSequence([run_seed, *words]))
+    return np.random.default_rng(np.random.SeedSequence([run_seed, _hash_word(scene_id), _hash_word(stage)]))
 
 
 def _hash_word(text: str) -> int:

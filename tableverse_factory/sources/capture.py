@@ -92,20 +92,16 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
     depth_scale = _read_number(value, "depth_scale", 1e-7, MAX_DEPTH_SCALE)
     size = (_read_number(value, "width", 1, 1e6), _read_number(value, "height", 1, 1e6))
     if size[0] != width or size[1] != height:
-        raise InputError(
-            f"{CAMERA_NAME} is for {size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}",
-            "bad_intrinsics",
-        )
+        sizes = f"{size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}"
+        raise InputError(f"{CAMERA_NAME} is for {sizes}", "bad_intrinsics")
     return Camera(fx, fy, cx, cy, width, height), depth_scale
 
 
 def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> float:
     number = parse_finite(value.get(key))
     if number is None or not low <= number <= high:
-        raise InputError(
-            f"{CAMERA_NAME}: {key} is {str(value.get(key))[:80]!r}; give a finite number from {low:g} to {high:g}",
-            "bad_intrinsics",
-        )
+        given = f"{key} is {str(value.get(key))[:80]!r}"
+        raise InputError(f"{CAMERA_NAME}: {given}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
     return number
 
 
@@ -114,15 +110,11 @@ def read_depth(folder: str, bounds: ObserveConfig, camera: Camera, depth_scale: 
     data = read_bytes(f"{folder}/{DEPTH_NAME}", bounds.max_file_bytes, "missing_depth")
     image = open_image(data, DEPTH_NAME, bounds, "unreadable_depth")
     if image.mode not in DEPTH_MODES:
-        raise InputError(
-            f"{DEPTH_NAME} has pixels of mode {image.mode!r}; give a 16-bit greyscale PNG", "depth_not_16_bit"
-        )
+        problem = f"{DEPTH_NAME} has pixels of mode {image.mode!r}; give a 16-bit greyscale PNG"
+        raise InputError(problem, "depth_not_16_bit")
     if image.size != (camera.width, camera.height):
-        raise InputError(
-            f"{DEPTH_NAME} is {image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}: "
-            "register the depth to the colour image",
-            "depth_size_differs",
-        )
+        sizes = f"{image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}"
+        raise InputError(f"{DEPTH_NAME} is {sizes}: register the depth to the colour image", "depth_size_differs")
     depth = decode_image(image, DEPTH_NAME, None, "unreadable_depth").astype(np.float32) * np.float32(depth_scale)
     if not depth.any():
         raise InputError(f"{DEPTH_NAME} holds no reading: every pixel is 0", "depth_all_zero")
@@ -161,10 +153,8 @@ def read_id_image(uri: str, bounds: ObserveConfig, camera: Camera) -> IdImage:
     if image.mode not in ("L", "P", *DEPTH_MODES):
         raise InputError(f"{name} has pixels of mode {image.mode!r}; give one channel of 8 or 16 bit", "bad_masks")
     if image.size != (camera.width, camera.height):
-        raise InputError(
-            f"{name} is {image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}",
-            "bad_masks",
-        )
+        sizes = f"{image.size[0]} x {image.size[1]}, the colour image {camera.width} x {camera.height}"
+        raise InputError(f"{name} is {sizes}", "bad_masks")
     return decode_image(image, name, None, "bad_masks").astype(np.int32)  # of a palette, the indices: they are the ids
 
 
@@ -172,9 +162,8 @@ def list_recorded_meshes(folder: str) -> tuple[str, ...]:
     """List the names in `meshes/` that `read_recorded_meshes` may read, sorted; none over HTTP."""
     names = tuple(name for name in list_file_names(f"{folder}/{MESHES_NAME}") if _RECORDED_MESH.fullmatch(name))
     if len(names) > MAX_RECORDED_MESHES:
-        raise InputError(
-            f"{MESHES_NAME}/ holds {len(names)} meshes; at most {MAX_RECORDED_MESHES} are read", "too_many_meshes"
-        )
+        problem = f"{MESHES_NAME}/ holds {len(names)} meshes; at most {MAX_RECORDED_MESHES} are read"
+        raise InputError(problem, "too_many_meshes")
     return names
 
 

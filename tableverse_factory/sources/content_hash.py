@@ -37,11 +37,9 @@ def hash_entry(kind: SceneKind, uri: str, bounds: ObserveConfig, known: dict[str
 def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
     """Compare an entry with the hash in the manifest, if there is one, else raise `content_changed`."""
     if row.content_sha256 and (found := hash_entry(row.kind, row.uri, bounds)) != row.content_sha256:
-        raise InputError(
-            f"its files are not those that the manifest saw (sha256 {found[:12]}, not {row.content_sha256[:12]}): "
-            "make the manifest again",
-            "content_changed",
-        )
+        change = f"sha256 {found[:12]}, not {row.content_sha256[:12]}"
+        problem = f"its files are not those that the manifest saw ({change}): make the manifest again"
+        raise InputError(problem, "content_changed")
 
 
 def find_sidecars(uri: str) -> dict[str, str]:
@@ -74,14 +72,12 @@ def _hash_capture(uri: str, bounds: ObserveConfig) -> str:
 
 def _hash_layout(uri: str, bounds: ObserveConfig, known: dict[str, str]) -> str:
     text = read_bytes(uri, MAX_JSON_BYTES, "bad_layout")
-    meshes = {
-        mesh: resolve_mesh_uri(uri, mesh) for mesh in sorted({item.mesh for item in read_layout_file(uri).objects})
-    }
+    names = sorted({item.mesh for item in read_layout_file(uri).objects})
+    meshes = {mesh: resolve_mesh_uri(uri, mesh) for mesh in names}
     for mesh, where in meshes.items():
         if where not in known:
             data = read_bytes(where, bounds.max_file_bytes, "missing_mesh")
             materials = read_material_files(mesh, data, partial(resolve_mesh_uri, uri), bounds)
-            known[where] = content_hash(
-                data, *(part for name in sorted(materials) for part in (name.encode(), materials[name]))
-            )
+            parts = (part for name in sorted(materials) for part in (name.encode(), materials[name]))
+            known[where] = content_hash(data, *parts)
     return content_hash(text, *(known[where].encode() for where in meshes.values()))

@@ -175,24 +175,16 @@ def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str])
         return
     if folder.hidden:
         ignored["hidden folder"] += folder.hidden
-    in_assets = _holds_assets(folder)
-    cameras = _find_image_cameras(folder)
+    named = any(part.lower() in ASSET_FOLDERS for part in folder.uri.split("/")[-2:])
+    in_assets = named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
+    parts = map(posixpath.splitext, folder.files)
+    cameras = {stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES}
     for name in folder.files:
         kind = "camera of a picture" if name in cameras else _classify_file(folder.uri, name, in_assets)
         if isinstance(kind, SceneKind):
             yield _make_entry(kind, posixpath.join(folder.uri, name))
         else:
             ignored[kind] += 1
-
-
-def _holds_assets(folder: _Folder) -> bool:
-    named = any(part.lower() in ASSET_FOLDERS for part in folder.uri.split("/")[-2:])
-    return named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
-
-
-def _find_image_cameras(folder: _Folder) -> frozenset[str]:
-    parts = map(posixpath.splitext, folder.files)
-    return frozenset(stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
@@ -227,7 +219,8 @@ def _looks_like_layout(uri: str) -> bool:
         raise
     except (OSError, ValueError):
         return True  # what cannot be read becomes a row that says so
-    text = _to_utf8(data)
+    encoding = json.detect_encoding(data)  # in UTF-16 or UTF-32, no key would be found by its letters
+    text = data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
     keys = set(_LAYOUT_KEY.findall(text))
     if len(keys) > 1 and keys & {b"objects", b"mesh"}:  # one of them may be written wrong
         return True
@@ -239,12 +232,6 @@ def _looks_like_layout(uri: str) -> bool:
         return True
     # Of a method that found nothing.
     return isinstance(value, dict) and value.get("objects") == [] and value.keys() <= Layout.model_fields.keys()
-
-
-def _to_utf8(data: bytes) -> bytes:
-    """JSON may be in UTF-16 or UTF-32 too, where no key would be found by its letters."""
-    encoding = json.detect_encoding(data)
-    return data if encoding.startswith("utf-8") else data.decode(encoding, "replace").encode("utf-8", "replace")
 
 
 def _make_entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = None) -> ManifestEntry:

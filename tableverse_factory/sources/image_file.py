@@ -23,7 +23,6 @@ _TRANSPOSE_BY_ORIENTATION = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""Transposes that undo each value of the tag."""
 
 
 def read_image(uri: str, bounds: ObserveConfig) -> Picture:
@@ -43,16 +42,13 @@ def decode_upright(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
     if frames > 1 and image.format != "MPO":  # phones put a preview or a depth behind the photo: its first frame counts
         raise InputError(f"{name} has {frames} frames: give one picture", "animated_picture")
     if image.mode not in _MODES:
-        raise InputError(
-            f"{name} has pixels of mode {image.mode!r}: give 8-bit colour or grey (sRGB)", "unsupported_pixels"
-        )
+        problem = f"{name} has pixels of mode {image.mode!r}: give 8-bit colour or grey (sRGB)"
+        raise InputError(problem, "unsupported_pixels")
     if image.has_transparency_data:
         alpha = decode_image(image, name, "RGBA", "unreadable_color")[..., 3]
         if (alpha < 255).any():
-            raise InputError(
-                f"{name} is transparent in {(alpha < 255).mean():.0%} of its pixels: a photo has no holes",
-                "transparent_picture",
-            )
+            share = f"{(alpha < 255).mean():.0%} of its pixels"
+            raise InputError(f"{name} is transparent in {share}: a photo has no holes", "transparent_picture")
     decode_image(image, name, None, "unreadable_color")  # before its EXIF, which may stand behind the pixels
     turned = _TRANSPOSE_BY_ORIENTATION.get(_read_orientation(image))
     return decode_image(image if turned is None else image.transpose(turned), name, "RGB", "unreadable_color")

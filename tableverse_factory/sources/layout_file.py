@@ -35,10 +35,8 @@ def resolve_mesh_uri(layout_uri: str, mesh: str) -> str:
     up = posixpath.normpath(mesh)
     climbs = up.startswith("../../") or up in ("..", "../..")
     if posixpath.isabs(mesh) or "\\" in mesh or "://" in mesh or "::" in mesh or "\0" in mesh or climbs:
-        raise InputError(
-            f"mesh {mesh[:200]!r}: give a relative path with '/' that stays within the parent of the layout's folder",
-            "bad_mesh_path",
-        )
+        remedy = "give a relative path with '/' that stays within the parent of the layout's folder"
+        raise InputError(f"mesh {mesh[:200]!r}: {remedy}", "bad_mesh_path")
     filesystem, path = resolve_filesystem(layout_uri)
     target = posixpath.normpath(posixpath.join(posixpath.dirname(path), up))
     if isinstance(filesystem, LocalFileSystem):

@@ -29,10 +29,7 @@ _SLUG_CHARS = 40
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Rows, and how many files and columns were ignored, by kind.
-
-    The rows of what lies in folders come first, in the order of their uris; then those of lists, in the lists' order.
-    """
+    """Rows of folders by uri, then of lists in their order, and numbers of ignored files and columns by kind."""
 
     rows: tuple[ImageRow, ...]
     ignored: dict[str, int]
@@ -156,7 +153,11 @@ class _EntryChecker:
         for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
             uri = resolve_mesh_uri(entry.uri, mesh)
             if uri not in self.refused:
-                self.refused[uri] = _find_mesh_problem(uri, self.bounds)
+                try:
+                    read_mesh(read_bytes(uri, self.bounds.max_file_bytes, "missing_mesh"), uri)
+                    self.refused[uri] = ""
+                except GeometryError as error:
+                    self.refused[uri] = str(error)
             if self.refused[uri]:
                 raise InputError(self.refused[uri], "bad_mesh")
         return None
@@ -166,14 +167,6 @@ def _make_scene_id(entry: ManifestEntry, digest: str) -> str:
     stem = entry.name if entry.kind is SceneKind.CAPTURE else entry.name.rpartition(".")[0] or entry.name
     slug = re.sub(r"[^A-Za-z0-9_]+", "-", stem)[:_SLUG_CHARS].strip("-_")
     return f"{slug or entry.kind.value}-{digest[:12]}"
-
-
-def _find_mesh_problem(uri: str, bounds: ObserveConfig) -> str:
-    try:
-        read_mesh(read_bytes(uri, bounds.max_file_bytes, "missing_mesh"), uri)
-    except GeometryError as error:
-        return str(error)
-    return ""
 
 
 def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:

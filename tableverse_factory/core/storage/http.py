@@ -165,11 +165,8 @@ def _check_range(response: httpx.Response, start: int, stop: int, address: str) 
         length = response.headers.get("content-length", "")
         if start == 0 and length.isdecimal() and int(length) <= stop:
             return int(length)  # all of a small file
-        raise _error(
-            address,
-            "the server does not serve ranges of bytes: put the dataset behind one that does, such as nginx, S3 or the "
-            "Hub",
-        )
+        remedy = "put the dataset behind one that does, such as nginx, S3 or the Hub"
+        raise _error(address, f"the server does not serve ranges of bytes: {remedy}")
     found = _RANGE.fullmatch(header)
     if found is None or (int(found[1]), int(found[2])) != (start, min(stop, int(found[3])) - 1):
         given = sanitize_line(header, 80) or "no Content-Range"

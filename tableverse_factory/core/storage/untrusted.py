@@ -118,9 +118,8 @@ def read_bytes(uri: str, max_bytes: int, reason: str) -> bytes:
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{redact_uri(uri)!r} cannot be read: {describe_error(error)}"[:500], reason) from error
     if len(data) > max_bytes:
-        raise InputError(
-            f"{redact_uri(uri)!r} is longer than {max_bytes} bytes, the most that is read", "file_too_large"
-        )
+        problem = f"{redact_uri(uri)!r} is longer than {max_bytes} bytes, the most that is read"
+        raise InputError(problem, "file_too_large")
     return data
 
 
@@ -170,11 +169,8 @@ def open_image(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Im
         raise InputError(f"{name} is no picture: {describe_error(error)}"[:500], reason) from error
     width, height = image.size
     if width * height > bounds.max_pixels:
-        raise InputError(
-            f"{name} is {width} x {height} = {width * height} pixels; at most {bounds.max_pixels} "
-            "(observe.max_pixels) are decoded",
-            "picture_too_large",
-        )
+        limit = f"at most {bounds.max_pixels} (observe.max_pixels) are decoded"
+        raise InputError(f"{name} is {width} x {height} = {width * height} pixels; {limit}", "picture_too_large")
     if width < 1 or height < 1:
         raise InputError(f"{name} is {width} x {height} pixels: it has no content", reason)
     return image

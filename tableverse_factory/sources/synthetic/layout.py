@@ -71,23 +71,13 @@ def encode_layout(scene_id: str, seed: int, origin: dict[str, Any]) -> dict[str,
         mesh = f"{MESHES}/{scene_id}_{name}.obj"
         files[mesh] = encode_obj(scale_and_quantize(item.model.mesh, 1.0))
         pose, scale = perturb_pose(item, rng)
-        entry = {
-            "id": name,
-            "label": item.model.label,
-            "mesh": f"../{mesh}",
-            "scale": scale,
-            "pose": _pose_to_json(pose),
-        }
+        entry: dict[str, Any] = {"id": name, "label": item.model.label, "mesh": f"../{mesh}"}
+        entry |= {"scale": scale, "pose": _pose_to_json(pose)}
         objects.append(entry if holder is None else entry | {"contained_in": make_object_id(holder)})
         truth[name] = {**_pose_to_json(item.pose), "scale": 1.0}
-    layout = {
-        "scene_id": scene_id,
-        "frame": "table: z up, table plane z=0, metres",
-        "origin": origin,
-        "objects": objects,
-    }
+    layout = {"scene_id": scene_id, "frame": "table: z up, table plane z=0, metres", "origin": origin}
     files[f"{TRUTH}/{scene_id}.json"] = _encode_json(truth)
-    files[f"{LAYOUTS}/{scene_id}.json"] = _encode_json(layout)
+    files[f"{LAYOUTS}/{scene_id}.json"] = _encode_json({**layout, "objects": objects})
     return files
 
 

@@ -95,8 +95,8 @@ def put_utensils_in(rng: np.random.Generator) -> list[PlacedModel]:
         # The utensil's +x end is its head: stood on it, or with the head up.
         rotation = multiply_quaternions(upward, _make_rotation((0.0, 1.0, 0.0), np.pi / 2 if head_down else -np.pi / 2))
         axis = transform_points(Pose(np.zeros(3), rotation), np.array([[-half if head_down else half, 0.0, 0.0]]))[0]
-        placed = stand_on(model, rotation, toward * (foot + float(axis @ toward)) + [0.0, 0.0, cavity.floor])
-        group.append(placed)
+        place = toward * (foot + float(axis @ toward)) + [0.0, 0.0, cavity.floor]
+        group.append(stand_on(model, rotation, place))
     return group
 
 
@@ -108,12 +108,10 @@ def lean_on_prop(rng: np.random.Generator) -> list[PlacedModel]:
         slope = rng.uniform(0.2, 0.45)
         reach = extents.max() * np.cos(slope)
         height = np.ptp(prop.mesh.vertices[:, 2])
-        heavy_enough = prop.mass_kg > 0.5 * leaner.mass_kg
-        if not (0.55 * reach < height and heavy_enough):
+        if not (0.55 * reach < height and prop.mass_kg > 0.5 * leaner.mass_kg):
             continue
         upright = multiply_quaternions(_make_rotation((1.0, 0.0, 0.0), -slope), _turn_on_edge(extents))
-        back = stand_on(prop, _UPRIGHT)
-        front = stand_on(leaner, upright)
+        back, front = stand_on(prop, _UPRIGHT), stand_on(leaner, upright)
         near = -back.vertices()[:, 1].min() + front.vertices()[:, 1].max() + GAP_M
         aside = rng.uniform(-0.25, 0.25) * np.ptp(back.vertices()[:, 0])
         return [back, stand_on(leaner, upright, np.array([aside, -near, 0.0]))]

@@ -74,9 +74,8 @@ def make_scene(seed: int, scene_id: str) -> SyntheticScene:
     sensor = make_sensor(rng)
     shininess = np.array([*(item.model.shiny for item in placed), 0.0])
     ids = np.where(rendering.ids < len(objects), rendering.ids, -1)
-    depth = sense_depth(
-        rng, sensor, camera, rendering.depth, _compute_facing(rendering, camera, camera_to_table), shininess[ids]
-    )
+    facing = _compute_facing(rendering, camera, camera_to_table)
+    depth = sense_depth(rng, sensor, camera, rendering.depth, facing, shininess[ids])
     seen, fractions = _measure_visibility(ids, objects, camera, camera_to_table)
     holders = [find_container(index, placed) for index in range(len(placed))]
     return SyntheticScene(
@@ -139,10 +138,8 @@ def _compute_facing(rendering: Rendering, camera: Camera, camera_to_table: Pose)
     """Compute the cosine between normal and line of sight at each pixel. Shape (h, w)."""
     v, u = np.indices(rendering.depth.shape, dtype=np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    normals = transform_points(
-        Pose(np.zeros(3), invert_pose(camera_to_table).quaternion_wxyz),
-        rendering.normals.reshape(-1, 3).astype(np.float64),
-    )
+    rotation = Pose(np.zeros(3), invert_pose(camera_to_table).quaternion_wxyz)
+    normals = transform_points(rotation, rendering.normals.reshape(-1, 3).astype(np.float64))
     facing: np.ndarray = np.abs(np.einsum("ij,ij->i", rays.reshape(-1, 3), normals)).reshape(v.shape)
     facing /= np.linalg.norm(rays, axis=-1)
     return facing
@@ -155,14 +152,8 @@ def _measure_visibility(
 
     What the edge of the picture cuts off counts as hidden.
     """
-    wide = Camera(
-        camera.fx / SUBSAMPLING,
-        camera.fy / SUBSAMPLING,
-        camera.cx / SUBSAMPLING + camera.width / 4,
-        camera.cy / SUBSAMPLING + camera.height / 4,
-        camera.width,
-        camera.height,
-    )
+    fx, fy, cx, cy = (value / SUBSAMPLING for value in (camera.fx, camera.fy, camera.cx, camera.cy))
+    wide = Camera(fx, fy, cx + camera.width / 4, cy + camera.height / 4, camera.width, camera.height)
     _, parts = Raycaster(objects).covered(wide, camera_to_table)
     alone = np.bincount(parts, minlength=len(objects)) * float(SUBSAMPLING**2)
     seen = np.bincount(ids[(ids >= 0) & (ids < len(objects))], minlength=len(objects))

@@ -12,6 +12,8 @@ from scipy.ndimage import binary_dilation, gaussian_filter, maximum_filter, mini
 
 from schemas.geometry import Camera, DepthImage, Picture
 
+Plane = Float64[np.ndarray, "h w"]
+
 FARTHEST_M = 4.0
 
 
@@ -54,24 +56,17 @@ def make_sensor(rng: np.random.Generator) -> DepthSensor:
 
 
 def sense_depth(
-    rng: np.random.Generator,
-    sensor: DepthSensor,
-    camera: Camera,
-    truth: DepthImage,
-    facing: Float64[np.ndarray, "h w"],
-    shiny: Float64[np.ndarray, "h w"],
+    rng: np.random.Generator, sensor: DepthSensor, camera: Camera, truth: DepthImage, facing: Plane, shiny: Plane
 ) -> UInt16[np.ndarray, "h w"]:
     """Simulate the depth image of a sensor, 0 where it has no reading, from the true depth [m], 0 for none.
 
     `facing` is the cosine between normal and line of sight; `shiny` is 0 for matt to 1 for polished.
     """
     readable = (truth > 0.0) & (truth < FARTHEST_M)
-    rows, columns = (
-        np.clip(
-            np.rint(index + _make_correlated_noise(rng, truth.shape, 1.2) * sensor.wobble).astype(np.intp), 0, size - 1
-        )
-        for index, size in zip(np.indices(truth.shape), truth.shape, strict=True)
+    moved = (
+        np.rint(i + _make_correlated_noise(rng, truth.shape, 1.2) * sensor.wobble) for i in np.indices(truth.shape)
     )
+    rows, columns = (np.clip(m.astype(np.intp), 0, size - 1) for m, size in zip(moved, truth.shape, strict=True))
     depth = np.where(readable, truth, FARTHEST_M).astype(np.float64)[rows, columns]
     readable &= readable[rows, columns]
     per_metre = camera.fx * sensor.baseline_m
@@ -94,24 +89,17 @@ def sense_color(rng: np.random.Generator, picture: Picture) -> Picture:
     return np.clip(np.rint(picture * gains * vignette[..., None] + grain), 0, 255).astype(np.uint8)
 
 
-def _find_shadows(disparity: Float64[np.ndarray, "h w"]) -> np.ndarray:
+def _find_shadows(disparity: Plane) -> np.ndarray:
     """Find pixels that a nearer surface hides from the projector.
 
     Seen from the projector, to the left, a point at column u stands at column u + disparity: in the camera's order
     from left to right these columns grow, except where a nearer surface has been passed.
     """
     columns = np.arange(disparity.shape[1]) + disparity
-    reached = np.maximum.accumulate(columns, axis=1)
-    return columns < reached - 0.75
+    return columns < np.maximum.accumulate(columns, axis=1) - 0.75
 
 
-def _find_holes(
-    rng: np.random.Generator,
-    sensor: DepthSensor,
-    depth: Float64[np.ndarray, "h w"],
-    facing: np.ndarray,
-    shiny: np.ndarray,
-) -> np.ndarray:
+def _find_holes(rng: np.random.Generator, sensor: DepthSensor, depth: Plane, facing: Plane, shiny: Plane) -> np.ndarray:
     """Find pixels without a reading: grazing surfaces, depth edges, polished metal, and random dropout."""
     shape = depth.shape
     grazing = rng.random(shape) > 1.0 / (1.0 + np.exp(-(facing - 0.16) / 0.035))
@@ -119,14 +107,11 @@ def _find_holes(
     edge &= rng.random(shape) < 0.55
     # Patches of a shiny surface mirror the projector away; their size is that of the correlation window.
     glare = _make_correlated_noise(rng, shape, 5.0) > 2.6 - 2.1 * shiny
-    seeds = rng.random(shape) < sensor.dropout / 40.0
-    blots = binary_dilation(seeds, iterations=3)
+    blots = binary_dilation(rng.random(shape) < sensor.dropout / 40.0, iterations=3)
     return grazing | edge | (glare & (shiny > 0.05)) | blots | (rng.random(shape) < sensor.dropout / 2)
 
 
-def _make_correlated_noise(
-    rng: np.random.Generator, shape: tuple[int, ...], radius: float
-) -> Float64[np.ndarray, "h w"]:
+def _make_correlated_noise(rng: np.random.Generator, shape: tuple[int, ...], radius: float) -> Plane:
     """Make noise of unit variance, correlated over `radius` pixels."""
     smooth = gaussian_filter(rng.standard_normal(shape), radius, mode="wrap")
     return smooth / smooth.std()

@@ -105,14 +105,12 @@ def make_loft(rings: Rings, stride: int = 1) -> Solid:
     index = np.arange(count * around).reshape(count, around)
     a, b = index[:-1], index[1:]
     a_next, b_next = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
-    sides = np.concatenate(
-        [np.stack([a, a_next, b_next], -1).reshape(-1, 3), np.stack([a, b_next, b], -1).reshape(-1, 3)]
-    )
+    sides = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, a_next, b_next), (a, b_next, b))]
     first, last = count * around, count * around + 1
     bottom = np.stack([np.full(around, first), np.roll(index[0], -1), index[0]], axis=-1)
     top = np.stack([np.full(around, last), index[-1], np.roll(index[-1], -1)], axis=-1)
     vertices = np.vstack([rings.reshape(-1, 3), rings[0].mean(axis=0), rings[-1].mean(axis=0)])
-    faces = np.concatenate([sides, bottom, top])
+    faces = np.concatenate([*sides, bottom, top])
     manifold = Manifold(Mesh64(vertices, faces.astype(np.uint64)))
     if manifold.volume() < 0.0:
         manifold = Manifold(Mesh64(vertices, faces[:, ::-1].astype(np.uint64)))
@@ -133,11 +131,8 @@ def make_tube(
     v = np.cross(tangents, u)
     angles = 2 * np.pi * (np.arange(around) + 0.5) / around
     circle_u, circle_v = np.cos(angles)[None, :, None], np.sin(angles)[None, :, None]
-    return (
-        centers[:, None]
-        + radii_uv[:, 0, None, None] * circle_u * u
-        + radii_uv[:, 1, None, None] * circle_v * v[:, None]
-    )
+    along_u, along_v = radii_uv[:, 0, None, None] * circle_u * u, radii_uv[:, 1, None, None] * circle_v * v[:, None]
+    return centers[:, None] + along_u + along_v
 
 
 def _revolve_outline(outline: Profile) -> Manifold:
@@ -151,10 +146,8 @@ def _revolve_profile(profile: Profile) -> Points:
 
 def _revolve_points(section: Profile, angles: np.ndarray) -> Points:
     radius, height = section[:, :1], section[:, 1:]
-    points = np.stack(
-        [radius * np.cos(angles), radius * np.sin(angles), np.broadcast_to(height, (len(section), len(angles)))], -1
-    )
-    return points.reshape(-1, 3)
+    z = np.broadcast_to(height, (len(section), len(angles)))
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), z], -1).reshape(-1, 3)
 
 
 def _find_convex_runs(profile: Profile) -> list[tuple[int, int]]:

@@ -1,6 +1,5 @@
 """Surroundings of a synthetic scene: table, floor, wall, light and viewpoint."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +8,7 @@ from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, quaternion_about_z, transform_points
 from tableverse_factory.physics.render.render import Lighting, Pattern, look_at
-from tableverse_factory.sources.synthetic.colors import Color, pick_color
+from tableverse_factory.sources.synthetic.colors import pick_color
 from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
 from tableverse_factory.sources.synthetic.solids import make_block
 from tableverse_factory.sources.synthetic.textures import fill_color, tile_picture
@@ -48,12 +47,9 @@ def make_table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Studio
 
 def make_room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurface]:
     """Make the floor, and often a wall behind the table as the camera sees it."""
-    ground = parse_texture_seed(
-        f"{FLOORS[int(rng.integers(len(FLOORS)))]}-{int(rng.integers(TEXTURE_COUNT // len(FAMILIES)))}"
-    )
-    floor = _make_quad(
-        np.array([[-3.0, -3.0, FLOOR_M], [3.0, -3.0, FLOOR_M], [3.0, 3.0, FLOOR_M], [-3.0, 3.0, FLOOR_M]])
-    )
+    family = FLOORS[int(rng.integers(len(FLOORS)))]
+    ground = parse_texture_seed(f"{family}-{int(rng.integers(TEXTURE_COUNT // len(FAMILIES)))}")
+    floor = _make_quad(np.array([[x, y, FLOOR_M] for x, y in ((-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0))]))
     surfaces = [StudioSurface(floor, tile_picture(make_texture(ground, TILE_PX), FLOOR_TILE_M))]
     if rng.random() < 0.65:
         away = np.array([np.cos(view_azimuth), np.sin(view_azimuth), 0.0])
@@ -61,8 +57,9 @@ def make_room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurfa
         foot = away * rng.uniform(1.0, 2.2) + [0.0, 0.0, FLOOR_M]
         tall = np.array([0.0, 0.0, 2.6])
         corners = np.array([foot + 3 * side, foot - 3 * side, foot - 3 * side + tall, foot + 3 * side + tall])
-        paint = _pick_muted_color(rng, ("white", "cream", "beige", "grey", "light blue", "olive"))
-        surfaces.append(StudioSurface(_make_quad(corners), fill_color(paint)))
+        _, color = pick_color(rng, ("white", "cream", "beige", "grey", "light blue", "olive"))
+        grey = color.mean()
+        surfaces.append(StudioSurface(_make_quad(corners), fill_color(grey + 0.7 * (color - grey))))
     return surfaces
 
 
@@ -114,12 +111,6 @@ def _is_in_view(camera: Camera, camera_to_table: Pose, points: Points) -> bool:
     pixels = project(transform_points(invert_pose(camera_to_table), points), camera)
     inside = (pixels > MARGIN_PX) & (pixels < np.array([camera.width, camera.height]) - MARGIN_PX)
     return bool(inside.all())
-
-
-def _pick_muted_color(rng: np.random.Generator, names: Sequence[str]) -> Color:
-    _, color = pick_color(rng, tuple(names))
-    grey = color.mean()
-    return grey + 0.7 * (color - grey)
 
 
 def _make_quad(corners: Points) -> TriangleMesh:

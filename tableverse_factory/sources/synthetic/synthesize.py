@@ -13,8 +13,8 @@ from tableverse_factory.sources.synthetic.scene import SyntheticScene, make_scen
 
 GENERATOR = "tableverse-synth-1"  # Changes whenever the same seed no longer gives the same bytes
 MAX_SCENES = 1_000_000
-_FOLDER_NAME = re.compile(r"synth_\d{6}")
 _PARTIAL = ".partial"
+_OWN_NAME = re.compile(rf"synth_\d{{6}}|\.?synth_\d{{6}}{re.escape(_PARTIAL)}")
 
 
 def synthesize_captures(
@@ -25,7 +25,7 @@ def synthesize_captures(
     Scene k has the same bytes whatever the number of scenes.
     """
     check_numbers(scenes, seed)
-    check_output_folder(out, _is_own_folder)
+    check_output_folder(out, lambda path: path.is_dir() and _OWN_NAME.fullmatch(path.name) is not None)
     out.mkdir(parents=True, exist_ok=True)
     folders = []
     for index in range(scenes):
@@ -85,8 +85,3 @@ def _write_capture(scene: SyntheticScene, origin: dict[str, Any], folder: Path) 
     partial.mkdir()
     write_files(encode_capture(scene, origin), partial)
     partial.rename(folder)
-
-
-def _is_own_folder(path: Path) -> bool:
-    name = path.name.removeprefix(".").removesuffix(_PARTIAL) if path.name.endswith(_PARTIAL) else path.name
-    return path.is_dir() and _FOLDER_NAME.fullmatch(name) is not None

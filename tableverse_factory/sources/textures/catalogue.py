@@ -95,14 +95,9 @@ def make_texture(seed: int, size: int = 512) -> Picture:
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise InputError(f"a texture of {size} px: give {MIN_SIZE} to {MAX_SIZE}")
     family, number = _split_seed(seed)
-    seed = int(seed)
-    number = _NUMBERS.get(seed, number)
-    draw = TextureSampler(
-        np.random.default_rng(np.random.SeedSequence([seed % len(FAMILIES), number])),
-        number,
-        size,
-        start=0.618034 * (seed % len(FAMILIES)),
-    )
+    index, number = int(seed) % len(FAMILIES), _NUMBERS.get(int(seed), number)
+    rng = np.random.default_rng(np.random.SeedSequence([index, number]))
+    draw = TextureSampler(rng, number, size, start=0.618034 * index)
     return np.rint(np.clip(FAMILIES[family](draw), 0, 255)).astype(np.uint8)
 
 

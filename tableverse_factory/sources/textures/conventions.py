@@ -65,8 +65,5 @@ def parse_category(asset: str) -> str:
 
 
 def find_source(folder: str) -> str:
-    """Find the source that a folder is named after, exactly; empty if there is none.
-
-    `not-ambientCG` and `ambientCG_edited` name the same site and may hold anything.
-    """
+    """Find the source that a folder is named after; empty if the name adds anything, as `ambientCG_edited` does."""
     return _SOURCES.get(re.sub(r"[\s_\-]", "", folder.lower()), "")

@@ -57,9 +57,8 @@ class TextureLibrary:
         if not path.is_relative_to(self.root.resolve()):
             raise InputError(f"{sanitize_line(file)} lies outside {sanitize_line(str(self.root))}", "unreadable_map")
         data = read_bytes(str(path), LARGE_IMAGE_BOUNDS.max_file_bytes, "unreadable_map")
-        picture = decode_image(
-            open_image(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map"), file, "RGB", "unreadable_map"
-        )
+        image = open_image(data, file, LARGE_IMAGE_BOUNDS, "unreadable_map")
+        picture = decode_image(image, file, "RGB", "unreadable_map")
         share = most_px / max(picture.shape[:2])
         if share < 1.0:
             size = tuple(max(1, round(side * share)) for side in picture.shape[1::-1])

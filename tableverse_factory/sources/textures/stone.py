@@ -37,7 +37,8 @@ MARBLES: tuple[tuple[str, str, str], ...] = (
 
 def draw_marble(draw: TextureSampler) -> Raster:
     """Draw clouds, a few strong veins, many hair-fine ones."""
-    ground, cloud, vein = _draw_colors(draw, MARBLES)
+    tint = 0.88 + 0.22 * draw.spread(1)
+    ground, cloud, vein = (draw.near(scale_color(parse_hex(c), tint), 10) for c in draw.choose(MARBLES, 0))
     warp = draw.noise((2, 2), 5, 0.55)
     coarse = draw.choose((2, 3, 4))
     clouds = draw.noise((coarse, coarse), 5, 0.55)
@@ -157,8 +158,3 @@ def draw_concrete(draw: TextureSampler) -> Raster:
 def _draw_cracks(draw: TextureSampler) -> Field:
     path = draw.noise((2, 2), 6, 0.6)
     return bell(path, 0.008) * smoothstep(draw.noise((2, 2), 2), 0.0, 0.8)
-
-
-def _draw_colors(draw: TextureSampler, palettes: Sequence[tuple[str, ...]]) -> list[Color]:
-    tint = 0.88 + 0.22 * draw.spread(1)
-    return [draw.near(scale_color(parse_hex(c), tint), 10) for c in palettes[int(len(palettes) * draw.spread(0))]]

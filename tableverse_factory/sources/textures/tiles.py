@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from tableverse_factory.sources.textures.boards import BoardLayout, lay_rows
+from tableverse_factory.sources.textures.boards import lay_rows
 from tableverse_factory.sources.textures.draw import TextureSampler, map_shades, oklch, parse_hex, scale_color
 from tableverse_factory.sources.textures.fields import (
     Color,
@@ -27,7 +27,12 @@ def draw_glazed_tiles(draw: TextureSampler, layouts: Sequence[tuple[int, int]], 
     """
     down, right = draw.choose(layouts)
     step = draw.pick(steps) if steps else 0.0
-    return _draw_glazed(draw, lay_rows(draw.size, down, right, np.arange(down) * step % 1), _draw_glaze_color(draw))
+    boards, base = lay_rows(draw.size, down, right, np.arange(down) * step % 1), _draw_glaze_color(draw)
+    tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
+    pooled = draw.noise((16, 16), 4, 0.6)
+    raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)
+    width, grout = draw.pick((0.002, 0.003, 0.005)), _draw_grout_color(draw)
+    return _draw_joints(draw, brighten(raster, tone), boards.edge, width, grout)
 
 
 def draw_stone_slabs(draw: TextureSampler) -> Raster:
@@ -152,14 +157,6 @@ def _draw_glaze_color(draw: TextureSampler, shift: int = 0) -> Color:
 
 def _draw_grout_color(draw: TextureSampler) -> Color:
     return draw.near(parse_hex(draw.pick(("e8e4dc", "c9c4ba", "8f8a82", "4a4744", "f3f1ec"))), 8)
-
-
-def _draw_glazed(draw: TextureSampler, boards: BoardLayout, base: Color) -> Raster:
-    tone = draw.each(boards.count, draw.pick((0.02, 0.06, 0.14)))[boards.ids]
-    pooled = draw.noise((16, 16), 4, 0.6)
-    raster = map_shades(0.5 + draw.between(0.03, 0.2) * pooled, base, 0.78, 1.14)
-    width, grout = draw.pick((0.002, 0.003, 0.005)), _draw_grout_color(draw)
-    return _draw_joints(draw, brighten(raster, tone), boards.edge, width, grout)
 
 
 def _draw_joints(draw: TextureSampler, raster: Raster, edge: Field, width: float, grout: Color) -> Raster:

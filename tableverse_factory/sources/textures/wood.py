@@ -161,7 +161,11 @@ def _make_grain(draw: TextureSampler, boards: BoardLayout, frequency: float) -> 
     """Make late wood of rings, 0–1, and fibres: a plain-sawn board cuts its stem's rings at √(y² + h(x)²)."""
     bend, fine = draw.noise((2, 3), 3), _make_fibres(draw)
     pores = smoothstep(draw.noise((24, 200), 1), 1.0, 2.0)
-    right, down = _find_offsets(draw, boards)
+    index = np.arange(draw.size, dtype=np.int32)
+    offset = draw.rng.integers(0, draw.size, (2, boards.count), dtype=np.int32)
+    # The fields' grain runs to the right; each board looks into another place of them.
+    right = np.where(boards.upright, index[:, None], index[None, :]) + offset[0][boards.ids]
+    down = np.where(boards.upright, index[None, :], index[:, None]) + offset[1][boards.ids]
     bend, fine, pores = (gather_wrapped(field, right, down) for field in (bend, fine, pores))
     middle = draw.each(boards.count, 1.3)[boards.ids] + 0.12 * bend
     y = 2 * boards.across - 1 - middle
@@ -170,15 +174,6 @@ def _make_grain(draw: TextureSampler, boards: BoardLayout, frequency: float) -> 
     turns = take_fraction(distance * np.float32(frequency) + 0.06 * fine)
     rings = smoothstep(turns, 0.0, 0.9) * smoothstep(turns, 1.0, 0.92)
     return rings, fine + 1.6 * pores
-
-
-def _find_offsets(draw: TextureSampler, boards: BoardLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Find where each pixel looks into fields whose grain runs to the right, shifted for each board."""
-    index = np.arange(draw.size, dtype=np.int32)
-    offset = draw.rng.integers(0, draw.size, (2, boards.count), dtype=np.int32)
-    right = np.where(boards.upright, index[:, None], index[None, :]) + offset[0][boards.ids]
-    down = np.where(boards.upright, index[None, :], index[:, None]) + offset[1][boards.ids]
-    return right, down
 
 
 def _draw_patch(draw: TextureSampler, raster: Raster, color: Color) -> Raster:

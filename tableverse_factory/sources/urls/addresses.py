@@ -91,10 +91,8 @@ class CheckedNetworkBackend(httpcore.AsyncNetworkBackend):
             for address in addresses:
                 if classify_address(address) != "public":
                     named = sanitize_line(host) if host == address else f"{sanitize_line(host)} is {address}, which"
-                    raise InputError(
-                        f"{named} is no address of the internet: --allow-private lets lists reach into this network",
-                        "private_address",
-                    )
+                    remedy = "--allow-private lets lists reach into this network"
+                    raise InputError(f"{named} is no address of the internet: {remedy}", "private_address")
         return addresses
 
     async def sleep(self, seconds: float) -> None:

@@ -154,9 +154,8 @@ async def _read_body(answer: httpcore.Response, max_bytes: int) -> bytes:
         raise InputError(f"the server answers {answer.status}", "http_error")
     coding = _get_header(answer, b"content-encoding")
     if coding.lower() not in ("", "identity"):
-        raise InputError(
-            f"the answer is packed ({sanitize_line(coding, 20)}), which was not asked for", "compressed_answer"
-        )
+        problem = f"the answer is packed ({sanitize_line(coding, 20)}), which was not asked for"
+        raise InputError(problem, "compressed_answer")
     length = _get_header(answer, b"content-length")
     too_large = InputError(f"it is longer than {max_bytes} bytes, the most that is fetched", "file_too_large")
     if length.isdecimal() and int(length[:20]) > max_bytes:

@@ -87,18 +87,15 @@ def filter_rows(
     if criteria.near_bits < 0:
         return tuple(checked)
     candidates = [stats[checked[number].scene_id] for number in remaining]
-    ranks = [_rank(checked[number], seen) for number, seen in zip(remaining, candidates, strict=True)]
+    # Among equally large pictures, a known licence wins.
+    licensed = [bool(checked[number].licence) for number in remaining]
+    ranks = [2 * seen.width * seen.height + known for seen, known in zip(candidates, licensed, strict=True)]
     duplicates = find_near_duplicates([seen.phash for seen in candidates], ranks, criteria.near_bits)
     for number, (kept, bits) in duplicates.items():
         first = checked[remaining[kept]]
         detail = f"{bits} bits from {first.scene_id}, not smaller, at {sanitize_line(first.url or first.uri, 500)}"
         checked[remaining[number]] = _reject(checked[remaining[number]], "near_duplicate_of", detail)
     return tuple(checked)
-
-
-def _rank(row: ImageRow, stats: ImageStats) -> int:
-    """Rank by pixels; among equally large pictures a known licence wins."""
-    return 2 * stats.width * stats.height + bool(row.licence)
 
 
 def _apply_criteria(row: ImageRow, stats: ImageStats | None, criteria: FilterCriteria) -> ImageRow:

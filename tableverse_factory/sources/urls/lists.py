@@ -176,10 +176,8 @@ def _match_columns(name: str, header: list[str]) -> dict[str, str]:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:
         columns = summarize_names(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
-        raise InputError(
-            f"{name} has no column url: it has {columns}; a list has url, and source and licence where they are known",
-            "unreadable_list",
-        )
+        remedy = "a list has url, and source and licence where they are known"
+        raise InputError(f"{name} has no column url: it has {columns}; {remedy}", "unreadable_list")
     return known
 
 
@@ -190,9 +188,8 @@ def _find_other_columns(header: list[str], known: Mapping[str, str]) -> tuple[st
 def summarize_names(names: Iterable[str]) -> str:
     """List the first names, and how many more there are; empty if there are none."""
     every = list(names)
-    return ", ".join(every[:_MAX_SHOWN_NAMES]) + (
-        f" and {len(every) - _MAX_SHOWN_NAMES} more" if len(every) > _MAX_SHOWN_NAMES else ""
-    )
+    more = f" and {len(every) - _MAX_SHOWN_NAMES} more" if len(every) > _MAX_SHOWN_NAMES else ""
+    return ", ".join(every[:_MAX_SHOWN_NAMES]) + more
 
 
 def _make_row(cells: Mapping[str, Any]) -> ListRow:
@@ -201,9 +198,8 @@ def _make_row(cells: Mapping[str, Any]) -> ListRow:
     for column, value in cells.items():
         text = "" if value is None else value
         if not isinstance(text, str) or len(text) > _LIMITS[column]:
-            actual = (
-                f"{len(text)} characters" if isinstance(text, str) else f"no text but of the type {type(text).__name__}"
-            )
+            is_text = isinstance(text, str)
+            actual = f"{len(text)} characters" if is_text else f"no text but of the type {type(text).__name__}"
             detail = f"{column} is {actual}; give text of at most {_LIMITS[column]} characters"
             return ListRow(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
         texts[column] = text.strip() if column == "url" else sanitize_line(text.strip(), _LIMITS[column])

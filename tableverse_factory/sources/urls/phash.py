@@ -8,12 +8,8 @@ from schemas.geometry import Picture
 
 HASH_BITS = 64
 _SIDE = 32
-_FREQUENCIES = np.array(
-    sorted(((u, v) for u in range(12) for v in range(12) if u + v), key=lambda w: (w[0] ** 2 + w[1] ** 2, w))[
-        :HASH_BITS
-    ]
-)
-"""The longest waves but the mean, from the longest on. Shape (64, 2)."""
+_WAVES = sorted(((u, v) for u in range(12) for v in range(12) if u + v), key=lambda w: (w[0] ** 2 + w[1] ** 2, w))
+_FREQUENCIES = np.array(_WAVES[:HASH_BITS])  # The longest waves but the mean, from the longest on. Shape (64, 2)
 
 
 def compute_phash(picture: Picture) -> int:
