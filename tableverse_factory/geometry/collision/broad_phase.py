@@ -11,14 +11,12 @@ from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 MAX_CROPPED_SHARE = 0.5
 """With more of its vertices in the half-space a mesh is not cropped: its whole solid is made once for all."""
 
-MAX_STEPS = 20
-"""Of Gilbert's walk: a plane between two objects beside each other is nearly always found by the third."""
+MAX_STEPS = 20  # of Gilbert's walk: a plane between two objects beside each other is nearly always found by the third
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _TINY = np.finfo(np.float64).tiny
 
-_APEX_OFFSET = np.array([0.0137, 0.0219, 0.0321])
-"""Share of the extent: off every plane of symmetry."""
+_APEX_OFFSET = np.array([0.0137, 0.0219, 0.0321])  # share of the extent: off every plane of symmetry
 
 
 @dataclass(frozen=True, slots=True)

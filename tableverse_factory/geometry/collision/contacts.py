@@ -7,8 +7,7 @@ from tableverse_factory.geometry.collision.linear_sweep import MovingSolid
 from tableverse_factory.geometry.collision.solids import find_near_pieces
 from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, to_tensor
 
-MAX_MESH_GAP_M = 0.004
-"""Where pieces touch and a mesh is further away than this, the object looks as if it floats."""
+MAX_MESH_GAP_M = 0.004  # where pieces touch and a mesh is further away than this, the object looks as if it floats
 
 
 def find_contact_points(a: MovingSolid, b: MovingSolid, reach_m: float) -> Points:

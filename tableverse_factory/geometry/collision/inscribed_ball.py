@@ -7,17 +7,12 @@ from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, pack_rays, to_tensor
 
-TOLERANCE_SHARE = 1e-3
-"""Share of its radius by which the surface may reach into a ball that counts as inside."""
-MAX_ROUNDS = 100
-"""Five to ten are usual."""
+TOLERANCE_SHARE = 1e-3  # share of its radius by which the surface may reach into a ball that counts as inside
+MAX_ROUNDS = 100  # five to ten are usual
 
-FIRST_BATCH = 64
-"""The largest balls are shrunk before the others."""
-MIN_GAIN = 0.01
-"""Balls larger than the best by no more than this share are not searched for."""
-RAY_OFFSET = 1e-6
-"""How far inside rays begin, as a share of the extent: the face that they leave is not hit."""
+FIRST_BATCH = 64  # the largest balls are shrunk before the others
+MIN_GAIN = 0.01  # balls larger than the best by no more than this share are not searched for
+RAY_OFFSET = 1e-6  # how far inside rays begin, as a share of the extent: the face that they leave is not hit
 
 _PROBE_DIRECTIONS = np.array([[0.8431, 0.4127, 0.3449], [-0.3178, 0.8052, -0.5006], [0.2903, -0.5618, 0.7747]])
 """Skew: along no edge that is likely in a mesh."""

@@ -12,17 +12,13 @@ from tableverse_factory.core.errors import SolverError
 Rows = Float64[np.ndarray, "m n"]
 Values = Float64[np.ndarray, " n"]
 Bounds = Float64[np.ndarray, " m"]
-Owners = Int64[np.ndarray, " m"]
-"""Group of each constraint; -1 for those that never give way."""
+Owners = Int64[np.ndarray, " m"]  # group of each constraint; -1 for those that never give way
 
-INFEASIBLE_RESIDUAL = 1e-8
-"""Residual of the dual below which no point satisfies all constraints (1 where none binds)."""
+INFEASIBLE_RESIDUAL = 1e-8  # residual of the dual below which no point satisfies all constraints (1 where none binds)
 
-ITERATIONS_PER_UNKNOWN = 10
-"""A few are usual."""
+ITERATIONS_PER_UNKNOWN = 10  # A few are usual
 MAX_ROUNDS = 30
-VIOLATION_TOLERANCE = 1e-9
-"""Constraints violated by more than this become active in the next round."""
+VIOLATION_TOLERANCE = 1e-9  # constraints violated by more than this become active in the next round
 
 
 class WorkLimitError(SolverError):

@@ -15,13 +15,10 @@ import numpy as np
 from schemas.geometry import Matrix3, Points, Vector3
 from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces
 
-TOLERANCE_M = 1e-7
-"""Gaps are known to this; what is clear to within it counts as clear."""
-MIN_MARGIN_M = 1e-6
-"""Least clearance: disjoint is a little more than touching."""
+TOLERANCE_M = 1e-7  # gaps are known to this; what is clear to within it counts as clear
+MIN_MARGIN_M = 1e-6  # least clearance: disjoint is a little more than touching
 GJK_TOLERANCE = 1e-9
-MAX_STEPS = 200
-"""Of Newton; three to six are usual. Stopping early leaves more room than needed, never less."""
+MAX_STEPS = 200  # of Newton; three to six are usual. Stopping early leaves more room than needed, never less
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,8 +14,7 @@ from tableverse_factory.geometry.collision.solids import Solids, find_near_piece
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_mesh
 
-PairDepth = tuple[int, int, float]
-"""Indices i < j of two objects and how deep they overlap [m], always > 0."""
+PairDepth = tuple[int, int, float]  # indices i < j of two objects and how deep they overlap [m], always > 0
 
 THIN_M = 1e-4
 """Thinner overlaps are not examined further: objects at rest share micrometres with what carries them [m]."""

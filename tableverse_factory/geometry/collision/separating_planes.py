@@ -17,14 +17,11 @@ from tableverse_factory.geometry.collision.linear_sweep import GJK_TOLERANCE
 from tableverse_factory.geometry.collision.solids import Solids, make_convex_shape
 from tableverse_factory.geometry.math.transforms import cross_matrix
 
-SIDEWAYS_STRETCH = 6.0
-"""With z stretched this much, the shortest way out is a sideways one wherever there is any."""
+SIDEWAYS_STRETCH = 6.0  # with z stretched this much, the shortest way out is a sideways one wherever there is any
 CORNER_DEPTH_M = 0.003
 """Corners this much further from a plane than the nearest one may become the nearest in one step [m]."""
-SINGLE_CORNER_M = 0.006
-"""With more room than this, one corner is watched: one step goes less far [m]."""
-MAX_CORNERS = 4
-"""Watched corners of either piece."""
+SINGLE_CORNER_M = 0.006  # with more room than this, one corner is watched: one step goes less far [m]
+MAX_CORNERS = 4  # watched corners of either piece
 MIN_RISE = 0.1
 
 

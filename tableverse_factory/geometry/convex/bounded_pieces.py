@@ -9,10 +9,8 @@ from tableverse_factory.geometry.convex.cut_and_merge import PieceCluster
 from tableverse_factory.geometry.mesh.hulls import make_bounded_hull, unite_hulls
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 
-MAX_HULL_VERTICES = 64
-"""MuJoCo and GPU simulators are fast up to this number."""
-HULL_TOLERANCE = 4e-4
-"""Points this near to a hull need no corner, as a share of the mesh's longest side."""
+MAX_HULL_VERTICES = 64  # muJoCo and GPU simulators are fast up to this number
+HULL_TOLERANCE = 4e-4  # points this near to a hull need no corner, as a share of the mesh's longest side
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,8 +14,7 @@ from schemas.geometry import ConvexPieces, TriangleMesh
 from schemas.identity import content_hash
 from tableverse_factory.core.disk_cache import DiskCache
 
-VERSION = b"pieces 5"
-"""Changes whenever the same shape and parameters would give other pieces."""
+VERSION = b"pieces 5"  # changes whenever the same shape and parameters would give other pieces
 _PACKAGES = ("coacd", "manifold3d", "numpy", "scipy")
 """Packages whose versions may change the pieces of the same shape."""
 

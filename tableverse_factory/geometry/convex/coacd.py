@@ -7,8 +7,7 @@ import numpy as np
 from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
 
-THRESHOLD = 0.05
-"""Concavity allowed, a share of the mesh's size: CoACD's default."""
+THRESHOLD = 0.05  # concavity allowed, a share of the mesh's size: CoACD's default
 MAX_FACES = 20_000
 MAX_HULL_VERTICES = 64
 _LIGHT_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "resolution": 1000}

@@ -17,19 +17,14 @@ from schemas.geometry import Matrix3, Points, Vector3
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import compute_hull_volume, find_extreme_points, make_hull_mesh
 
-CUT_POSITIONS = (0.25, 0.5, 0.75)
-"""Where a part may be cut, as shares of its extent along an axis."""
+CUT_POSITIONS = (0.25, 0.5, 0.75)  # where a part may be cut, as shares of its extent along an axis
 MIN_SAVING_SHARE = 0.3
 """Where no cut saves this share of a part's excess, the part is halved across its longest axis: shells (bowls, plates)
 gain nothing from one cut but much from many, and halves lead to compact patches."""
-OVERCUT = 1.5
-"""Cutting goes on to this many times the pieces allowed: merging makes better pieces than cutting alone."""
-CUT_SHARE = 0.5
-"""Cutting goes on to this share of the volume error allowed; merging spends the rest."""
-NEGLIGIBLE_SHARE = 1e-9
-"""Parts of less than this share of the solid's volume are rounding, and left out."""
-MERGE_REACH = 0.01
-"""Parts whose boxes come this near (the solid measures 1) may be merged."""
+OVERCUT = 1.5  # cutting goes on to this many times the pieces allowed: merging makes better pieces than cutting alone
+CUT_SHARE = 0.5  # cutting goes on to this share of the volume error allowed; merging spends the rest
+NEGLIGIBLE_SHARE = 1e-9  # parts of less than this share of the solid's volume are rounding, and left out
+MERGE_REACH = 0.01  # parts whose boxes come this near (the solid measures 1) may be merged
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,18 +22,14 @@ from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volum
 from tableverse_factory.geometry.mesh.meshes import check_mesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_mesh
 
-FEW_FACES = 5_000
-"""Smaller meshes are not simplified."""
-MANY_SHELLS = 500
-"""More shells cannot be simplified to few faces, and none of them will be cut."""
+FEW_FACES = 5_000  # smaller meshes are not simplified
+MANY_SHELLS = 500  # more shells cannot be simplified to few faces, and none of them will be cut
 SIMPLIFY_TOLERANCES = (4e-4, 2e-4, 1e-4, 0.0)
 """The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one. Lengths here are
 shares of the mesh's longest side."""
 SIMPLIFY_VOLUME = 0.01
-MAX_FACES = 20_000
-"""Larger meshes are simplified further, twice as coarsely each time."""
-GRID = 2.0**-30
-"""Shapes are rounded to this, so that scale leaves no trace in the last bits."""
+MAX_FACES = 20_000  # larger meshes are simplified further, twice as coarsely each time
+GRID = 2.0**-30  # shapes are rounded to this, so that scale leaves no trace in the last bits
 
 
 def decompose(mesh: TriangleMesh, config: RectifyConfig, cache_dir: Path) -> ConvexPieces:

@@ -16,8 +16,7 @@ from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to
 SAMPLES = 10_000
 MAX_POINTS = 30_000
 INSIDE_TOLERANCE = 1e-9
-MIN_CAVITY_SHARE = 0.01
-"""Share of the hull's volume below which there is no cavity to keep."""
+MIN_CAVITY_SHARE = 0.01  # share of the hull's volume below which there is no cavity to keep
 
 
 def add_metrics(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPieces:

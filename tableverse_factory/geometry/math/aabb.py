@@ -3,8 +3,7 @@
 import numpy as np
 from jaxtyping import Float64
 
-Box = tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]
-"""Lowest and highest corner."""
+Box = tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, " k"]]  # lowest and highest corner
 
 
 def aabb(points: Float64[np.ndarray, "n k"]) -> Box:

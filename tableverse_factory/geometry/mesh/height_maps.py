@@ -19,8 +19,7 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, pack_ra
 Heights = Float64[np.ndarray, "nx ny"]
 CellMask = Bool[np.ndarray, "nx ny"]
 
-CELL_M = 0.003
-"""Spacing of the grid: the walls of household vessels are 2 to 5 mm."""
+CELL_M = 0.003  # spacing of the grid: the walls of household vessels are 2 to 5 mm
 
 MIN_CAVITY_DEPTH_M = 0.015
 MIN_CAVITY_WIDTH_M = 0.025
@@ -28,8 +27,7 @@ MIN_CAVITY_ASPECT = 0.12
 """Depth over width of the opening: a plate of 25 cm with a rim of 2 cm is no container, a frying pan is one."""
 
 LEVEL_TOLERANCE_M = 0.0025
-MIN_FLAT_WIDTH_M = 0.04
-"""A body carries others on a level patch of at least this diameter."""
+MIN_FLAT_WIDTH_M = 0.04  # A body carries others on a level patch of at least this diameter
 
 _RAYS_PER_SIDE = 2
 _MIN_WATER_DEPTH_M = 0.003

@@ -10,10 +10,8 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.geometry import Points, TriangleMesh
 
 VERTICES_PER_ROUND = 6
-SLIVER = 1e-9
-"""A triangle lower than this share of its length has no reliable normal."""
-MIN_CORNER_COSINE = 0.5
-"""Cosine between the direction of a corner and its faces' normals."""
+SLIVER = 1e-9  # A triangle lower than this share of its length has no reliable normal
+MIN_CORNER_COSINE = 0.5  # cosine between the direction of a corner and its faces' normals
 
 
 def fibonacci_directions(count: int) -> Points:

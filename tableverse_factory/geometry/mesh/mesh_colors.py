@@ -12,12 +12,9 @@ from schemas.geometry import Colors, Matrix4, Picture, Points, Texture, Triangle
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.core.storage.untrusted import IMAGE_FORMATS
 
-MAX_SIDE = 2048
-"""Larger pictures are reduced."""
-MAX_SHEET = 4096
-"""Side of the atlas that holds the pictures of several materials."""
-DEFAULT_COLOR = (178, 178, 184)
-"""sRGB of uncoloured parts beside coloured ones."""
+MAX_SIDE = 2048  # larger pictures are reduced
+MAX_SHEET = 4096  # side of the atlas that holds the pictures of several materials
+DEFAULT_COLOR = (178, 178, 184)  # sRGB of uncoloured parts beside coloured ones
 
 
 @dataclass(frozen=True, slots=True, eq=False)

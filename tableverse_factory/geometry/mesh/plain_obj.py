@@ -9,11 +9,9 @@ from schemas.geometry import Faces, TriangleMesh
 _PLAIN = b"0123456789.+-e vf\r\n"
 _NO_INDEX = (b".", b"e")
 _MOST_NUMBERS = 6
-_FEW_BYTES = 50_000
-"""Below it numpy is faster than Arrow: pieces are read by the thousand."""
+_FEW_BYTES = 50_000  # below it numpy is faster than Arrow: pieces are read by the thousand
 
-_LARGEST = 1e9
-"""No arithmetic overflows below it."""
+_LARGEST = 1e9  # no arithmetic overflows below it
 
 
 def read_plain_obj(data: bytes) -> TriangleMesh | None:

@@ -10,18 +10,14 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area, sample_surface
 
-RESOLUTION = 64
-"""Voxels along the longest side."""
-SEALED = 0.9
-"""Space within this many voxels of the triangles is blocked: more than half a voxel's diagonal."""
-SKIN = 0.25
-"""The new surface lies this many voxels outside the triangles."""
+RESOLUTION = 64  # voxels along the longest side
+SEALED = 0.9  # space within this many voxels of the triangles is blocked: more than half a voxel's diagonal
+SKIN = 0.25  # the new surface lies this many voxels outside the triangles
 SAMPLES_PER_VOXEL_FACE = 6.0
 MAX_SAMPLES = 1_000_000
 SAMPLES_PER_VOXEL = 4.0
 """Along each axis; of samples nearer to one another, in folded or doubled surfaces, one is kept."""
-MIN_AREA_SHARE = 1e-9
-"""Share of the square of the extent."""
+MIN_AREA_SHARE = 1e-9  # share of the square of the extent
 
 
 def remesh(mesh: TriangleMesh) -> TriangleMesh:

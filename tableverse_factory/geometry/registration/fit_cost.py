@@ -13,14 +13,11 @@ from schemas.geometry import Points
 from tableverse_factory.geometry.registration.icp import Fit, PartialView, SampledMesh, subsample
 
 BODY_POINTS = 300
-UPRIGHT = 0.9
-"""Cosine of the tilt up to which a mesh stands on its own lower face."""
-ODD_PRICE_M = 0.001
-"""A mesh that lies on another than its own lower face has to fit this much better."""
+UPRIGHT = 0.9  # cosine of the tilt up to which a mesh stands on its own lower face
+ODD_PRICE_M = 0.001  # A mesh that lies on another than its own lower face has to fit this much better
 PROPORTIONS_STD = 0.04
 """A MeshModel's error of the proportions: of the logarithm of the size along one axis against the others."""
-STRETCHED_M = 0.0001
-"""Price of proportions that are wrong by one standard deviation."""
+STRETCHED_M = 0.0001  # price of proportions that are wrong by one standard deviation
 FARTHEST_M = 0.02
 FLOATS, KNOWN_SUPPORT_M = 0.1, 0.005
 """Price of a metre between a mesh and its support, and how well this has to be known for that."""

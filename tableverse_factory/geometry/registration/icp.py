@@ -18,25 +18,17 @@ from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
 SAMPLES = 3000
 ROBUST_M = 0.004
-NOISE_M = 0.0004
-"""Lower bound of the points' noise."""
-OUTLINE_M = 0.002
-"""Accuracy of the free space: a pixel or two, and the error of its depth."""
+NOISE_M = 0.0004  # lower bound of the points' noise
+OUTLINE_M = 0.002  # accuracy of the free space: a pixel or two, and the error of its depth
 OUTLINE_POINTS = 300
-IN_COMMON = 2.0
-"""The scatter within one picture shows about half of the error, measured on synthetic truth."""
+IN_COMMON = 2.0  # the scatter within one picture shows about half of the error, measured on synthetic truth
 SYSTEMATIC_M, SYSTEMATIC_RAD = 0.0015, 0.0035
 """Lower bound of the error, from outlines a pixel too narrow and depth quantisation; measured likewise."""
-OUTLINES = 30
-"""Effective number of outline points: their errors are correlated."""
-INDEPENDENT = 300
-"""Effective number of observed points, at most: errors of neighbours are correlated."""
-SCALE_STD = 1.0
-"""Of the logarithm of the overall size: nearly unconstrained."""
-SIZE_RANGE = (0.6, 1.6)
-"""Bounds of the size along each axis, against its start."""
-CELLS = 4
-"""Cells along the object's longest side; points within one have errors in common."""
+OUTLINES = 30  # effective number of outline points: their errors are correlated
+INDEPENDENT = 300  # effective number of observed points, at most: errors of neighbours are correlated
+SCALE_STD = 1.0  # of the logarithm of the overall size: nearly unconstrained
+SIZE_RANGE = (0.6, 1.6)  # bounds of the size along each axis, against its start
+CELLS = 4  # cells along the object's longest side; points within one have errors in common
 
 Emptiness = Callable[[Points], Float64[np.ndarray, " n"]]
 """Signed distance of each point to the space seen to be empty [m], negative inside it."""

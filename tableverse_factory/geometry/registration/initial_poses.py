@@ -19,8 +19,7 @@ from tableverse_factory.geometry.registration.symmetry import rotation_about_axi
 POINTS = 150
 HEADING_STEP = float(np.deg2rad(5.0))
 TIPPED_STEP = float(np.deg2rad(15.0))
-MAX_STARTS, MAX_UPRIGHT_STARTS = 7, 3
-"""In all, and of them those on the mesh's own lower face at first."""
+MAX_STARTS, MAX_UPRIGHT_STARTS = 7, 3  # in all, and of them those on the mesh's own lower face at first
 APART_RAD, OTHER_SIZE = 0.3, 0.1
 
 

@@ -28,23 +28,18 @@ from tableverse_factory.geometry.registration.initial_poses import find_initial_
 from tableverse_factory.geometry.registration.symmetry import count_heading_folds, find_symmetry_turn
 
 MIN_POINTS = 10
-MIN_BREADTH_M = 1e-4
-"""Of points across the line that fits them best, root mean square."""
+MIN_BREADTH_M = 1e-4  # of points across the line that fits them best, root mean square
 SAMPLES = 3000
 MIDDLE_POINTS, FINE_POINTS, RESIDUAL_POINTS = 400, 1200, 1000
 MIDDLE_STEPS, FINE_STEPS = 15, 20
-MIDDLE_SETTLED, FINE_SETTLED = 6e-4, 2e-4
-"""ICP ends with a step smaller than this [m, rad]."""
-REFINED_STARTS = 2
-"""Starts that are aligned to more points."""
-DISTINCT = 0.03
-"""Two placements are distinct where their surfaces lie this far apart, over the longest side."""
+MIDDLE_SETTLED, FINE_SETTLED = 6e-4, 2e-4  # ICP ends with a step smaller than this [m, rad]
+REFINED_STARTS = 2  # starts that are aligned to more points
+DISTINCT = 0.03  # two placements are distinct where their surfaces lie this far apart, over the longest side
 ALIKE_COST_RATIO = 1.05
 """Cost of a fit turned by a symmetry over that of the fit, up to which the view does not distinguish them."""
 COMPLETED_STD = 0.08
 """Error of the proportions of a completion from one view, whose far side is guessed; see `PROPORTIONS_STD`."""
-STANDS_STD_M = 0.0015
-"""Of the height of the table, or of another object's top."""
+STANDS_STD_M = 0.0015  # of the height of the table, or of another object's top
 
 
 @dataclass(frozen=True, slots=True, eq=False)

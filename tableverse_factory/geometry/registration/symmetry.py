@@ -5,8 +5,7 @@ from scipy.spatial import cKDTree
 
 from schemas.geometry import Matrix3, Points
 
-FOLDS = (8, 6, 5, 4, 3, 2)
-"""Candidates, from the most to the fewest."""
+FOLDS = (8, 6, 5, 4, 3, 2)  # candidates, from the most to the fewest
 ODD_TURNS = (0.35, 1.13, 1.87, 2.61)
 """No simple fractions of a full turn: only a round shape is alike after all of them [rad]."""
 MAX_QUERIES = 400

@@ -13,18 +13,15 @@ from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volum
 from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, pack_rays
 from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
-FRICTION = 0.5
-"""Coulomb coefficient of pad on object; the contact normals lie within its cone about the closing axis."""
+FRICTION = 0.5  # coulomb coefficient of pad on object; the contact normals lie within its cone about the closing axis
 
 MIN_WIDTH_M = 0.001
-FINGER_M = 0.012
-"""Thickness of a finger beyond the contact."""
+FINGER_M = 0.012  # thickness of a finger beyond the contact
 
 MAX_AXIS_SLOPE = 0.6
 """Largest vertical part of the closing axis: fingers come from above or from the side, never from below."""
 
-MIN_HEIGHT_M = 0.004
-"""Contacts nearer to what the body stands on are out of the fingertips' reach."""
+MIN_HEIGHT_M = 0.004  # contacts nearer to what the body stands on are out of the fingertips' reach
 
 _SAMPLES = 512
 _OFF_M = 1e-4

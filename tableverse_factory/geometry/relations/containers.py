@@ -9,10 +9,8 @@ from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.geometry.mesh.height_maps import CellMask
 from tableverse_factory.geometry.relations.relations import BodyFeatures, compute_body_features, is_inside
 
-FOOT_TOLERANCE_M = 0.003
-"""An object that reaches further below the container's foot stands beside it."""
-INSIDE_SHARE = 0.5
-"""Share of an object below the rim that is within the opening: objects lean out of full bowls."""
+FOOT_TOLERANCE_M = 0.003  # an object that reaches further below the container's foot stands beside it
+INSIDE_SHARE = 0.5  # share of an object below the rim that is within the opening: objects lean out of full bowls
 DIP_M = 0.003
 HEAP_SHARE = 2 / 3
 """Share of an object on a heap, seen from above, that is over the opening: a pen across a cup is not in it."""

@@ -31,8 +31,7 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_ra
 Points2 = Float64[np.ndarray, "n 2"]
 
 NEXT_TO_GAP_M = 0.06
-SIDE_OVERLAP_M = 0.01
-"""How far boxes may overlap along the axis and still lie beside each other."""
+SIDE_OVERLAP_M = 0.01  # how far boxes may overlap along the axis and still lie beside each other
 
 CONTACT_GAP_M = 0.005
 SUBMERGED_M = 0.01

@@ -17,25 +17,20 @@ from schemas.geometry import Frozen, Vector3
 from tableverse_factory.geometry.mesh.height_maps import CELL_M, LEVEL_TOLERANCE_M, CellMask, HeightMap, Heights
 from tableverse_factory.geometry.relations.relations import BodyFeatures, relation_holds
 
-REACH_M = 0.4
-"""How far around the bodies the table is considered."""
+REACH_M = 0.4  # how far around the bodies the table is considered
 
-CLEARANCE_M = 0.012
-"""Free space around a body put down on the table: a finger's thickness."""
+CLEARANCE_M = 0.012  # free space around a body put down on the table: a finger's thickness
 
 _DISTANCES_M = (0.02, 0.035, 0.05, 0.09, 0.15)
 _SIDESTEPS = (0.0, -0.5, 0.5)
 CONTACT_M = 0.002
 _STAND_MARGIN_M = 0.002
-_SUPPORT_SHARE = 0.7
-"""Share of the base area that must be carried: a box on a lemon has less."""
+_SUPPORT_SHARE = 0.7  # share of the base area that must be carried: a box on a lemon has less
 
-_FLAT_SHARE = 0.6
-"""Share of the area under a body that must be flat: scissors and balls carry nothing."""
+_FLAT_SHARE = 0.6  # share of the area under a body that must be flat: scissors and balls carry nothing
 
 _FITS_SHARE = 0.95
-_SUBMERGED_SHARE = 0.25
-"""Share of a body's height that must come to lie below the rim, or it topples out."""
+_SUBMERGED_SHARE = 0.25  # share of a body's height that must come to lie below the rim, or it topples out
 
 _MAX_CANDIDATES = 49
 _ANGLES = np.arange(16) * (2 * np.pi / 16)

@@ -11,17 +11,13 @@ from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, to_tensor
 from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
-Pairs = frozenset[tuple[int, int]]
-"""(carried, carrier), indices of bodies."""
+Pairs = frozenset[tuple[int, int]]  # (carried, carrier), indices of bodies
 
-REACH_M = 0.002
-"""Surfaces this near touch: a layout that was never simulated keeps gaps of this order."""
+REACH_M = 0.002  # surfaces this near touch: a layout that was never simulated keeps gaps of this order
 UPWARD = 0.5
 """Least vertical part of the unit normal of a supporting contact, 30° above the horizontal; steeper ones only lean."""
-SAMPLES = 4000
-"""Points on each surface: 1 to 3 mm apart on household objects."""
-TOUCHING_M = 0.0002
-"""Nearer surfaces have no meaningful direction between them; their normals decide alone."""
+SAMPLES = 4000  # points on each surface: 1 to 3 mm apart on household objects
+TOUCHING_M = 0.0002  # nearer surfaces have no meaningful direction between them; their normals decide alone
 
 
 def find_mesh_support(meshes: Sequence[TriangleMesh]) -> Pairs:

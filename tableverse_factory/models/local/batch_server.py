@@ -21,14 +21,10 @@ BatchModel = Callable[[Sequence[Arrays]], Iterable[Arrays]]
 Heartbeat = Callable[[], None]
 """To be called every second or so by long work: raises SystemExit when no client is connected any more."""
 
-GATHER_S = 0.005
-"""Wait for further questions of a batch that is not full, a twentieth of a forward pass [s]."""
-IDLE_S = 15.0
-"""Time without connections after which the process ends [s]."""
-REFUSING_S = 1.0
-"""The same for a process without a model, so that the next one may succeed [s]."""
-MESSAGE_S = 5.0
-"""Limit for a message that has begun, in either direction: all others wait meanwhile [s]."""
+GATHER_S = 0.005  # wait for further questions of a batch that is not full, a twentieth of a forward pass [s]
+IDLE_S = 15.0  # time without connections after which the process ends [s]
+REFUSING_S = 1.0  # the same for a process without a model, so that the next one may succeed [s]
+MESSAGE_S = 5.0  # limit for a message that has begun, in either direction: all others wait meanwhile [s]
 ACCEPTED, REFUSED = np.array([1], dtype=np.uint8), np.array([0], dtype=np.uint8)
 
 

@@ -9,8 +9,7 @@ from tableverse_factory.models.local.device import Device, Tensor, import_torch
 Forward = Callable[..., tuple[Tensor, ...]]
 """Tensors to tensors on the device; output shapes follow from input shapes, and it does not synchronize."""
 
-WARM_UPS = 2
-"""Calls before recording, in which libraries create their handles and choose their kernels."""
+WARM_UPS = 2  # calls before recording, in which libraries create their handles and choose their kernels
 
 
 @dataclass(frozen=True, slots=True)

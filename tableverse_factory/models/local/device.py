@@ -8,8 +8,7 @@ from schemas.config import ModelsConfig
 from tableverse_factory.core.errors import InputError, ModelAccessError
 from tableverse_factory.core.optional_imports import import_extra
 
-Tensor = Any
-"""A `torch.Tensor`; torch is an extra, and type checks must pass without it."""
+Tensor = Any  # A `torch.Tensor`; torch is an extra, and type checks must pass without it
 
 
 @dataclass(frozen=True, slots=True)

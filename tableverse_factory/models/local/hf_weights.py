@@ -20,8 +20,7 @@ DEFAULT_WEIGHTS = {
 }
 """Default weights by backend."""
 
-HUB_TIMEOUT_S = 60.0
-"""Limit for the hub to resolve a revision [s]."""
+HUB_TIMEOUT_S = 60.0  # limit for the hub to resolve a revision [s]
 
 _NAME = re.compile(r"(?P<name>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")

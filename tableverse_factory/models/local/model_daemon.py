@@ -23,18 +23,13 @@ from tableverse_factory.models.local.batch_server import BatchModel, Heartbeat, 
 from tableverse_factory.models.local.fingerprint import stat_weights
 from tableverse_factory.models.local.wire import WireError, decode_error, receive_arrays, send_arrays
 
-Spec = dict[str, str | int]
-"""Description of a model."""
+Spec = dict[str, str | int]  # description of a model
 
-START_S = 60.0
-"""Limit until the daemon listens; it loads its weights after that [s]."""
-TRIES = 2
-"""Attempts at one question; a daemon that dies is started again."""
-DYING_S = 0.5
-"""Time in which a dying daemon closes its listening socket after its connections [s]."""
+START_S = 60.0  # limit until the daemon listens; it loads its weights after that [s]
+TRIES = 2  # attempts at one question; a daemon that dies is started again
+DYING_S = 0.5  # time in which a dying daemon closes its listening socket after its connections [s]
 _POLL_S = 0.02
-_MAX_FOLDER = 85
-"""Maximum length of the folder's path; that of a socket may have 107 [bytes]."""
+_MAX_FOLDER = 85  # maximum length of the folder's path; that of a socket may have 107 [bytes]
 _LOG = "a .log in the folder tableverse-UID of $XDG_RUNTIME_DIR, or of the temporary files where that is not set"
 """Place of the log in messages, which go into datasets and must not hold paths of this machine."""
 _CONNECTIONS: dict[Path, socket.socket] = {}

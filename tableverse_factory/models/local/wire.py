@@ -14,8 +14,7 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import FrameError, encode_header, read_frame
 
 MAX_ARRAYS = 16
-MAX_BYTES = 1 << 30
-"""Maximum size of one array: a picture of 200 million pixels fits."""
+MAX_BYTES = 1 << 30  # maximum size of one array: a picture of 200 million pixels fits
 
 _ARRAY_ERRORS = (
     ValueError,

@@ -28,14 +28,11 @@ _KEY_HEADERS: dict[str, Callable[[str], dict[str, str]]] = {
     "gemini": lambda key: {"x-goog-api-key": key},
 }
 
-MOST_CALLS = 2 * ATTEMPTS
-"""Maximum number of requests for one question: two rounds, each with all its retries."""
+MOST_CALLS = 2 * ATTEMPTS  # maximum number of requests for one question: two rounds, each with all its retries
 
-_REPAIR_CHARS = 20_000
-"""Maximum length of an answer that is sent back for repair."""
+_REPAIR_CHARS = 20_000  # maximum length of an answer that is sent back for repair
 
-_KEY_CHARS = 8
-"""Shorter keys are placeholders for a local server, such as `none`, and may occur in an answer."""
+_KEY_CHARS = 8  # shorter keys are placeholders for a local server, such as `none`, and may occur in an answer
 
 T = TypeVar("T")
 

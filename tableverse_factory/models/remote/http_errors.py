@@ -16,10 +16,8 @@ _TRANSIENT = TRANSIENT_STATUSES | {409, 520, 522, 524, 529}
 _NO_KEY, _NO_CREDIT, _NO_PERMISSION, _NOT_THERE = 401, 402, 403, 404
 _KEY_WORDS = frozenset({"API_KEY_INVALID", "invalid_api_key"})
 _CREDIT_WORDS = frozenset({"insufficient_quota", "billing_hard_limit_reached", "billing_not_active"})
-_MALFORMED = frozenset({400, 422})
-"""Statuses of a request with an unknown schema, often without a message about it."""
-_UNSTATED = 502
-"""Stands for the status of an error that came with a status of success."""
+_MALFORMED = frozenset({400, 422})  # statuses of a request with an unknown schema, often without a message about it
+_UNSTATED = 502  # stands for the status of an error that came with a status of success
 
 _CONTENT_STATUSES = frozenset({400, 403, 451, _UNSTATED})
 _CONTENT_CODES = ("content_filter", "content_policy", "moderation", "sensitivecontent")

@@ -7,8 +7,7 @@ from pydantic import BaseModel, ValidationError
 
 from tableverse_factory.core.errors import AnswerInvalidError
 
-MAX_ANSWER_CHARS = 262_144
-"""Maximum length of an answer, including thoughts in its text."""
+MAX_ANSWER_CHARS = 262_144  # maximum length of an answer, including thoughts in its text
 
 T = TypeVar("T", bound=BaseModel)
 

@@ -25,8 +25,7 @@ MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 MAX_DOCUMENTS = 64
 MAX_REFERENCES = 20_000
 MAX_SETTINGS = 64
-MAX_LOOKUPS = 1_000_000
-"""Of paths, in all possible folders."""
+MAX_LOOKUPS = 1_000_000  # of paths, in all possible folders
 
 MAX_TOTAL_BYTES = 2 * 1024**3
 

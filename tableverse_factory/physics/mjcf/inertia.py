@@ -16,11 +16,9 @@ from tableverse_factory.geometry.mesh.shells import is_one_shell, unite_shells
 MIN_GYRATION_M = 5e-4
 """Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
 
-REMEMBERED_BYTES = 4 * 1024
-"""One flag for each mesh of some scenes."""
+REMEMBERED_BYTES = 4 * 1024  # one flag for each mesh of some scenes
 
-MIN_COMPACTNESS = 1e-3
-"""Least volume over that of the box for which a closed mesh counts as a solid."""
+MIN_COMPACTNESS = 1e-3  # least volume over that of the box for which a closed mesh counts as a solid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,14 +6,11 @@ from jaxtyping import Float64, Int64, UInt8
 from tableverse_factory.core.errors import GeometryError
 
 _ZERO, _MINUS, _POINT = b"0"[0], b"-"[0], b"."[0]
-_BLANK = 0
-"""Placeholder where a shorter number has no digit; it is removed at the end."""
+_BLANK = 0  # placeholder where a shorter number has no digit; it is removed at the end
 
-_MIN_VECTORIZED = 600
-"""Python formats fewer numbers faster."""
+_MIN_VECTORIZED = 600  # python formats fewer numbers faster
 
-_MAX_EXACT_INTEGER = 2.0**53
-"""Limit of exact integers in float64."""
+_MAX_EXACT_INTEGER = 2.0**53  # limit of exact integers in float64
 
 
 def format_integer_lines(head: bytes, numbers: Int64[np.ndarray, "n k"], ends: bytes) -> bytes:

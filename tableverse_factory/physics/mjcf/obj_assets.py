@@ -15,11 +15,9 @@ from tableverse_factory.physics.mjcf.number_format import format_decimal_lines, 
 
 MAX_PIECE_VERTICES = 64
 MIN_MESH_VERTICES = 4
-MIN_PIECE_THICKNESS_M = 5e-5
-"""Thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail."""
+MIN_PIECE_THICKNESS_M = 5e-5  # thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail
 
-ROUNDING_UNITS = 4
-"""Units of the last digit by which rounding may lift a corner over the plane of a compact face."""
+ROUNDING_UNITS = 4  # units of the last digit by which rounding may lift a corner over the plane of a compact face
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,8 +7,7 @@ from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.physics.mjcf.inertia import VolumeMoments, compute_volume_moments
 from tableverse_factory.physics.mjcf.obj_assets import prepare_hulls, scale_and_quantize
 
-REMEMBERED_BYTES = 64 * 1024 * 1024
-"""The objects of many scenes: stages in one process share the results."""
+REMEMBERED_BYTES = 64 * 1024 * 1024  # the objects of many scenes: stages in one process share the results
 
 
 @dataclass(frozen=True, slots=True, eq=False)

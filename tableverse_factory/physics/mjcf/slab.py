@@ -12,8 +12,7 @@ from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import transform_points
 
 THICKNESS_M = 0.04
-OBJECT_MARGIN_M = 0.10
-"""The slab reaches this far beyond every object, as a picture may show only part of a table."""
+OBJECT_MARGIN_M = 0.10  # the slab reaches this far beyond every object, as a picture may show only part of a table
 
 
 @dataclass(frozen=True, slots=True, eq=False)

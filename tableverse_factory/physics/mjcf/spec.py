@@ -36,8 +36,7 @@ CONTACT_TIME_S = 0.005
 With the impedance below, objects at rest sink in by 0.02 mm instead of 0.4 mm at MuJoCo's defaults, and drift less.
 """
 
-IMPEDANCE = (0.95, 0.99, 0.001)
-"""Impedance of a contact: at no depth, deep, and the depth between them [m]."""
+IMPEDANCE = (0.95, 0.99, 0.001)  # impedance of a contact: at no depth, deep, and the depth between them [m]
 
 _TETRAHEDRON_OBJ = (
     b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"

@@ -20,8 +20,7 @@ _BACKGROUND: Rgb = (236, 238, 242)
 _TOWARDS_LIGHT = np.array([-0.36, -0.44, 0.82], dtype=np.float32)
 _AMBIENT, _KEY, _SHADE = 0.52, 0.52, 0.72
 _OFFSET_M = 2e-4
-_COARSE = 2
-"""Shadow rays are cast for every second pixel of every second row."""
+_COARSE = 2  # shadow rays are cast for every second pixel of every second row
 
 
 class PreviewRenderer:

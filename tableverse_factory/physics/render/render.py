@@ -16,8 +16,7 @@ from tableverse_factory.physics.render.normals import compute_corner_normals
 from tableverse_factory.physics.render.raycast import Hits, Raycaster
 
 Rgb = tuple[float, float, float]
-Pattern = Callable[[Points], Float64[np.ndarray, "n 3"]]
-"""World positions [m] to sRGB in 0–255, point by point."""
+Pattern = Callable[[Points], Float64[np.ndarray, "n 3"]]  # world positions [m] to sRGB in 0–255, point by point
 Paint = Rgb | Pattern | None
 """One sRGB colour in 0–255, a pattern, or None: the mesh's own texture or vertex colours, else grey."""
 
@@ -340,8 +339,7 @@ def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
     return np.clip(srgb / 255.0, 0.0, 1.0) ** GAMMA
 
 
-_LINEAR = srgb_to_linear(np.arange(256))
-"""Look-up table of linear light for a byte."""
+_LINEAR = srgb_to_linear(np.arange(256))  # look-up table of linear light for a byte
 
 
 def _pixel_turns(pixels: np.ndarray, width: int) -> np.ndarray:

@@ -17,11 +17,9 @@ from tableverse_factory.physics.render.preview import PreviewRenderer
 from tableverse_factory.physics.render.render import Rendering, look_at, render_views
 
 FRONT_ELEVATION = float(np.deg2rad(38.0))
-FIELD_OF_VIEW = float(np.deg2rad(34.0))
-"""Vertical, of the front and top views: narrow, so that heights compare."""
+FIELD_OF_VIEW = float(np.deg2rad(34.0))  # vertical, of the front and top views: narrow, so that heights compare
 
-SHEET_SIDE = 512
-"""Of each view of a judge's sheet [px]: labels are legible, in a quarter of a second."""
+SHEET_SIDE = 512  # of each view of a judge's sheet [px]: labels are legible, in a quarter of a second
 
 _MARGIN = 1.12
 _NEAREST_M = 0.15

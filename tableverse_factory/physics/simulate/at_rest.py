@@ -12,22 +12,17 @@ from schemas.geometry import Frozen, Pose
 from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_angle
 from tableverse_factory.physics.simulate.mujoco_sleep import allow_sleep
 
-SPEED_LIMIT = 0.01
-"""At rest every object moves slower than this, in m/s and in rad/s."""
+SPEED_LIMIT = 0.01  # at rest every object moves slower than this, in m/s and in rad/s
 
-ACCELERATION_LIMIT = 0.5
-"""And changes its speed by less than this between samples, in m/s² and in rad/s²."""
+ACCELERATION_LIMIT = 0.5  # and changes its speed by less than this between samples, in m/s² and in rad/s²
 
-HOLD_S = 0.2
-"""Time for which this must hold without a break [s]."""
+HOLD_S = 0.2  # time for which this must hold without a break [s]
 
 GENTLE_S = 0.4
-GENTLE_RATE = 40.0
-"""While settling gently, speed decays with this rate [1/s]: a free fall ends at 0.25 m/s."""
+GENTLE_RATE = 40.0  # while settling gently, speed decays with this rate [1/s]: a free fall ends at 0.25 m/s
 
 STEPS_PER_SAMPLE = 5
-STEPS_PER_SLEEP_CHECK = 25
-"""Steps between checks whether all bodies sleep."""
+STEPS_PER_SLEEP_CHECK = 25  # steps between checks whether all bodies sleep
 
 NUDGES = 1e-6 * np.array([[1.0, 1, 1, 1, 1, 1], [1, -1, 1, 1, -1, 1]])
 """Velocities that every body is given before its drift is measured, and again `NUDGE_INTERVAL_S` later [m/s, rad/s].
@@ -36,8 +31,7 @@ Friction stops them within a step or two, but a body on its tip or edge falls, w
 errors. No direction across the table is at right angles to both.
 """
 
-NUDGE_INTERVAL_S = 0.1
-"""Sleep is allowed after it."""
+NUDGE_INTERVAL_S = 0.1  # sleep is allowed after it
 
 DRIFT_SLEEP_TOLERANCE = 1e-9
 """Sleeping bodies would have moved by 5 nm in the certificate's 5 s; most settled ones stand at 1e-15."""

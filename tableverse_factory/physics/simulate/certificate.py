@@ -19,11 +19,9 @@ from tableverse_factory.physics.simulate.model_solids import ModelBody, body_nam
 DRIFT_TIME_S = 5.0
 DRIFT_LIMIT_M = 0.001
 DRIFT_LIMIT_RAD = float(np.deg2rad(1.0))
-FALL_M = 0.05
-"""An object whose centre of mass sinks this far within the drift time has fallen off its support."""
+FALL_M = 0.05  # an object whose centre of mass sinks this far within the drift time has fallen off its support
 
-Depth = tuple[float, str]
-"""Depth of the deepest pair [m], and its names joined by ` & `; (0.0, "") where none touch."""
+Depth = tuple[float, str]  # depth of the deepest pair [m], and its names joined by ` & `; (0.0, "") where none touch
 
 
 @dataclass(frozen=True, slots=True)

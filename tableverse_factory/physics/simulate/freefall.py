@@ -18,8 +18,7 @@ from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 SLIPPERY_FRICTION, SLIPPERY_ROLLING_FRICTION = 0.1, 0.001
 """Of contents that are shaken down: at the friction of everyday surfaces they bridge the void below."""
 
-LOST_BELOW_M = 0.05
-"""A body that sinks this far below all fixed ones has missed them."""
+LOST_BELOW_M = 0.05  # A body that sinks this far below all fixed ones has missed them
 
 _EMPTY_SLAB = Slab(np.zeros(2), np.ones(2), 0.0, (0, 0, 0))
 

@@ -31,8 +31,7 @@ from tableverse_factory.physics.mjcf.scenery import read_mesh
 from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies
 
-_MIN_CROPPED_FACES = 500
-"""Of fewer the whole solid is made."""
+_MIN_CROPPED_FACES = 500  # of fewer the whole solid is made
 
 _SEGMENTS = 48
 _PLANE_REACH_M = 50.0

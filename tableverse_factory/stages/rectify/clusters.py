@@ -11,11 +11,9 @@ from tableverse_factory.stages.rectify.relaxation import Relaxation, SolverBudge
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.support import SupportRelation
 
-Cluster = tuple[int, ...]
-"""Indices of parts, ascending."""
+Cluster = tuple[int, ...]  # indices of parts, ascending
 
-LINK_M = 0.01
-"""Objects with a gap of at most this are in one cluster from the start [m]."""
+LINK_M = 0.01  # objects with a gap of at most this are in one cluster from the start [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

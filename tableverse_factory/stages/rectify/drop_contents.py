@@ -23,15 +23,12 @@ from tableverse_factory.physics.mjcf.spec import SceneBody
 from tableverse_factory.stages.rectify.budget import SimulationBudget
 from tableverse_factory.stages.rectify.vertical import UP
 
-HEADINGS = 8
-"""Sideways directions in which an object that overlaps is pushed clear; as many again point halfway up."""
+HEADINGS = 8  # sideways directions in which an object that overlaps is pushed clear; as many again point halfway up
 TILT_STEPS = (0.0, 0.15, 0.3, 0.5)
 """Shares by which a long object is turned upright, where pushing alone would move it far."""
 LONG_RATIO = 2.5
-METRES_PER_RAD = 0.05
-"""Cost of turning an object against pushing it."""
-DRAWS = 16
-"""Random poses tried for one fall; the one that starts lowest is taken."""
+METRES_PER_RAD = 0.05  # cost of turning an object against pushing it
+DRAWS = 16  # random poses tried for one fall; the one that starts lowest is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)

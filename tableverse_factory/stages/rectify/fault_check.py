@@ -7,10 +7,8 @@ from tableverse_factory.geometry.collision.linear_sweep import MIN_MARGIN_M, TOL
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.vertical import UP
 
-MAX_SUNK_M = 1e-6
-"""A part below the table by no more than this stands on it [m]."""
-MAX_HOVER_M = 1e-3
-"""A part that would sink by no more than this lies still [m]."""
+MAX_SUNK_M = 1e-6  # A part below the table by no more than this stands on it [m]
+MAX_HOVER_M = 1e-3  # A part that would sink by no more than this lies still [m]
 
 LET_DOWN_M, NEAR_M, PAST_M = 4 * TOLERANCE_M, 5 * TOLERANCE_M, 7 * TOLERANCE_M
 """Reductions of the clearance: to lower parts past others, to find parts too near, and to test whether a part would
@@ -18,8 +16,7 @@ sink. In this order, the last two further apart than the tolerance: then no lowe
 no permitted neighbour holds a part by its side.
 """
 
-ROUND_M = 2e-3
-"""A round part's lowest corner lies below its centre of mass, to within this [m]."""
+ROUND_M = 2e-3  # A round part's lowest corner lies below its centre of mass, to within this [m]
 
 
 def is_faultless(parts: Sequence[RigidPart], clearance_m: float) -> bool:

@@ -18,12 +18,9 @@ from tableverse_factory.stages.rectify.drop_contents import (
     find_seen_starts,
 )
 
-SEEN_TRIES, RANDOM_TRIES = 8, 3
-"""Falls from starts near the seen pose, and from random ones."""
-SLACK_M = 1e-4
-"""Gap that free fall keeps beyond the clearance; contacts yield by a fifth of this."""
-FREED_TRIES = 2
-"""Tries of settling all contents together; each starts from standstill."""
+SEEN_TRIES, RANDOM_TRIES = 8, 3  # falls from starts near the seen pose, and from random ones
+SLACK_M = 1e-4  # gap that free fall keeps beyond the clearance; contacts yield by a fifth of this
+FREED_TRIES = 2  # tries of settling all contents together; each starts from standstill
 LEFT = "left its container when everything in it was freed together"
 RESTLESS = "did not come to rest when everything in its container was freed together"
 UNSTABLE = "the simulation broke down when everything in its container was freed together"

@@ -11,8 +11,7 @@ from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_box,
 
 Entity = tuple[int, ...]
 """Indices of an object and what it contains, the outermost container first: a composite moves as one."""
-Group = tuple[Entity, ...]
-"""Entities that stand over one another: they move sideways as one."""
+Group = tuple[Entity, ...]  # entities that stand over one another: they move sideways as one
 
 RATIO_TOLERANCE = 1e-9
 

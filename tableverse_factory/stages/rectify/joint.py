@@ -25,14 +25,11 @@ from tableverse_factory.stages.rectify.vertical import UP, lift_contents
 
 Azimuths = Float64[np.ndarray, " n"]
 
-AT_REST_M = 1e-6
-"""Lowering ends with a motion smaller than this [m]."""
-MAX_NOISE_M = 0.025
-"""Where no part moves further, noise explains it, and the radial method is not tried [m]."""
+AT_REST_M = 1e-6  # lowering ends with a motion smaller than this [m]
+MAX_NOISE_M = 0.025  # where no part moves further, noise explains it, and the radial method is not tried [m]
 SAME_WAY_RAD = 1e-4
 """Azimuths that differ by less are equal, so that rounding errors do not order a row of objects [rad]."""
-MAX_TILT_RAD = np.radians(4.0)
-"""Standing parts are levelled by at most this; more is no noise."""
+MAX_TILT_RAD = np.radians(4.0)  # standing parts are levelled by at most this; more is no noise
 
 
 def rectify_jointly(parts: Sequence[RigidPart], config: RectifyConfig) -> RectificationResult:

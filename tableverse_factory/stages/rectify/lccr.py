@@ -15,8 +15,7 @@ from tableverse_factory.stages.rectify.vertical import disentangle, lift_content
 SpreadFunction = Callable[[Sequence[RigidPart], Sequence[Group], float], list[RigidPart]]
 """Phase 2: parts, ordered groups and clearance [m] to moved parts."""
 
-HANGING_M = 1e-9
-"""A group whose lowest vertex is higher than this hangs in the air."""
+HANGING_M = 1e-9  # A group whose lowest vertex is higher than this hangs in the air
 
 
 @dataclass(frozen=True, slots=True, eq=False)

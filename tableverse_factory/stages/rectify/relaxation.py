@@ -33,31 +33,23 @@ REACH_M = 0.012
 Two parts that both move as far as a step allows may close 21 mm and more and so collide; the next step separates them,
 and after the last one the exact clean-up does.
 """
-WISHED_REACH_M = 0.025
-"""The same for a part and its carrier, which noise may have moved this far apart [m]."""
+WISHED_REACH_M = 0.025  # the same for a part and its carrier, which noise may have moved this far apart [m]
 STEPS, LAST_STEPS = 10, 5
 MAX_WORK = 3e9
 """Budget of all steps of a layout, in constraints times the square of unknowns: thirty times that of ten objects in one
 place."""
-MAX_ENTRIES = 2e7
-"""Corners near planes times unknowns of a step, at most: 160 MB; ten boxes in one place have 2e4."""
+MAX_ENTRIES = 2e7  # corners near planes times unknowns of a step, at most: 160 MB; ten boxes in one place have 2e4
 MAX_WAYS_OUT = 5000
 """Budget of ways out for a layout, in entangled pairs times parts: some seconds; a dozen objects have at most 800."""
 CONVERGED = 2e-5
-PATIENCE, STUCK_M = 4, 2e-4
-"""Pairs that still overlap this much after this many steps are entangled [m]."""
-EXTRA_M = 2e-6
-"""Added to the clearance, so that the exact clean-up has nothing to do [m]."""
-CONTACT_M = 0.0005
-"""Deviation of a wished contact that costs as much as a motion by the noise [m]."""
+PATIENCE, STUCK_M = 4, 2e-4  # pairs that still overlap this much after this many steps are entangled [m]
+EXTRA_M = 2e-6  # added to the clearance, so that the exact clean-up has nothing to do [m]
+CONTACT_M = 0.0005  # deviation of a wished contact that costs as much as a motion by the noise [m]
 SOFTNESS = 0.05
 """Remaining overlap, in `UNIT`, that costs as much as a motion by the noise, where the constraints contradict."""
-TILTS = (0.05, 0.15)
-"""The lowest points are searched in directions this far from straight down [rad]."""
-UPWARD = 0.3
-"""Least vertical part of the normal of a wished contact."""
-UNIT = 1e-3
-"""Unit of the constraints, so that all numbers are near one [m]."""
+TILTS = (0.05, 0.15)  # the lowest points are searched in directions this far from straight down [rad]
+UPWARD = 0.3  # least vertical part of the normal of a wished contact
+UNIT = 1e-3  # unit of the constraints, so that all numbers are near one [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,8 +25,7 @@ from tableverse_factory.geometry.mesh.mass_integrals import compute_volumes_and_
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 
 Vector2 = Float64[np.ndarray, "2"]
-Box2 = Float64[np.ndarray, "2 2"]
-"""Lowest and highest corner, seen from above [m]."""
+Box2 = Float64[np.ndarray, "2 2"]  # lowest and highest corner, seen from above [m]
 
 FOOTPRINT_STEP_M2 = 1e-10
 LEAST_VOLUME_M3 = 1e-18

@@ -12,26 +12,19 @@ from schemas.geometry import Points
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, are_within, find_nearest_point
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, Vector2
 
-TILT_NOISE_DEG = 3.0
-"""An object is as good as upright if it would stand when tilted by up to this."""
+TILT_NOISE_DEG = 3.0  # an object is as good as upright if it would stand when tilted by up to this
 BASIN_DEG = 6.0
 """Tilted by this much, a standing object has its centre of mass higher than for some tilt within the noise."""
-BASIN_TOLERANCE_M = 2e-4
-"""Round objects stand in any direction: their centre of mass must not sink by more than this."""
-ON_TABLE_M = 0.008
-"""An object whose lowest vertex is higher than this does not stand on the table."""
+BASIN_TOLERANCE_M = 2e-4  # round objects stand in any direction: their centre of mass must not sink by more than this
+ON_TABLE_M = 0.008  # an object whose lowest vertex is higher than this does not stand on the table
 
-VERTICAL_NOISE_M = 0.012
-"""An object that must rise or sink by no more than this to lie upon another may lie upon it."""
+VERTICAL_NOISE_M = 0.012  # an object that must rise or sink by no more than this to lie upon another may lie upon it
 STEEP_NOISE_M = 0.025
 """The same at steep edges, which turn sideways noise into height, if the opposite order is twice as far."""
-NEEDY_REACH = 1.5
-"""Factor on the contact distance for an object that could not stand alone."""
-LEANING_REACH_M = 0.02
-"""Noise may have moved an object this far from the one it leans on."""
+NEEDY_REACH = 1.5  # factor on the contact distance for an object that could not stand alone
+LEANING_REACH_M = 0.02  # noise may have moved an object this far from the one it leans on
 
-Outline = Float64[np.ndarray, "n 3"]
-"""Half planes (normal, offset) around a footprint."""
+Outline = Float64[np.ndarray, "n 3"]  # half planes (normal, offset) around a footprint
 
 
 @dataclass(frozen=True, slots=True)

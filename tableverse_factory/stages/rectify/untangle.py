@@ -11,8 +11,7 @@ from tableverse_factory.stages.rectify.support import SupportRelation
 from tableverse_factory.stages.rectify.vertical import UP
 
 AZIMUTHS = 16
-UPWARD_COST = 1.5
-"""Cost of a way up against a way aside, as a rising part leaves its carrier."""
+UPWARD_COST = 1.5  # cost of a way up against a way aside, as a rising part leaves its carrier
 
 
 def release_parts(

@@ -10,10 +10,8 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.resample import resample_depth
 
-MODEL_BEND = 0.015
-"""Share of the distance by which monocular depth may be bent smoothly."""
-_IMPLAUSIBLE_M = 100.0
-"""A depth map entirely beyond this is probably in another unit [m]."""
+MODEL_BEND = 0.015  # share of the distance by which monocular depth may be bent smoothly
+_IMPLAUSIBLE_M = 100.0  # A depth map entirely beyond this is probably in another unit [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,8 +15,7 @@ from tableverse_factory.stages.observe.depth.focal import read_exif_focal
 MAX_SIDE_PX = 2048
 """Maximum longer side; larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest."""
 
-MAX_ASPECT = 8.0
-"""Maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures."""
+MAX_ASPECT = 8.0  # maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures
 
 
 @dataclass(frozen=True, slots=True, eq=False)

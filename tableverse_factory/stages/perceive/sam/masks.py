@@ -11,13 +11,10 @@ from schemas.geometry import Frozen, IdImage, Picture
 from tableverse_factory.models.local.device import Tensor, import_torch
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID
 
-REACH = 0.25
-"""Maximum distance of contents from their container's mask, in shorter sides of its box."""
-MIN_FILL = 0.1
-"""Share of its box that a container's mask must fill to be used; a tray seen edge-on fills a fifth."""
+REACH = 0.25  # maximum distance of contents from their container's mask, in shorter sides of its box
+MIN_FILL = 0.1  # share of its box that a container's mask must fill to be used; a tray seen edge-on fills a fifth
 OUTSIDE = -1.0
-MAX_SCORES = 64_000_000
-"""Maximum number of scores at the size of the picture held at once; four bytes each."""
+MAX_SCORES = 64_000_000  # maximum number of scores at the size of the picture held at once; four bytes each
 
 
 @dataclass(frozen=True, slots=True, eq=False)

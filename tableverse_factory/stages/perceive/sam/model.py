@@ -16,8 +16,7 @@ from tableverse_factory.models.local.pixels import HALF, IMAGENET, Normalization
 from tableverse_factory.models.local.weights import load_pretrained
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, clip_boxes, compute_id_image, to_id_image
 
-BOXES = 5
-"""Number of boxes of a picture that are decoded at a time; the last batch is padded."""
+BOXES = 5  # number of boxes of a picture that are decoded at a time; the last batch is padded
 FLOAT32_PARTS = ("prompt_encoder", "shared_image_embedding")
 """Modules that encode coordinates: in bfloat16 they would be off by up to four pixels."""
 
