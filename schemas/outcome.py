@@ -87,7 +87,6 @@ class Allowance:
     """Budget that a chain of stages may still spend on model requests; None for no limit.
 
     Attributes:
-        calls: Requests.
         usd: A request may begin as long as less than this is spent [USD].
         name: Under which costs are logged; empty if no model is asked.
     """

@@ -103,8 +103,6 @@ class ExportedScene(Frozen):
         files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
             `observation/…`, `trajectories/…`.
         scene_row: Columns of scenes/ that the scene itself determines (`schemas.arrow.SCENES`).
-        object_rows: Rows of objects/.
-        task_rows: Rows of tasks/.
         trajectory_rows: Rows of trajectories/; none in builds without trajectories.
     """
 

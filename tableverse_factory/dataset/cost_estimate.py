@@ -102,8 +102,6 @@ class CostEstimate:
     """Cost estimate of a build.
 
     Attributes:
-        scenes: Scenes that are planned.
-        measured: Scenes that were measured.
         cpu_hours: CPU time that the stages use.
         cpu_hours_held: CPUs that actors hold, waiting included.
         gpu_hours: GPUs that actors hold.

@@ -35,9 +35,6 @@ class ChangedError(StoreError):
 def translate_errors(what: str) -> Iterator[None]:
     """Translate what huggingface_hub raises into one line.
 
-    Args:
-        what: Subject of the request, which begins the line.
-
     Raises:
         ChangedError: if a commit was to follow another than the newest.
         StoreError: for every other failure of the Hub or the connection.

@@ -21,7 +21,6 @@ class RulesAgreement:
     """Agreement of judge and rules, over the scenes that another judge than the rules has judged.
 
     Attributes:
-        scenes: Number of these scenes.
         usable_share: Scenes with the same gate.
         score_difference: Median of judge minus rules.
         names_share: Objects with the same noun, mean over scenes.

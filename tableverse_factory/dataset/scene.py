@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Exported scene.
-
-    Attributes:
-        row: Its row of scenes/.
-    """
+    """Exported scene."""
 
     scene_id: str
     row: Mapping[str, Any]

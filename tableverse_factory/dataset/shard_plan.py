@@ -24,7 +24,6 @@ class Plan:
 
     Attributes:
         scene_ids: Unique ids; a scene's index in here is its rank everywhere.
-        kinds: Kind of each scene.
         shards: Shard of each scene, ascending from 0.
     """
 

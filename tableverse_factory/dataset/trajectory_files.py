@@ -71,13 +71,7 @@ def find_misfits(rows: Sequence[Row], files: Mapping[str, bytes], task_ids: Sequ
 
 
 def find_changes(rows: Sequence[Row], files: Mapping[str, bytes], scene: Row) -> Iterator[str]:
-    """Find what has changed or is lost since the scene was written; one line each.
-
-    Args:
-        rows: Of the scene's trajectories.
-        files: Of the scene.
-        scene: Its row of scenes/.
-    """
+    """Find what has changed or is lost since the scene was written; one line each."""
     if len(rows) != (scene.get("n_trajectories") or 0):
         yield f"trajectories/ has {len(rows)} rows of it, and scenes/ says {scene.get('n_trajectories') or 0}"
     for row in rows:

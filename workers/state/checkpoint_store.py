@@ -1,10 +1,9 @@
 """Stage outputs kept beside the dataset, so that nothing is computed or paid for twice after a kill.
 
-A checkpoint's name says what it was made from: the scene, the stage, and a key over everything that the stage and those
-before it have read. So a checkpoint is valid wherever it is found, and one of another configuration is never taken. The
-process that made it writes it at once; it is verified when read, and a torn one counts as missing. A checkpoint may
-also be a tombstone: the committed shard holds what it stands for. On the disk each process appends to its own packs
-(see `checkpoint_pack`); in a store each checkpoint is an object.
+A checkpoint's name holds the scene, the stage, and a key over everything that the stage and those before it have read,
+so one of another configuration is never taken. It is verified when read, and a torn one counts as missing. A tombstone
+says that the committed shard holds what it stands for. On the disk each process appends to its own packs (see
+`checkpoint_pack`); in a store each checkpoint is an object.
 """
 
 import json

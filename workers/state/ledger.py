@@ -77,9 +77,6 @@ class Ledger:
     def record(self, result: SceneResult) -> bool:
         """Record a scene's result, and commit its shard if it was the last one missing.
 
-        Returns:
-            Whether the shard is committed now.
-
         Raises:
             BuildError: if the disk is full or refuses; nothing recorded earlier is lost.
         """

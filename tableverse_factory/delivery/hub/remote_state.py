@@ -46,13 +46,6 @@ class RemoteState:
 def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, replace: bool) -> RemoteState:
     """Inspect the repository, and check that `contents` may go there.
 
-    Args:
-        api: The Hub.
-        contents: To be uploaded.
-        name: Of the dataset on the Hub.
-        public: Whether everybody is to read it.
-        replace: Whether another dataset may be deleted.
-
     Raises:
         BuildError: if something else is there, or its visibility is not the requested one.
         StoreError: if the Hub refuses or fails.

@@ -2,9 +2,8 @@
 
 The library's own upload of a folder makes commits wherever its files happen to fall; here the first commit holds
 `run.json`, the plan and the card, and each of the following whole shards. A reader at any commit sees an unfinished
-dataset, as on the disk. Nothing is kept beside the dataset to resume an upload: the Hub is asked what it has, by
-content. Every commit must follow the inspected one, or the state is inspected anew, so that two uploads under one name
-do not mix.
+dataset, as on the disk. An upload resumes from what the Hub has, by content. Every commit must follow the inspected
+one, or the state is inspected anew, so that two uploads under one name do not mix.
 """
 
 import sys
@@ -55,9 +54,6 @@ def upload(contents: UploadSet, name: str, options: UploadOptions, report: Repor
         name: Of the dataset on the Hub, as `OWNER/NAME`; created if missing.
         options: Visibility, and what may be overwritten.
         report: Called with a line before every commit.
-
-    Returns:
-        Address of the last commit.
 
     Raises:
         BuildError: if something else is there, or the dataset is public and was to be private.

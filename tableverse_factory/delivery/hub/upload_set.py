@@ -30,14 +30,10 @@ class UploadSet:
     """Dataset as it would be uploaded.
 
     Attributes:
-        out: Its folder.
         run: Its `run.json`.
-        n_shards: Number of planned shards.
         shards: Numbers of the committed ones, in order.
         card: Its `README.md`.
         sizes: Of every file, by its path below `out` [bytes], without the card.
-        scenes: Number of scenes with a row.
-        with_files: Number of them with files.
         licences: Scenes by name of their licence; empty if none is stated.
         verdicts: Scenes by what their licences and those of their meshes allow; the freest first.
         private_values: Number of rows and configuration values that name files or addresses of the building machine.
@@ -114,12 +110,7 @@ def collect_upload_set(out: Path) -> UploadSet:
 
 
 def find_refusals(contents: UploadSet, unfinished: bool) -> list[str]:
-    """Find the reasons not to upload it, each with what to do.
-
-    Args:
-        contents: To be uploaded.
-        unfinished: Whether shards may be missing.
-    """
+    """Find the reasons not to upload it, each with what to do."""
     found = []
     missing = contents.n_shards - len(contents.shards)
     if missing and not unfinished:

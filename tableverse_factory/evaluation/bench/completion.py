@@ -49,7 +49,6 @@ class CompletionScore:
     """Score of one method on one view of a mesh.
 
     Attributes:
-        mesh: Name of the mesh.
         view: Index into `VIEWS`.
         method: `hull`, `height field`, or the `completion` that the place stage recorded.
         iou: Volume of the intersection over the union; 0 where nothing was placed.

@@ -26,11 +26,9 @@ class PieceScore:
     """Score of one method on one mesh, or on several: the sums of time and pieces, the means of the rest.
 
     Attributes:
-        mesh: File name.
         method: Key of `DECOMPOSITIONS`.
         cpu_s: CPU time of repair, simplification and decomposition [s].
         faster: CPU time of the first method over that of this one.
-        pieces: Number of pieces.
         volume_ratio: Volume of the union of the pieces over that of the mesh.
         volume_error: Absolute difference of `volume_ratio` from 1.
         hausdorff: Hausdorff distance between mesh and pieces over the longest side of the mesh.

@@ -30,8 +30,6 @@ class FactoryRun:
 
     Attributes:
         what: `local`, `ray`, `burning` or `ray data`.
-        workers: Number of workers.
-        scenes: Number of scenes.
         working_s: Wall time from the start of the driver's work until the last commit, start of workers included [s].
         steady_s: Wall time from the first finished scenes until the last commit [s].
         steady_scenes: Scenes finished in that time.

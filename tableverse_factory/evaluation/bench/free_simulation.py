@@ -31,7 +31,6 @@ class ReleasedScene(Frozen):
 
     Attributes:
         bodies: In the order of the layout's objects.
-        slab: The table.
     """
 
     bodies: tuple[SceneBody, ...]
@@ -59,13 +58,7 @@ def make_scene(item: PlacedObjects, pieces: Sequence[ConvexPieces], poses: Seque
 
 
 def simulate_to_rest(scene: ReleasedScene, config: SettleConfig, gentle: bool) -> tuple[ReleasedScene, bool]:
-    """Simulate to rest; return the scene and whether it came to rest within the time limit.
-
-    Args:
-        scene: Initial scene.
-        config: Time step and time limit.
-        gentle: Whether to damp the first motion as the settle stage does.
-    """
+    """Simulate to rest; return the scene and whether it came to rest within the time limit."""
     ended, rest = bring_to_rest(
         scene.bodies, scene.slab, timestep_s=config.timestep_s, max_time_s=config.max_time_s, gentle=gentle
     )

@@ -36,7 +36,6 @@ class Containment:
 
     Attributes:
         true: True pairs with both objects visible in the true masks.
-        found: Pairs that were found.
         correct: Found pairs whose objects match those of a true pair, one to one by their masks.
     """
 

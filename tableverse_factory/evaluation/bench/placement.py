@@ -43,7 +43,6 @@ class PlacementError:
 
     Attributes:
         scene: Name of the capture's folder.
-        label: True label.
         completion: Kind of completion; empty if the object was not placed.
         visible_fraction: Visible part of the object in the image.
         symmetry: Number of headings at which the true mesh looks alike: 1 for none but its own, 0 for all (round).

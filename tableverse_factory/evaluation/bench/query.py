@@ -30,10 +30,6 @@ class QueryTimes:
     """Medians of `REPEATS` repetitions after a warm-up [ms].
 
     Attributes:
-        what: Name of the dataset.
-        shards: Number of shards.
-        scenes: Number of scenes.
-        objects: Number of objects.
         found: Number of objects that pass the filter.
         filter_ms: Filter of objects by label and confidence, in the columns that `query` shows.
         count_ms: Count of usable scenes from a score on.
@@ -94,16 +90,7 @@ def bench_query(out: Path, what: str) -> QueryTimes:
 
 
 def write_query_dataset(out: Path, scenes: int, shard_size: int) -> int:
-    """Write a dataset of minimal scenes with ten objects each and random figures.
-
-    Args:
-        out: New folder.
-        scenes: Number of scenes.
-        shard_size: Scenes per shard.
-
-    Returns:
-        Number of shards.
-    """
+    """Write a dataset of minimal scenes with ten objects each and random figures."""
     rng = np.random.default_rng(0)
     for folder in ("mjcf", "scenes", "objects", "tasks"):
         (out / folder).mkdir(parents=True)

@@ -206,8 +206,6 @@ class OutcomeCounts:
     """Outcomes of tasks.
 
     Attributes:
-        tasks: Number of tasks by relation, then in all.
-        succeeded: Number of successes.
         free: Number of tasks whose object is free.
         free_succeeded: Number of successes among these.
         reasons: Number of failures by reason, most frequent first.

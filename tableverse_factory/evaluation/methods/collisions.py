@@ -32,7 +32,6 @@ class SceneCollisions:
     """Collisions of one scene.
 
     Attributes:
-        name: Name of the scene.
         objects: Number of objects compared, without the table.
         meshes: Pairs with overlapping meshes, deepest first.
         pieces: Pairs with overlapping convex pieces, deepest first; None if they were not measured.
@@ -80,7 +79,6 @@ class MethodCollisions:
     """Collisions of one method over all its scenes.
 
     Attributes:
-        method: Name of the method.
         epsilon_m: Depth beyond which objects collide [m].
         scenes: Measured scenes, and those that could not be measured.
         dropped: Number of scenes that the factory dropped, which are not among them; None if unknown.

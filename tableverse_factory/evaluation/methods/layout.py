@@ -62,7 +62,6 @@ class SceneLayout:
     """Comparison of one scene.
 
     Attributes:
-        name: Name of the scene.
         matches: One per true object.
         extra: Names of objects of the result without a true object.
         kept: True relations of support and containment, and those that hold in the result.

@@ -15,8 +15,6 @@ class MethodObject(Frozen):
         name: Id in the scene.
         mesh: Shape as one mesh in its own frame: visual meshes, and solids without a visual mesh.
         looks: Visual meshes with colours.
-        pose: Pose in the scene.
-        scale: Scale of the mesh.
         pieces: Convex pieces if the file has them (MJCF), else None.
         baked_scale: Scale that an export has already applied to the mesh.
     """

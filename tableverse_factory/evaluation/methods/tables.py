@@ -42,7 +42,6 @@ class Tables:
         shared: The same over the scenes that could be measured for every method (table 1).
         votes: The judge's marks; None without recorded answers.
         ablation: Configurations of each method that is one of our datasets (table 2).
-        seed: Seed of the bootstrap.
     """
 
     collisions: tuple[MethodCollisions, ...]

@@ -76,7 +76,6 @@ class Vote:
 
     Attributes:
         columns: The methods from the left, as they were shown.
-        marks: By method.
     """
 
     scene: str

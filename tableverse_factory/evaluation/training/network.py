@@ -20,9 +20,6 @@ class ConvLayer:
 
     Attributes:
         name: Name of its weights and its result.
-        source: Name of its input.
-        inputs: Input channels.
-        outputs: Output channels.
         kernel: Side of the kernel [px].
         stride: Stride [px].
         dilation: Spacing of the kernel's taps [px].

@@ -34,7 +34,6 @@ class TrainSettings:
     """Settings that determine the weights, besides the device.
 
     Attributes:
-        scenes: Number of synthetic scenes.
         steps: Number of steps, each on `batch` random views.
         seed: Seed of scenes, first weights, order and augmentation.
         batch: Views per step.

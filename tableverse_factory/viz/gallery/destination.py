@@ -52,10 +52,6 @@ def resolve_destination(dest: Path, dataset: Path | None) -> Path:
 def check_replaceable(folder: Path, name: str) -> None:
     """Check that a folder is absent, empty, or holds nothing but a gallery.
 
-    Args:
-        folder: The folder.
-        name: Its name in errors.
-
     Raises:
         InputError: if it is a file, or holds something that is not part of a gallery.
     """
@@ -76,11 +72,7 @@ def check_replaceable(folder: Path, name: str) -> None:
 
 
 def _list_entries(folder: Path) -> Iterator[str]:
-    """List everything below a folder by relative name; folders end in a slash. Links are not followed.
-
-    Raises:
-        OSError: if a folder cannot be read.
-    """
+    """List everything below a folder by relative name; folders end in a slash. Links are not followed."""
     for base, folders, files in os.walk(folder, onerror=_reraise):
         above = Path(base).relative_to(folder)
         for name in sorted(files):

@@ -30,7 +30,6 @@ class MotionCard:
     """A trajectory on the page of its scene.
 
     Attributes:
-        row: Row of trajectories/.
         film: Name of the film and of its still without suffix; empty without a film.
         plot: Joints and gripper over time as markup; None without a plot.
         problem: Reason why the recording could not be shown.

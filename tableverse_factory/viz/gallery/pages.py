@@ -20,8 +20,6 @@ class Site:
     """Data that all pages of a gallery share.
 
     Attributes:
-        folder: Folder of the gallery.
-        dataset: Name of the dataset.
         out: Absolute path or address of the dataset.
         n_done: Number of scenes with a page.
         n_lost: Number of scenes listed with their reason.

@@ -40,11 +40,9 @@ class PictureSet:
     """File names of the pictures of a scene without suffix; empty for those that do not exist.
 
     Attributes:
-        photo: The photograph.
         twin: The twin from the camera of the photograph.
         before: View from above the front of the observed layout.
         front: The same view of the exported scene.
-        top: View from the top.
         sketch: A small and quick picture, without photograph and render.
         photo_height: Height of photograph and twin, `WIDTH` wide [px].
     """

@@ -16,11 +16,9 @@ class SceneJob:
     """A scene to write.
 
     Attributes:
-        scene: Its rows.
         render: Whether to draw its twin, plots and films.
         before: Id of the previous scene; empty for the first.
         after: Id of the next scene; empty for the last.
-        page: Number of the page with its card.
     """
 
     scene: SceneRecord
@@ -35,7 +33,6 @@ class SceneCard:
     """Data of a scene for its card and the filters.
 
     Attributes:
-        scene_id: Id of the scene.
         pictures: Its pictures; None if they could not be made.
         problem: Reason why there are no pictures.
         reason_codes: The judge's reasons why the scene is not usable.

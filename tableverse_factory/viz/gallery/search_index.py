@@ -22,14 +22,7 @@ MOST_LABELS = 500
 def write_search_index(
     path: Path, done: Sequence[SceneRecord], cards: Sequence[SceneCard], lost: Sequence[SceneRecord]
 ) -> None:
-    """Write the data, without markup: `<` and all but ASCII are escaped.
-
-    Args:
-        path: Path of the script.
-        done: Finished scenes.
-        cards: Card of each finished scene.
-        lost: Dropped and failed scenes.
-    """
+    """Write the data, without markup: `<` and all but ASCII are escaped."""
     names = Counter(name for scene in done for name in set(scene.labels))
     labels = sorted(names, key=lambda name: (-names[name], name))
     number = {name: index for index, name in enumerate(labels)}

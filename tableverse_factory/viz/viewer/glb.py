@@ -32,12 +32,7 @@ def encode_visuals(looks: Sequence[VisualMesh]) -> bytes:
 
 
 def encode_pieces(hulls: Sequence[TriangleMesh], first: int) -> bytes:
-    """Encode the convex pieces of one object, each in its own colour and with flat faces.
-
-    Args:
-        hulls: The pieces.
-        first: Number of the first colour, so that objects of one piece differ too.
-    """
+    """Encode the convex pieces of one object, each in its own colour and with flat faces."""
     scene = trimesh.Scene()
     if hulls:
         starts = np.cumsum([0, *(len(hull.vertices) for hull in hulls[:-1])])

@@ -38,10 +38,8 @@ class VisualBody(Frozen):
     """An object in its own frame.
 
     Attributes:
-        name: Name in the model.
         look: GLB of the visual meshes; empty without any.
         pieces: GLB of the convex pieces.
-        n_pieces: Number of pieces.
         shape: Mesh of the whole object, for ghosts [m].
         mass_kg: Mass in the simulation [kg].
     """

@@ -20,9 +20,6 @@ class SceneList:
     def search(self, current: str) -> str | None:
         """Search by the controls.
 
-        Args:
-            current: The shown scene.
-
         Returns:
             The scene to show instead; None if the shown one matches too, or none does.
 

@@ -157,11 +157,7 @@ def _wrap_websocket_handlers(guard: Callable[[Any, _Handler], Awaitable[None]]) 
 
 
 def _check_port(host: str, port: int) -> None:
-    """Check that the port is free: viser would silently take the next one.
-
-    Raises:
-        InputError: `port_in_use` or `bad_host`.
-    """
+    """Check that the port is free: viser would silently take the next one."""
     where = sanitize_line(host, 100)
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
