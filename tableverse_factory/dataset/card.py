@@ -40,7 +40,10 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
         shards: Numbers of the committed shards, the only ones it covers.
     """
     scenes = _read_scenes(out, shards)
-    rows = {table: _count_rows(out, table, shards) for table in ("objects", "tasks")}
+    rows = {
+        table: sum(found.num_rows for found in read_shards(out, table, shards, ["scene_id"]))
+        for table in ("objects", "tasks")
+    }
     status = Counter(scenes["status"].to_pylist())
     motions = summarize_trajectories(out, shards)
     bound = _select_done(scenes, "licence", "mesh_licences")
@@ -176,10 +179,6 @@ def _sort_by_count(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
 def _read_scenes(out: StoragePath, shards: Sequence[int]) -> pa.Table:
     tables = read_shards(out, "scenes", shards, _COLUMNS)
     return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
-
-
-def _count_rows(out: StoragePath, table: str, shards: Sequence[int]) -> int:
-    return sum(found.num_rows for found in read_shards(out, table, shards, ["scene_id"]))
 
 
 def _format_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

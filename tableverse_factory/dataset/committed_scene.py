@@ -32,11 +32,6 @@ ADDED_BY_COMMIT = frozenset(
 def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> ExportedScene | None:
     """Load a scene as it left `export`, without its trajectories.
 
-    Args:
-        out: The dataset.
-        shard: Of the scene.
-        scene_id: Of the scene.
-
     Returns:
         The stage's output; None if the shard is not committed, or the scene has no files in it.
 
@@ -46,7 +41,7 @@ def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> Exported
     """
     try:
         tables = _read_tables(out, shard, _read_version(shard_path(out, "scenes", shard)))
-        scenes, objects, tasks = (_select_rows(table, scene_id) for table in tables)
+        scenes, objects, tasks = (table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist() for table in tables)
         if not scenes or scenes[0]["tar_offset"] is None:
             return None
         files = _read_files(out, shard, scene_id, scenes[0])
@@ -64,10 +59,7 @@ def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> Exported
 def _read_tables(out: StoragePath, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
     """Read the tables of a shard, cached: its scenes are loaded one after the other, and in a store each is a download.
 
-    Args:
-        out: The dataset.
-        shard: Its number.
-        version: Of the table of scenes, which is removed first and written last when a shard is rewritten.
+    The version is that of the table of scenes, which is removed first and written last when a shard is rewritten.
     """
     return tuple(read_shard(out, table, shard) for table in ("scenes", "objects", "tasks"))
 
@@ -78,10 +70,6 @@ def _read_version(path: StoragePath) -> tuple[Hashable, ...]:
         return found["ETag"], found["LastModified"], found["size"]
     found = path.stat()
     return found.st_ino, found.st_mtime_ns, found.st_size
-
-
-def _select_rows(table: pa.Table, scene_id: str) -> list[dict[str, Any]]:
-    return table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist()
 
 
 def _read_files(out: StoragePath, shard: int, scene_id: str, row: Mapping[str, Any]) -> tuple[tuple[str, bytes], ...]:

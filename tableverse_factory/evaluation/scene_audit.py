@@ -30,7 +30,6 @@ class SceneAudit:
     """Audit of one scene.
 
     Attributes:
-        scene_id: Id of the scene.
         measured: Measured figures by the names of `Certificate`.
         problems: Problems, one line each.
     """
@@ -62,7 +61,8 @@ def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any
     ]
     if missing := sorted(set(meta.history.rectified) ^ set(measured.bodies)):
         problems.append(f"bodies and meta.json disagree on {', '.join(missing[:5])}")
-    return SceneAudit(scene_id, _to_dict(certificate), tuple(problems))
+    values = {f.name: getattr(certificate, f.name) for f in fields(Certificate)}
+    return SceneAudit(scene_id, values, tuple(problems))
 
 
 def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> SceneAudit:
@@ -161,7 +161,3 @@ def _equal(key: str, old: Any, new: Any) -> bool:
         tolerance = ANGLE_TOLERANCE_RAD if key.endswith("_rad") else LENGTH_TOLERANCE_M
         return isinstance(old, float | int) and abs(old - new) <= tolerance
     return bool(old == new)
-
-
-def _to_dict(certificate: Certificate) -> dict[str, Any]:
-    return {f.name: getattr(certificate, f.name) for f in fields(Certificate)}

@@ -31,8 +31,6 @@ class Ranking:
     """Frequencies of names.
 
     Attributes:
-        total: Number of occurrences of all names.
-        names: Number of different names.
         top: The most frequent names with their counts; equal counts in alphabetical order.
     """
 
@@ -216,11 +214,7 @@ def _merge_counts(total: pa.Table, parts: Sequence[pa.Table]) -> pa.Table:
 def _make_ranking(counts: pa.Table) -> Ranking:
     order = counts.sort_by([("count", "descending"), ("name", "ascending")]).slice(0, TOP).to_pylist()
     top = tuple((row["name"][:MAX_LABEL_CHARS], row["count"]) for row in order)
-    return Ranking(_total(counts), counts.num_rows, top)
-
-
-def _total(counts: pa.Table) -> int:
-    return int(pc.sum(counts["count"]).as_py() or 0)
+    return Ranking(int(pc.sum(counts["count"]).as_py() or 0), counts.num_rows, top)
 
 
 def _sample_tail(counts: pa.Table) -> tuple[tuple[int, int], ...]:

@@ -154,7 +154,7 @@ class Canvas:
             handle.remove()
         self._arm = []
         if motion is not None:
-            meshes = [_encode_arm_part(mesh) for mesh in (*motion.meshes, motion.pedestal)]
+            meshes = [encode_visuals([VisualMesh(mesh, _ARM_COLOR)]) for mesh in (*motion.meshes, motion.pedestal)]
             self._arm = [self._client.scene.add_glb(f"/arm/{k}", data) for k, data in enumerate(meshes)]
 
     def set_arm_poses(self, poses: Sequence[Pose]) -> None:
@@ -186,7 +186,3 @@ def _pose_arguments(pose: Pose) -> dict[str, np.ndarray]:
 
 def _set_pose(handle: Any, pose: Pose) -> None:
     handle.position, handle.wxyz = pose.position, pose.quaternion_wxyz
-
-
-def _encode_arm_part(mesh: TriangleMesh) -> bytes:
-    return encode_visuals([VisualMesh(mesh, _ARM_COLOR)])

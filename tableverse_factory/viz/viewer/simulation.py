@@ -75,7 +75,7 @@ class Simulation:
         mujoco.mj_resetData(self._model, self._data)
         for name, pose in poses.items():
             if name in self._bodies:
-                start = self._address(name)
+                start = int(self._model.jnt_qposadr[self._model.body_jntadr[self._bodies[name]]])
                 self._data.qpos[start : start + 3] = pose.position
                 self._data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
         mujoco.mj_forward(self._model, self._data)
@@ -138,6 +138,3 @@ class Simulation:
             -np.array(contact.dist)[chosen],
             len(kept),
         )
-
-    def _address(self, name: str) -> int:
-        return int(self._model.jnt_qposadr[self._model.body_jntadr[self._bodies[name]]])
