@@ -31,7 +31,7 @@ from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.physics.mjcf.drawables import Rgb, Scenery, load_scenery, make_scenery
+from tableverse_factory.physics.mjcf.scenery import Rgb, Scenery, load_scenery, make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
 from tableverse_factory.physics.render.views import (
     RenderQuality,
@@ -143,7 +143,9 @@ def curated(scene: CuratedScene) -> Picture:
     names = [its.label for its in layout.objects]
     meshes = _meshes(layout, scene.settled.poses)
     scenery = make_scenery([its.object_id for its in layout.objects], meshes, _slab(layout, meshes))
-    sheet = Image.fromarray(np.array(draw_judge_sheet(scenery, names))).resize((2 * WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    sheet = Image.fromarray(np.array(draw_judge_sheet(scenery, names))).resize(
+        (2 * WIDTH, WIDTH), Image.Resampling.LANCZOS
+    )
     verdict = scene.assessment
     masses = [f"{name}, {_mass(its.mass_kg)}" for name, its in zip(names, verdict.objects, strict=True)]
     tasks = sum(task.accepted for task in verdict.tasks)

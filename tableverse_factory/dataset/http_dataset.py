@@ -19,13 +19,11 @@ from tableverse_factory.dataset.consolidated_tables import MERGED
 from tableverse_factory.dataset.shard_plan import MAX_SHARDS, PLAN
 from tableverse_factory.dataset.shards import FOLDERS, SPARSE, shard_name
 
-MAX_WHOLE_BYTES = 512 * 1024**2
-"""Largest file that is read whole, such as the plan."""
+MAX_WHOLE_BYTES = 512 * 1024**2  # largest file that is read whole, such as the plan
 
 _FIRST_READ_BYTES = 64 * 1024
 _N_THREADS = 16
-_OPTIONAL_FOLDERS = frozenset({"scenes", MERGED, *SPARSE})
-"""Folders in which a dataset may lack a file."""
+_OPTIONAL_FOLDERS = frozenset({"scenes", MERGED, *SPARSE})  # folders in which a dataset may lack a file
 
 _ADDRESS_CHARS = re.compile(r"[^\s\x00-\x1f\x7f\\]+")
 

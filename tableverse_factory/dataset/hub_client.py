@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 RETRY_POLICY = RetryPolicy(attempts=5, backoff_s=2.0, max_backoff_s=300.0, max_asked_s=300.0)
-TIMEOUT_S = 300.0
-"""Time limit of an answer; requests that send bytes add to it [s]."""
+TIMEOUT_S = 300.0  # time limit of an answer; requests that send bytes add to it [s]
 
 _NO_SUCH_ENDPOINT = (404, 405, 501)
 

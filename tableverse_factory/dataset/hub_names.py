@@ -12,8 +12,7 @@ from tableverse_factory.core.text import sanitize_line
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-LIBRARY = "tableverse-factory"
-"""User agent of requests to the Hub."""
+LIBRARY = "tableverse-factory"  # user agent of requests to the Hub
 
 _PART = r"(?!.*(?:--|\.\.))[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
 _NAME = re.compile(rf"{_PART}/{_PART}")

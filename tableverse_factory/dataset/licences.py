@@ -11,7 +11,7 @@ from typing import Any
 
 
 class LicenceVerdict(StrEnum):
-    """What may be done with a scene, from the least to the most restricted."""
+    """Permitted use of a scene, from the least to the most restricted."""
 
     PERMISSIVE = "permissive"
     """May be adapted and passed on, at most with credit."""

@@ -5,11 +5,9 @@ from PIL import Image
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import LARGE_IMAGE_BOUNDS, decode_image, open_image
 
-PHOTOGRAPH = "observation/color.jpg"
-"""Its name among the files of a scene."""
+PHOTOGRAPH = "observation/color.jpg"  # its name among the files of a scene
 
-TALLEST = 4
-"""Largest ratio of height to width: a strip of four pixels by seven hundred would be scaled to megabytes."""
+TALLEST = 4  # largest ratio of height to width: a strip of four pixels by seven hundred would be scaled to megabytes
 
 
 def read_photograph(data: bytes, name: str, width: int) -> Image.Image:

@@ -13,8 +13,7 @@ from tableverse_factory.core.png import encode_png
 from tableverse_factory.physics.render.domain_randomization import randomize_appearance
 from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture, name_texture, parse_texture_seed
 
-TableTexture = int | str | Picture
-"""A seed, a name such as `marble-12`, or a picture of shape (h, w, 3), sRGB."""
+TableTexture = int | str | Picture  # A seed, a name such as `marble-12`, or a picture of shape (h, w, 3), sRGB
 
 TEXTURE_PX = 512
 MAX_PICTURE_PX = 8192

@@ -18,8 +18,7 @@ from tableverse_factory.dataset.trajectory_files import find_misfits
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
 """Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
 
-SPARSE = {"trajectories": "parquet"}
-"""Folders in which a shard has a file only if it has rows for it."""
+SPARSE = {"trajectories": "parquet"}  # folders in which a shard has a file only if it has rows for it
 
 _COPY_BYTES = 1024 * 1024
 _PARQUET = re.compile(r"shard-(\d{5,9})\.parquet")

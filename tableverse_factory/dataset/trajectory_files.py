@@ -8,8 +8,7 @@ from schemas.identity import check_id
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 
-FOLDER = "trajectories/"
-"""Folder of a scene for what came after the export, which is not in `meta.json`."""
+FOLDER = "trajectories/"  # folder of a scene for what came after the export, which is not in `meta.json`
 
 Row = Mapping[str, Any]
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.dataset.committed_rows import read_rows
 
-BEFORE = "before any motion"
-"""Phase of a task that failed because no motion was found for it."""
+BEFORE = "before any motion"  # phase of a task that failed because no motion was found for it
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,7 @@ from tableverse_factory.robotics.robots.registry import load_arm
 
 Row = Mapping[str, Any]
 
-SCENES_PER_PROCESS = 4
-"""Least scenes per process: the start of a process takes as long as measuring two."""
+SCENES_PER_PROCESS = 4  # least scenes per process: the start of a process takes as long as measuring two
 
 
 @dataclass(frozen=True, slots=True)

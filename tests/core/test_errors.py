@@ -21,7 +21,7 @@ from tableverse_factory.core.errors import AnswerInvalidError, InputError, Store
     ],
 )
 def test_topic_is_the_class_s_the_reason_or_the_given_one(error: TableverseError, topic: str) -> None:
-    travelled = pickle.loads(pickle.dumps(error)) - our own bytes
+    travelled = pickle.loads(pickle.dumps(error))
     assert (error.topic, str(error)) == (travelled.topic, str(travelled)) == (topic, "m")
 
 

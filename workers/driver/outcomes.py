@@ -20,10 +20,8 @@ _CONFIG_ERROR = ConfigError.__name__
 """Stops the build where a stage adds to finished scenes: a misspelt key must not add failed rows to them."""
 _MODEL_SILENT = ModelError.__name__
 """Postpones the scene where a stage adds to finished scenes: with failed rows it would count as done for ever."""
-_MAX_SILENT_IN_A_ROW = 5
-"""Postponed scenes in a row that stop the build: the model server is down."""
-_MAX_TRACES = 3
-"""Failures of a stage that are shown with their traceback."""
+_MAX_SILENT_IN_A_ROW = 5  # postponed scenes in a row that stop the build: the model server is down
+_MAX_TRACES = 3  # failures of a stage that are shown with their traceback
 
 
 class OutcomeRecorder:

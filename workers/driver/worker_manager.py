@@ -18,12 +18,9 @@ from workers.executors.schedule import (
     scale_up,
 )
 
-RESIZE_INTERVAL = 20
-"""Calls between two checks of the sizes of the pools."""
-PLACEMENT_TIMEOUT_S = 20.0
-"""A worker that takes longer to start fits on no node [s]."""
-_SMOOTHING = 0.05
-"""Weight of the newest scene in the moving average of its pool's scene time."""
+RESIZE_INTERVAL = 20  # calls between two checks of the sizes of the pools
+PLACEMENT_TIMEOUT_S = 20.0  # A worker that takes longer to start fits on no node [s]
+_SMOOTHING = 0.05  # weight of the newest scene in the moving average of its pool's scene time
 
 
 class WorkerManager:

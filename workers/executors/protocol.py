@@ -6,8 +6,7 @@ from typing import Any, Protocol
 from schemas.work import StageChain, StageChainReport
 from workers.executors.schedule import ScheduleLimits
 
-Payload = Any
-"""An encoded record: bytes in this process, or a reference into Ray's object store."""
+Payload = Any  # an encoded record: bytes in this process, or a reference into Ray's object store
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,8 +33,7 @@ from workers.sandbox.child import load_pipelines
 from workers.sandbox.parent import START_TIMEOUT_S
 
 CALL_GRACE_S = 60.0
-REFRESH_S = 10.0
-"""Interval between two checks of the nodes of a cluster [s]."""
+REFRESH_S = 10.0  # interval between two checks of the nodes of a cluster [s]
 
 
 @dataclass(frozen=True, slots=True)

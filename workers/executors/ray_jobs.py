@@ -17,13 +17,11 @@ from tableverse_factory.core.storage.files import redact_uri
 from workers.executors.ray_address import name_address_source, reject_secrets
 from workers.sandbox.error_text import sanitize_error_text
 
-OUT_KEY = "tableverse_out"
-"""Key of OUT in a job's metadata."""
+OUT_KEY = "tableverse_out"  # key of OUT in a job's metadata
 ADDRESS_HINT = "the head's port for jobs, e.g. http://head:8265"
 STOPPED_CODE = 143
 STOP_TIMEOUT_S = 60.0
-UNREACHABLE_S = 300.0
-"""Longest outage of the cluster while a job is followed [s]."""
+UNREACHABLE_S = 300.0  # longest outage of the cluster while a job is followed [s]
 _POLL_S = 1.0
 _MAX_TRIES = 20
 _SLUG_CHARS = 40

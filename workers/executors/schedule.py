@@ -4,8 +4,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-TARGET_CALL_S = 0.5
-"""Duration of a batch of scenes [s]: a call has an overhead of a millisecond."""
+TARGET_CALL_S = 0.5  # duration of a batch of scenes [s]: a call has an overhead of a millisecond
 MAX_BATCH = 64
 MIN_GAIN = 1.25
 """Pools are resized only for a throughput that is better by this factor, because starting a worker is expensive."""

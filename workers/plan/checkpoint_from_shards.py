@@ -17,8 +17,7 @@ from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, Checkp
 from workers.state.journal import find_journals, read_journal, read_result
 from workers.state.ledger import WORK, journal_path
 
-_N_THREADS = 8
-"""Threads for writes into a store, which mostly wait for answers."""
+_N_THREADS = 8  # threads for writes into a store, which mostly wait for answers
 
 Fingerprints = Mapping[str, Mapping[str, str]]
 

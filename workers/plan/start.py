@@ -36,8 +36,7 @@ from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore, fingerp
 from workers.state.commit import publish_ready
 from workers.state.ledger import WORK
 
-AGAIN_OPTION = "--again"
-"""Option of `tableverse trajectories` that recomputes its stage."""
+AGAIN_OPTION = "--again"  # option of `tableverse trajectories` that recomputes its stage
 
 
 def check_output_dir(out: StoragePath) -> None:

@@ -47,8 +47,7 @@ STAGING, READY = ".staging", ".ready"
 _WITHOUT = "without "
 """Precedes, in the ready file, a folder for which the shard has no rows, so that an older file is removed."""
 
-SceneRows = dict[str, list[dict[str, Any]]]
-"""The rows of one scene in each table."""
+SceneRows = dict[str, list[dict[str, Any]]]  # the rows of one scene in each table
 
 
 class CommittedShard:

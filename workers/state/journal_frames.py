@@ -12,8 +12,7 @@ from schemas.codec import encode
 from schemas.work import SceneResult
 from tableverse_factory.core.framing import scan_frames
 
-RESULT, REOPEN = b"+", b"-"
-"""First byte of a frame's label; the scene id follows."""
+RESULT, REOPEN = b"+", b"-"  # first byte of a frame's label; the scene id follows
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,12 +22,10 @@ from workers.state.lock_owner import decode_owner, describe_owner, encode_owner,
 if TYPE_CHECKING:
     from tableverse_factory.core.storage.s3 import VersionedObject
 
-LEASE_S = 30.0
-"""Age at which a lease that was not renewed has expired [s]."""
+LEASE_S = 30.0  # age at which a lease that was not renewed has expired [s]
 
 _HEARTBEAT_S = 5.0
-_SAFE_S = LEASE_S - 10.0
-"""How long a holder trusts its lease after it sent the last renewal that succeeded [s]."""
+_SAFE_S = LEASE_S - 10.0  # how long a holder trusts its lease after it sent the last renewal that succeeded [s]
 
 _POLL_S = 1.0
 

@@ -10,8 +10,7 @@ from tableverse_factory.core.storage.files import StoragePath
 from workers.state.file_lock import FileLock, describe_file_lock
 from workers.state.lease import Lease, describe_lease
 
-LOCK = "lock"
-"""Its name in the folder of the work."""
+LOCK = "lock"  # its name in the folder of the work
 
 
 class WriterLock(Protocol):

@@ -27,8 +27,7 @@ MAX_BYTES_A_COMMIT = 8 * 1024**3
 
 _SLOWEST_BYTES_PER_S = 200_000
 
-Report = Callable[[str], None]
-"""Takes a line about what is done next."""
+Report = Callable[[str], None]  # takes a line about what is done next
 
 
 @dataclass(frozen=True, slots=True)

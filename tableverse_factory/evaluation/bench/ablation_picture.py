@@ -18,8 +18,7 @@ from tableverse_factory.physics.mjcf.scenery import Rgb, Scenery, make_scenery
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.render.views import RenderQuality, make_front_camera, render_pictures
 
-LET_GO_S = 0.5
-"""Simulated time of the lower row [s]."""
+LET_GO_S = 0.5  # simulated time of the lower row [s]
 WIDTH, HEIGHT = 400, 276
 QUALITY = RenderQuality(samples=2, sky_rays=6)
 PALETTE: tuple[Rgb, ...] = (
@@ -38,8 +37,7 @@ PALETTE: tuple[Rgb, ...] = (
 _AZIMUTH = float(np.deg2rad(28.0))
 _TABLE_MARGIN_M = 0.25
 _CAPTION = 24
-GUTTER = 6
-"""White between two panels [px]."""
+GUTTER = 6  # white between two panels [px]
 
 
 def write_ablation(file: Path, layout: Path, methods: Sequence[str], config: Config, cache_dir: Path) -> None:

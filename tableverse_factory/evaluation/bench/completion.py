@@ -28,12 +28,10 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.physics.render.render import look_at, render
 from tableverse_factory.stages.place.place import place
 
-VIEWS = ((20.0, 35.0), (140.0, 50.0))
-"""Azimuth and elevation of the two cameras [degrees]."""
+VIEWS = ((20.0, 35.0), (140.0, 50.0))  # azimuth and elevation of the two cameras [degrees]
 SAMPLES = 10_000
 VOXEL_RANGE_M = (0.001, 0.004)
-VOXELS = 400_000
-"""Approximate number of points at which a pair of meshes is compared; thin walls need a fine grid."""
+VOXELS = 400_000  # approximate number of points at which a pair of meshes is compared; thin walls need a fine grid
 HEIGHT_CELL_M = 0.002
 HOLLOW_SHARE = 0.05
 """A mesh is hollow if a cavity that opens upward and has a floor takes at least this part of the volume of its hull."""

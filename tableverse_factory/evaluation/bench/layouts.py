@@ -31,8 +31,7 @@ from tableverse_factory.stages.rectify.rigid_part import RigidPart, make_rigid_p
 CROSSING_M = 0.001
 """Meshes that overlap by more than this in the truth collide there: no collision-free result can repeat it [m]."""
 
-RestPoses = dict[str, tuple[Pose, float]]
-"""True pose and scale of each object at rest."""
+RestPoses = dict[str, tuple[Pose, float]]  # true pose and scale of each object at rest
 
 
 class _RestPose(LayoutPose):

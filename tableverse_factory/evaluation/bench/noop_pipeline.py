@@ -13,8 +13,7 @@ from schemas.outcome import Done, Outcome
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.stage import Pool, Stage
 
-BURN_S = 0.02
-"""CPU time of each stage of the burning pipeline [s]."""
+BURN_S = 0.02  # CPU time of each stage of the burning pipeline [s]
 OBJECTS_PER_SCENE = 2
 _STAGES: tuple[tuple[str, Pool], ...] = (
     ("observe", "perception"),

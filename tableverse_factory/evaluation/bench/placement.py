@@ -33,8 +33,7 @@ from tableverse_factory.stages.place.place import place
 
 MESHES = ("carved", "replay")
 MASKS = ("replay", "geometric")
-UNIT = 1.0
-"""Longest side of a true mesh as `replay` receives it: a MeshModel does not know metres."""
+UNIT = 1.0  # longest side of a true mesh as `replay` receives it: a MeshModel does not know metres
 
 
 @dataclass(frozen=True, slots=True)

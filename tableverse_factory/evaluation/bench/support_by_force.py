@@ -14,10 +14,8 @@ from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.relations.support import Pairs
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, make_quiet_data
 
-LEAST_SHARE = 0.1
-"""An object is carried by another whose contact forces bear at least this share of its weight."""
-MEAN_OVER_S = 0.1
-"""Time over which forces are averaged: an object on an edge rests on changing pieces [s]."""
+LEAST_SHARE = 0.1  # an object is carried by another whose contact forces bear at least this share of its weight
+MEAN_OVER_S = 0.1  # time over which forces are averaged: an object on an edge rests on changing pieces [s]
 TRUE_REST_M = 0.005
 """An object that settles further than this from its true pose cannot stand there on its pieces: unknown [m]."""
 

@@ -31,8 +31,7 @@ from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.stages.trajectories.search import Attempt, search_trajectory
 from tableverse_factory.stages.trajectories.work_cell import WorkCell
 
-BLEND_RAD = 0.12
-"""Blend radius of the paths that are timed [rad]."""
+BLEND_RAD = 0.12  # blend radius of the paths that are timed [rad]
 
 FREE_M, BESIDE_M = 0.02, 0.01
 """An object is free if no other within `FREE_M` of its outline rises `BESIDE_M` above its lowest point [m]."""

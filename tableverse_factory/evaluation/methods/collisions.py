@@ -21,8 +21,7 @@ from tableverse_factory.geometry.collision.penetration import (
 )
 from tableverse_factory.geometry.convex.decompose import decompose
 
-Pair = tuple[str, str, float]
-"""Names of two objects and the depth of their overlap [m]."""
+Pair = tuple[str, str, float]  # names of two objects and the depth of their overlap [m]
 
 _Z95 = 1.959964
 

@@ -19,11 +19,9 @@ from tableverse_factory.physics.mjcf.scenery import Rgb, Scenery
 from tableverse_factory.physics.render.views import FINE, make_front_camera, render_pictures
 
 OBLIQUE = float(np.deg2rad(25.0))
-CELL = 448
-"""Side of a cell [px]."""
+CELL = 448  # side of a cell [px]
 
-HEADER = 28
-"""Height of the header with the letters [px]."""
+HEADER = 28  # height of the header with the letters [px]
 
 MAX_REFERENCE_PIXELS = 40_000_000
 

@@ -18,8 +18,7 @@ STEP = float(np.deg2rad(3.0))
 ROUND_SHARE = 0.02
 """A shape is round, without a heading, if no rotation moves its surface by more than this share of its size."""
 
-ALIKE_SHARE = 0.01
-"""Headings whose misfit exceeds the best one by at most this share of the size are symmetries."""
+ALIKE_SHARE = 0.01  # headings whose misfit exceeds the best one by at most this share of the size are symmetries
 
 APART = float(np.deg2rad(20.0))
 """Headings nearer than this count as one; smaller differences are sampling noise [rad]."""

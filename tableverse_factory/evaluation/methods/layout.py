@@ -30,11 +30,9 @@ from tableverse_factory.geometry.relations.preserved import (
     find_relations,
 )
 
-NO_RESULT = "not among the results"
-"""Error of a scene that has a truth and no result."""
+NO_RESULT = "not among the results"  # error of a scene that has a truth and no result
 
-SAME_PLACE = 0.6
-"""Without names, objects match within this share of the diagonal of the true box."""
+SAME_PLACE = 0.6  # without names, objects match within this share of the diagonal of the true box
 
 
 @dataclass(frozen=True, slots=True)

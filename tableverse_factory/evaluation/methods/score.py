@@ -17,11 +17,9 @@ from tableverse_factory.evaluation.methods.grid_judges import GridJudge, record_
 from tableverse_factory.evaluation.methods.vlm_vote import METRICS, Question, Vote, make_questions
 
 RESAMPLES = 2000
-MIN_SCENES = 5
-"""Least scenes for an interval."""
+MIN_SCENES = 5  # least scenes for an interval
 
-LOW, HIGH = 2.5, 97.5
-"""Percentiles of the resampled means that bound the 95 % interval."""
+LOW, HIGH = 2.5, 97.5  # percentiles of the resampled means that bound the 95 % interval
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,7 @@ from tableverse_factory.physics.mjcf.file_check import load_mjcf
 from tableverse_factory.sources.discovery import is_source_file
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
 
-WORLD = "world"
-"""Name of the world body in MuJoCo."""
+WORLD = "world"  # name of the world body in MuJoCo
 
 
 def find_scenes(path: Path) -> list[SceneSource]:

@@ -27,8 +27,7 @@ from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, 
 from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
 ANSWERS = "answers"
-OTHERS = frozenset({ANSWERS, "grids", "reference", "truth"})
-"""Subfolders of the results that are not methods."""
+OTHERS = frozenset({ANSWERS, "grids", "reference", "truth"})  # subfolders of the results that are not methods
 
 ABSENT = "–"
 

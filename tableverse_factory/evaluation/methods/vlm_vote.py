@@ -104,7 +104,7 @@ def make_questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int)
 
 
 def build_vote_prompt(count: int) -> str:
-    """What the judge is told; the methods have no names in it."""
+    """Write the judge's instructions, without names of methods."""
     names = make_letters(count)
     return f"""You compare {count} reconstructions of one real table-top scene. The picture is a grid of 2 rows and \
 {count + 1} columns, with a line of titles above.

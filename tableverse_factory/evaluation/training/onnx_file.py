@@ -14,8 +14,7 @@ from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet
 
 OPSET = 17
 IR_VERSION = 9
-TOLERANCE = 1e-3
-"""Largest allowed difference from float32 arithmetic, relative to the largest output."""
+TOLERANCE = 1e-3  # largest allowed difference from float32 arithmetic, relative to the largest output
 
 
 def write_onnx(network: Any, path: Path) -> float:

@@ -25,8 +25,7 @@ OFFSET_WEIGHT = 4.0
 WEIGHT_DECAY = 1e-4
 WARM_UP = 0.05
 MAX_NORM = 1.0
-AHEAD = 2
-"""Batches that each process prepares ahead."""
+AHEAD = 2  # batches that each process prepares ahead
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
 from tableverse_factory.sources.synthetic.solids import make_block
 
 VIEWS_PER_SCENE = 6
-COARSER = 2
-"""Pixels of the synthetic camera per pixel of a view."""
+COARSER = 2  # pixels of the synthetic camera per pixel of a view
 FOCAL_RANGE = (0.85, 1.2)
 MAX_SCENES = 1_000_000
 SCENES_AT_A_TIME = 4

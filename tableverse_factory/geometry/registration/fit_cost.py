@@ -1,4 +1,4 @@
-"""What a placement of a mesh costs against one view: the Chamfer distance for a partial view (paper section 3.1).
+"""Cost of a mesh's placement against one view: the Chamfer distance for a partial view (paper section 3.1).
 
 From each observed point to the mesh; and from the mesh to where it could hide, as far as it reaches into space that was
 seen to be empty. What nothing was seen of is free.

@@ -9,8 +9,7 @@ from typing import Any
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import resolve_filesystem
 
-MARKER = "tableverse-gallery.json"
-"""File in every gallery that lists its files."""
+MARKER = "tableverse-gallery.json"  # file in every gallery that lists its files
 
 _LOCAL = ("file://", "local://")
 _ELSE = "give a new or an empty folder"

@@ -34,12 +34,10 @@ DRAW_ALL_LIMIT, FILMS_PER_SCENE, SAMPLE_SIZE = 60, 6, 6
 """By default, all scenes are drawn up to this number, with this many films each; of more scenes, a sample of this size.
 A scene takes some four CPU seconds, a film three."""
 
-STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))
-"""Stages of the funnel, in order."""
+STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))  # stages of the funnel, in order
 
 _STATIC = ("gallery.css", "gallery.js")
-_CHUNK = 4
-"""Scenes per task of a process when most are not drawn, which takes some hundredths of a second each."""
+_CHUNK = 4  # scenes per task of a process when most are not drawn, which takes some hundredths of a second each
 
 
 @dataclass(frozen=True, slots=True)

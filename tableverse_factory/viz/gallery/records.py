@@ -12,8 +12,7 @@ from tableverse_factory.viz.funnel import SceneLoss
 
 Row = Mapping[str, Any]
 
-_MOST_REASONS = 60
-"""Most reasons that the filter lists; free text finds the others."""
+_MOST_REASONS = 60  # most reasons that the filter lists; free text finds the others
 
 
 @dataclass(frozen=True, slots=True)

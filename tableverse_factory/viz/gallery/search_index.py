@@ -15,8 +15,7 @@ from tableverse_factory.viz.gallery.scene import SceneCard
 
 FILE_NAME = "scenes.js"
 LOST_PAGE_SIZE = 100
-MOST_LABELS = 500
-"""Most labels that the filter lists; typing finds the others."""
+MOST_LABELS = 500  # most labels that the filter lists; typing finds the others
 
 
 def write_search_index(

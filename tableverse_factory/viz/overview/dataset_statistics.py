@@ -17,8 +17,7 @@ from tableverse_factory.viz.funnel import SceneLoss
 
 FORMAT = "tableverse-statistics-1"
 MAX_LABEL_CHARS = 200
-TOP = 100
-"""Most names in a ranking."""
+TOP = 100  # most names in a ranking
 
 MASS_EDGES_KG = tuple(float(f"{10 ** (-3 + k / 6):.6g}") for k in range(28))
 SIZE_EDGES_M = tuple(float(f"{10 ** (-2.5 + k / 8):.6g}") for k in range(23))

@@ -18,8 +18,7 @@ from tableverse_factory.viz.viewer.simulation import Contacts
 GHOST_COLORS = {"observed": (226, 125, 30), "rectified": (150, 80, 200), "settled": (40, 130, 90)}
 CONTACT_COLOR = (190, 0, 40)
 _GHOST_OPACITY = 0.38
-_LIGHT = {"hdri": "studio", "environment_intensity": 0.3}
-"""Environment map of viser, dim enough for white objects."""
+_LIGHT = {"hdri": "studio", "environment_intensity": 0.3}  # environment map of viser, dim enough for white objects
 
 _SKY = np.linspace((206, 214, 222), (240, 242, 244), 64).astype(np.uint8)[:, None].repeat(2, axis=1)
 _ARM_COLOR = (200, 200, 200)

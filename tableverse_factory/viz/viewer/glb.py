@@ -15,11 +15,9 @@ from tableverse_factory.physics.mjcf.scenery import Rgb
 from tableverse_factory.physics.render.normals import compute_corner_normals
 
 ROUGHNESS = 0.8
-_GOLDEN = 0.6180339887498949
-"""Step between hues that keeps all of them far apart."""
+_GOLDEN = 0.6180339887498949  # step between hues that keeps all of them far apart
 
-PIECE_COLORS = 256
-"""Number of colours; further pieces repeat them."""
+PIECE_COLORS = 256  # number of colours; further pieces repeat them
 
 
 def encode_visuals(looks: Sequence[VisualMesh]) -> bytes:

@@ -7,8 +7,7 @@ from schemas.geometry import Pose
 from tableverse_factory.dataset.scene_meta import read_meta_pose
 
 SETTLED, RECTIFIED, OBSERVED = "settled", "rectified", "observed"
-LAYOUTS = (OBSERVED, RECTIFIED, SETTLED)
-"""In the order of the pipeline."""
+LAYOUTS = (OBSERVED, RECTIFIED, SETTLED)  # in the order of the pipeline
 
 _KEYS = {OBSERVED: "placed", RECTIFIED: "rectified"}
 

@@ -10,8 +10,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 
 _MAX_PATH = 2000
-_MAX_REFUSED = 100
-"""Most refused origins that are logged."""
+_MAX_REFUSED = 100  # most refused origins that are logged
 
 _PORTS = {"http": 80, "https": 443}
 

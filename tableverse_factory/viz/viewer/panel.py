@@ -9,11 +9,9 @@ from tableverse_factory.viz.viewer.scene_index import ANY, STATUSES
 NO_GHOST, AS_EXPORTED, NO_TASK, NO_MATCH = "none", "as exported", "no trajectory", "no scene found"
 BACK, NEXT, PAGE_BACK, PAGE_NEXT = "‹", "›", "«", "»"
 PLAY, PAUSE = "Play", "Pause"
-_BRAND = (16, 84, 140)
-"""Dark enough for white text on it."""
+_BRAND = (16, 84, 140)  # dark enough for white text on it
 
-MAX_TEXTURE = 35
-"""Largest number of a texture within its family."""
+MAX_TEXTURE = 35  # largest number of a texture within its family
 
 
 class Panel:

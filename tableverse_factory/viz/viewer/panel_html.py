@@ -14,13 +14,11 @@ from tableverse_factory.viz.gallery.formatting import (
     format_millimetres,
 )
 
-MAX_ROWS = 100
-"""Most objects and tasks that are listed."""
+MAX_ROWS = 100  # most objects and tasks that are listed
 
 _STYLE = "font-size:0.8rem;line-height:1.35;padding:0.25rem 0.75rem;overflow-wrap:anywhere"
 _HEADING = "font-size:0.85rem;margin:0.7rem 0 0.2rem"
-SECTION_CLASS = "tableverse"
-"""CSS class of our sections in the page of viser."""
+SECTION_CLASS = "tableverse"  # CSS class of our sections in the page of viser
 
 _CERTIFICATE = (
     ("deepest overlap of pieces", "piece_penetration_m", format_millimetres),

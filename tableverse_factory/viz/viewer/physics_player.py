@@ -13,8 +13,7 @@ from tableverse_factory.viz.viewer.simulation import Contacts, Simulation
 
 MAX_OBJECTS = 200
 _PUSHES = {"left": (-1.0, 0.0, 0.0), "right": (1.0, 0.0, 0.0), "away": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
-_SLOW = 0.9
-"""Share of the chosen speed below which the panel reports it."""
+_SLOW = 0.9  # share of the chosen speed below which the panel reports it
 
 
 class PhysicsPlayer:

@@ -10,8 +10,7 @@ from tableverse_factory.dataset.dataset import Dataset, Scene
 from tableverse_factory.viz.viewer.loaded_scene import LoadedScene
 from tableverse_factory.viz.viewer.scene_index import SceneIndex, SearchHits
 
-MAX_SCENES = 4
-"""Most loaded scenes; each takes some tens of megabytes."""
+MAX_SCENES = 4  # most loaded scenes; each takes some tens of megabytes
 
 Row = Mapping[str, Any]
 

@@ -13,8 +13,7 @@ from tableverse_factory.dataset.dataset import Dataset
 
 ANY = "any"
 STATUSES = (ANY, "done", "dropped", "failed")
-MAX_SEARCH = 200
-"""Characters of a search; longer ones are cut."""
+MAX_SEARCH = 200  # characters of a search; longer ones are cut
 
 
 class SearchHits:

@@ -4,8 +4,7 @@ from tableverse_factory.viz.viewer.panel import BACK, NEXT, NO_MATCH, PAGE_BACK,
 from tableverse_factory.viz.viewer.panel_html import format_status
 from tableverse_factory.viz.viewer.scene_cache import SceneCache
 
-PAGE = 50
-"""Scenes per page of the list."""
+PAGE = 50  # scenes per page of the list
 
 _STEPS = {PAGE_BACK: -PAGE, BACK: -1, NEXT: 1, PAGE_NEXT: PAGE}
 

@@ -21,8 +21,7 @@ from tableverse_factory.viz.viewer.scene_cache import Row, SceneCache
 from tableverse_factory.viz.viewer.scene_list import SceneList
 from tableverse_factory.viz.viewer.session_lock import SessionLock
 
-_CONTACTS_EVERY = 5
-"""Number of ticks between two drawings of the contacts."""
+_CONTACTS_EVERY = 5  # number of ticks between two drawings of the contacts
 
 
 class Session:

@@ -12,11 +12,9 @@ from schemas.trajectories import Numbers
 from tableverse_factory.physics.simulate.at_rest import UNSTABLE, find_free_bodies, make_quiet_data, read_body_poses
 from tableverse_factory.physics.simulate.model_solids import body_name
 
-MAX_CONTACTS = 1000
-"""Most contacts shown, the strongest first."""
+MAX_CONTACTS = 1000  # most contacts shown, the strongest first
 
-SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.015, 0.1, 0.03
-"""Limits and scale of the length of a force arrow."""
+SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.015, 0.1, 0.03  # limits and scale of the length of a force arrow
 
 
 @dataclass(frozen=True, slots=True, eq=False)

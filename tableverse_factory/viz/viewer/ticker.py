@@ -8,11 +8,9 @@ from collections.abc import Callable, Sequence
 from tableverse_factory.viz.viewer.session import Session
 
 TICK_S = 1 / 30
-_BUSY_SHARE = 0.7
-"""Share of a tick that physics may take, all browsers together."""
+_BUSY_SHARE = 0.7  # share of a tick that physics may take, all browsers together
 
-_LONGEST_S = 0.2
-"""Longest time that a tick advances: after a stall, playback continues without a jump."""
+_LONGEST_S = 0.2  # longest time that a tick advances: after a stall, playback continues without a jump
 
 _log = logging.getLogger(__name__)
 

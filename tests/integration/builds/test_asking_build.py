@@ -287,4 +287,5 @@ def assert_nowhere(folder: Path) -> None:
         if path.suffix == ".parquet":
             assert KEY not in str(pq.read_table(path, partitioning=None).to_pylist()), path
         if path.suffix == ".pack":
-            assert all(KEY.encode() not in read_packed_checkpoint(path, span.start) for _, span in scan_pack(path)), path
+            records = [read_packed_checkpoint(path, span.start) for _, span in scan_pack(path)]
+            assert all(KEY.encode() not in record for record in records), path

@@ -90,7 +90,7 @@ def test_hostile_names_are_counted_and_drawn(tmp_path):
     content = json.loads(paths[0].read_text())
     assert content["labels"]["names"] == 6
     assert max(len(name) for name, _ in content["labels"]["top"]) == 200
-    ElementTree.parse(paths[1]) - our own
+    ElementTree.parse(paths[1])
     assert b"alert" not in paths[1].read_bytes(), "letters are drawn as outlines"
     for name in HOSTILE:
         assert sanitize_label(name).isprintable()

@@ -130,7 +130,7 @@ def fill_holes(ids: IdImage) -> IdImage:
 
 
 def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
-    """What `segment` gives as candidates without names, in the order of their ids."""
+    """Turn the result of `segment` into candidates without names, in the order of their ids."""
     things = [
         Candidate("object", 1.0, _to_box(window), k, holders[k] - 1 if k in holders else None)
         for k, window in enumerate(ndimage.find_objects(ids), start=1)
