@@ -6,22 +6,23 @@ Runs in the model's own environment and needs only Python 3.10.
 import ctypes
 import hashlib
 import json
-import os
+import secrets
 import signal
-import struct
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-PROTOCOL = 1
+PROTOCOL = 2
 BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + (
     "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
 )
 """A box as an OBJ file, for `--self-test`."""
 
-_LENGTH = struct.Struct("<I")
 _PR_SET_PDEATHSIG = 1
 _MAX_REASON = 300
 _MEMORY_MESSAGES = ("out of memory", "can't allocate memory", "ALLOC_FAILED")
@@ -93,6 +94,49 @@ def hash_names(*named: object) -> str:
     return hashed.hexdigest()[:8]
 
 
+class MeshServer(HTTPServer):
+    """HTTP server that ends with the first error that is no matter of one object.
+
+    Attributes:
+        path: Path of requests, which only the starter of this process is told.
+        answer: Answers a question.
+    """
+
+    def __init__(self, answer: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> None:
+        """Listen on a free port of this machine."""
+        super().__init__(("127.0.0.1", 0), MeshHandler)
+        self.path, self.answer = f"/{secrets.token_urlsafe(16)}", answer
+
+    def handle_error(self, *_: object) -> None:
+        """Raise errors other than those of a connection, at which the process ends with their message."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            raise
+
+
+class MeshHandler(BaseHTTPRequestHandler):
+    """Handler of one request."""
+
+    server: MeshServer
+    timeout = 60.0
+    """Limit for a connection that sends nothing [s]."""
+
+    def do_POST(self) -> None:
+        """Answer a question in JSON."""
+        if self.path != f"{self.server.path}/meshes":
+            self.send_error(404)
+            return
+        question = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        body = json.dumps(self.server.answer(question)).encode()
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Log no requests: the last line of output is shown with an error."""
+
+
 def serve(
     info: ModelInfo, load: Callable[[], MakeMeshes], batch: int = 1, release: Callable[[], None] = lambda: None
 ) -> None:
@@ -100,33 +144,28 @@ def serve(
 
     Args:
         info: Description of the model.
-        load: Loads the weights and returns the function that makes meshes; called once, at the first need.
+        load: Loads the weights and returns the function that makes meshes; called once, at the first request.
         batch: Number of objects made at a time.
         release: Called after an error, to free memory before the next attempt.
     """
     _end_with_parent()
-    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # prints go to stderr: stdout carries the protocol
-    write_frame(outgoing, {"type": "hello", "protocol": PROTOCOL, **info.__dict__})
     make: MakeMeshes | None = None
-    while (message := read_frame(incoming)) is not None:
-        head, parts = message
+
+    def answer(question: Mapping[str, Any]) -> Mapping[str, Any]:
+        nonlocal make
         make = make or load()
-        if head["type"] == "load":
-            write_frame(outgoing, {"type": "ready"})
-            continue
-        orders = list(_read_orders(head, parts))
-        for start in range(0, len(orders), batch):
-            some = orders[start : start + batch]
-            for (name, _), answer in zip(
-                some, make_all(make, [order for _, order in some], batch, release), strict=True
-            ):
-                if isinstance(answer, str):
-                    write_frame(outgoing, {"type": "failed", "id": name, "reason": answer})
-                else:
-                    write_frame(
-                        outgoing, {"type": "mesh", "id": name, "format": answer.format, "up": answer.up}, answer.data
-                    )
+        orders = [_read_order(question["pictures"][entry["picture"]], entry) for entry in question["objects"]]
+        some = [orders[start : start + batch] for start in range(0, len(orders), batch)]
+        made = [mesh for part in some for mesh in make_all(make, part, batch, release)]
+        return {"meshes": [_write_answer(mesh) for mesh in made]}
+
+    with MeshServer(answer) as server:
+        url = f"http://127.0.0.1:{server.server_port}{server.path}"
+        sys.stdout.write(json.dumps({"protocol": PROTOCOL, "url": url, "batch": batch, **info.__dict__}) + "\n")
+        sys.stdout.flush()
+        sys.stdout = sys.stderr  # which is never held back
+        threading.Thread(target=_shut_down_with_stdin, args=(server,), daemon=True).start()
+        server.serve_forever()
 
 
 def make_all(
@@ -160,33 +199,20 @@ def load_box() -> MakeMeshes:
     return lambda orders, _: [MeshFile(BOX.encode(), "obj", "z") for _ in orders]
 
 
-def read_frame(stream: BinaryIO) -> tuple[dict[str, Any], list[bytes]] | None:
-    """Read the next frame, its head and parts; None at the end."""
-    length = stream.read(_LENGTH.size)
-    if len(length) < _LENGTH.size:
-        return None
-    head: dict[str, Any] = json.loads(stream.read(_LENGTH.unpack(length)[0]))
-    return head, [stream.read(size) for size in head.get("parts", [])]
+def _read_order(view: Mapping[str, Any], entry: Mapping[str, Any]) -> MeshOrder:
+    depth = None if view["depth"] is None else b64decode(view["depth"])
+    return MeshOrder(b64decode(view["picture"]), b64decode(entry["mask"]), entry["seed"], depth, view["camera"])
 
 
-def write_frame(stream: BinaryIO, head: dict[str, Any], *parts: bytes) -> None:
-    """Write a frame."""
-    data = json.dumps({**head, "parts": [len(part) for part in parts]}).encode()
-    stream.write(_LENGTH.pack(len(data)) + data)
-    for part in parts:
-        stream.write(part)
-    stream.flush()
+def _write_answer(mesh: "MeshFile | str") -> dict[str, str]:
+    if isinstance(mesh, str):
+        return {"error": mesh}
+    return {"data": b64encode(mesh.data).decode(), "format": mesh.format, "up": mesh.up}
 
 
-def _read_orders(head: dict[str, Any], parts: list[bytes]) -> Iterator[tuple[str, MeshOrder]]:
-    """Read the ids and orders of a request."""
-    for entry in head["objects"]:
-        view = head["pictures"][entry["picture"]]
-        depth = None if view["depth"] is None else parts[view["depth"]]
-        yield (
-            entry["id"],
-            MeshOrder(parts[view["picture"]], parts[entry["mask"]], entry["seed"], depth, view["camera"]),
-        )
+def _shut_down_with_stdin(server: HTTPServer) -> None:
+    sys.stdin.buffer.read()
+    server.shutdown()
 
 
 def _end_with_parent() -> None:

@@ -1,14 +1,13 @@
 """Mesh daemons inside of a test's own process."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
-import numpy as np
 import pytest
 
 from tableverse_factory.stages.place.mesh_service import client
-from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon
-from tableverse_factory.stages.place.mesh_service.process import MeshFrame
+from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon, decode_json, encode_json
 
 
 @contextmanager
@@ -16,15 +15,14 @@ def daemons_inside(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[str, 
     """Route requests to daemons in this process, by command; a test that removes one must close it."""
     daemons: dict[tuple[str, ...], MeshDaemon] = {}
 
-    def ask(command: tuple[str, ...], question: MeshFrame) -> MeshFrame:
+    def ask(command: tuple[str, ...], request: Mapping[str, Any]) -> Any:
         if command not in daemons:
             daemons[command] = MeshDaemon(command)
-        data = np.frombuffer(b"".join(question.encode_parts()), dtype=np.uint8)
-        ((answer,),) = daemons[command].answer_scenes([[data]])
-        return MeshFrame.decode(answer.tobytes())
+        (answer,) = daemons[command].answer_scenes([encode_json(request)])
+        return decode_json(answer)
 
     monkeypatch.setattr(client, "request_meshes", ask)
-    monkeypatch.setattr(client, "_HELLO_CACHE", {})
+    monkeypatch.setattr(client, "_MODEL_CACHE", {})
     yield daemons
     for daemon in daemons.values():
         daemon.close()

@@ -4,47 +4,34 @@
 is told at objects whose seed ends in 666. MESH_LOG names a file that gets a line for everything that is asked.
 """
 
+import base64
 import hashlib
 import json
 import os
-import struct
 import sys
+import threading
 import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 TETRAHEDRON = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BAD_SEED = 666
-HELLO = {"type": "hello", "protocol": 1, "model": "tetra", "version": "1", "licence": "CC0-1.0", "wants": ["seed"]}
+HELLO = {"protocol": 2, "model": "tetra", "version": "1", "licence": "CC0-1.0", "wants": ["seed"]}
 STRANGE = {
     "empty": b"# nothing\n",
     "nan": TETRAHEDRON.replace(b"v 1 0 0", b"v nan 0 0"),
     "nonsense": b"\xff" * 1000,
     "sheet": b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n",
 }
-HEADS = {
-    "stranger": {"type": "mesh", "id": "77", "format": "obj", "up": "z", "parts": []},
-    "no type": {"parts": []},
+BODIES = {
+    "nothing": {},
     "list": [1, 2],
-    "negative": {"type": "mesh", "id": "1", "parts": [-1]},
-    "gigabyte": {"type": "mesh", "id": "1", "format": "obj", "up": "z", "parts": [1 << 30]},
-    "many": {"type": "mesh", "id": "1", "parts": [1] * 1000},
+    "no entry": {"meshes": [7]},
+    "no data": {"meshes": [{"format": "obj", "up": "z"}]},
+    "not base64": {"meshes": [{"data": "v 0 0 0", "format": "obj", "up": "z"}]},
+    "too many": {"meshes": [{"error": "one"}, {"error": "two"}]},
+    "long": {"meshes": [{"data": "A" * 100_000, "format": "obj", "up": "z"}]},
 }
-
-
-def read(stream):
-    start = stream.read(4)
-    if len(start) < 4:
-        return None
-    head = json.loads(stream.read(struct.unpack("<I", start)[0]))
-    return head, [stream.read(size) for size in head["parts"]]
-
-
-def write(head, *parts):
-    if isinstance(head, dict):
-        head = {"parts": [len(part) for part in parts], **head}
-    data = json.dumps(head).encode()
-    sys.stdout.buffer.write(struct.pack("<I", len(data)) + data + b"".join(parts))
-    sys.stdout.buffer.flush()
 
 
 def note(line):
@@ -59,39 +46,36 @@ def first_time():
     return not was_there
 
 
-def misbehave(behaviour, name):
-    """True where the object was answered."""
+def misbehave(behaviour, handler):
+    """True where the request was answered."""
     if behaviour.endswith(" once") and not first_time():
         return False
     behaviour = behaviour.removesuffix(" once")
     if behaviour == "crash":
-        sys.exit("Traceback (most recent call last):\n  nothing to see\nRuntimeError: the GPU is on fire")
+        sys.stderr.write("Traceback (most recent call last):\n  nothing to see\nRuntimeError: the GPU is on fire\n")
+        os._exit(1)
     if behaviour == "hang":
         time.sleep(1000)
     if behaviour == "gate":
         while not Path(os.environ["MESH_LOG"]).with_suffix(".gate").exists():
             time.sleep(0.01)
-    if behaviour == "print":
-        print("Loading pipeline components...", flush=True)  # noqa: T201 where it does not belong
-    if behaviour == "half":
-        sys.stdout.buffer.write(struct.pack("<I", 5000) + b'{"type": "mesh"')
-        sys.stdout.buffer.flush()
-        sys.exit(0)
-    if behaviour == "close":
-        os.close(1)
-        time.sleep(1000)
-    if behaviour == "drip":
-        write(
-            {"type": "mesh", "id": "1", "format": "obj", "up": "z", "parts": [1000]},
-        )
-        while True:
-            sys.stdout.buffer.write(b"#")
-            sys.stdout.buffer.flush()
+    if behaviour in ("half", "drip"):
+        handler.send_response(200)
+        handler.send_header("Content-Length", "5000")
+        handler.end_headers()
+        handler.wfile.write(b'{"meshes": [')
+        while behaviour == "drip":
+            handler.wfile.write(b" ")
             time.sleep(0.05)
-    if behaviour in HEADS:
-        head = HEADS[behaviour]
-        write({"id": name, **head} if isinstance(head, dict) else head)
-        time.sleep(1000)
+        os._exit(0)
+    if behaviour == "close":
+        return True
+    if behaviour == "refuse":
+        handler.send_error(404)
+        return True
+    if behaviour in BODIES:
+        handler.reply(BODIES[behaviour])
+        return True
     return False
 
 
@@ -119,55 +103,75 @@ def true_mesh(folder, mask_png):
     return trimesh.Trimesh(y_up, mesh.faces, process=False).export(file_type="glb")
 
 
-def answer(head, parts, behaviour, folder):
-    for entry in head["objects"]:
-        note(f"make {entry['seed']}")
-        bad = entry["seed"] % 1000 == BAD_SEED
-        mesh = {"type": "mesh", "id": entry["id"], "format": "obj", "up": "z"}
-        if bad and misbehave(behaviour, entry["id"]):
-            continue
-        if bad and behaviour == "fail":
-            write({"type": "failed", "id": entry["id"], "reason": "nothing in the mask \x1b[31m\n" + 1000 * "x"})
-        elif bad and behaviour == "no up":
-            write({"type": "mesh", "id": entry["id"], "format": "obj"}, TETRAHEDRON)
-        elif bad and behaviour in STRANGE:
-            write(mesh, STRANGE[behaviour])
-        elif folder:
-            write({**mesh, "format": "glb", "up": "y"}, true_mesh(folder, parts[entry["mask"]]))
-        elif behaviour == "gate":
-            picture = parts[head["pictures"][entry["picture"]]["picture"]]
-            seen = hashlib.sha256(picture + parts[entry["mask"]]).hexdigest()
-            write(mesh, TETRAHEDRON + f"# {entry['seed']} {seen}\n".encode())
-        else:
-            write(mesh, TETRAHEDRON)
+def make(question, entry, behaviour, folder):
+    bad = entry["seed"] % 1000 == BAD_SEED
+    if bad and behaviour == "fail":
+        return {"error": "nothing in the mask \x1b[31m\n" + 1000 * "x"}
+    mask = base64.b64decode(entry["mask"])
+    data, form, up = TETRAHEDRON, "obj", "z"
+    if bad and behaviour == "no up":
+        up = None
+    elif bad and behaviour in STRANGE:
+        data = STRANGE[behaviour]
+    elif folder:
+        data, form, up = true_mesh(folder, mask), "glb", "y"
+    elif behaviour == "gate":
+        picture = base64.b64decode(question["pictures"][entry["picture"]]["picture"])
+        seen = hashlib.sha256(picture + mask).hexdigest()
+        data += f"# {entry['seed']} {seen}\n".encode()
+    return {"data": base64.b64encode(data).decode(), "format": form, "up": up}
+
+
+class Handler(BaseHTTPRequestHandler):
+    behaviour, folder, loaded = "", None, False
+
+    def do_POST(self):
+        question = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        if not Handler.loaded:
+            note("load")
+            if self.behaviour == "no weights":
+                sys.stderr.write("FileNotFoundError: checkpoints/hf/pipeline.yaml\n")
+                os._exit(1)
+            Handler.loaded = True
+        if self.behaviour == "chatter":
+            sys.stderr.write("step 1/25\n" * 300_000)
+            sys.stdout.write("step 1/25\n" * 300_000)
+        if self.behaviour == "gate" and question["objects"]:
+            note(f"request of {len(question['objects'])}")
+        meshes = []
+        for entry in question["objects"]:
+            note(f"make {entry['seed']}")
+            if entry["seed"] % 1000 == BAD_SEED and misbehave(self.behaviour, self):
+                return
+            meshes.append(make(question, entry, self.behaviour, self.folder))
+        self.reply({"meshes": meshes})
+
+    def reply(self, body):
+        data = json.dumps(body).encode()
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, *_):
+        pass
 
 
 def main():
-    behaviour, folder = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else None
+    Handler.behaviour, Handler.folder = sys.argv[1], sys.argv[2] if len(sys.argv) > 2 else None
     note("start")
-    if behaviour == "no package":
+    if Handler.behaviour == "no package":
         import sam3d_objects_that_nobody_has  # noqa: F401
-    if behaviour == "other protocol":
-        write({**HELLO, "protocol": 2})
-    if behaviour == "mute":
+    if Handler.behaviour == "mute":
         time.sleep(1000)
-    write(HELLO)
-    if behaviour == "stuck":
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    hello = {**HELLO, "url": f"http://127.0.0.1:{server.server_port}", "batch": int(os.environ.get("MESH_BATCH", "1"))}
+    strange = {"other protocol": {"protocol": 3}, "elsewhere": {"url": "http://192.0.2.1"}, "unnamed": {"model": ""}}
+    print("Loading pipeline components...")  # noqa: T201 before the hello
+    print(json.dumps({**hello, **strange.get(Handler.behaviour, {})}), flush=True)  # noqa: T201
+    if Handler.behaviour == "stuck":
         time.sleep(1000)
-    while (message := read(sys.stdin.buffer)) is not None:
-        head, parts = message
-        if head["type"] == "load":
-            note("load")
-            if behaviour == "no weights":
-                sys.exit("FileNotFoundError: checkpoints/hf/pipeline.yaml")
-            write({"type": "ready"})
-            continue
-        if behaviour == "chatter":
-            sys.stderr.write("step 1/25\n" * 300_000)
-        if behaviour == "gate":
-            note(f"request of {len(head['objects'])}")
-            note(f"named {' '.join(entry['id'] for entry in head['objects'])}")
-        answer(head, parts, behaviour, folder)
+    threading.Thread(target=lambda: (sys.stdin.read(), os._exit(0)), daemon=True).start()
+    server.serve_forever()
 
 
 if __name__ == "__main__":

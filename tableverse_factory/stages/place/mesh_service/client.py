@@ -1,5 +1,6 @@
 """Client of a mesh process: cached meshes first, the others from its daemon."""
 
+import base64
 import json
 import struct
 from collections.abc import Mapping, Sequence
@@ -15,13 +16,12 @@ from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.daemon import build_spec, request_meshes
-from tableverse_factory.stages.place.mesh_service.process import MeshFrame
 
 _VERSION = b"meshes 2"
 _MAX_ROUNDS = 4
 """Rounds of cache lookup and request: to learn who answers, to request meshes, to read them, and one to spare."""
-_HELLO_CACHE: dict[str, dict[str, Any]] = {}
-"""Hello of the process of each command, as last received by this worker."""
+_MODEL_CACHE: dict[str, dict[str, Any]] = {}
+"""Model behind each command, as last received by this worker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,13 +80,13 @@ class MeshClient:
 
     Args:
         command: Program and arguments.
-        silence_s: Longest wait between two meshes [s].
+        silence_s: Longest wait for an answer of the process [s].
         services: Names the cache folder.
     """
 
     def __init__(self, command: tuple[str, ...], silence_s: float, services: Services) -> None:
         self._command, self._silence_s = command, silence_s
-        self._cache = DiskCache(services.cache_dir / "meshes", ".frame", durable=True)
+        self._cache = DiskCache(services.cache_dir / "meshes", ".json", durable=True)
 
     def make_meshes(self, view: RgbdImage, queries: Sequence[MeshQuery]) -> list[MeshAnswer]:
         """Make the meshes of a scene; a known process whose meshes are all cached is not asked.
@@ -98,68 +98,78 @@ class MeshClient:
         reasons: dict[int, str] = {}
         spec = json.dumps(build_spec(self._command))
         for _ in range(_MAX_ROUNDS):
-            hello = _HELLO_CACHE.get(spec)
-            keys = _compute_keys(hello, view, queries) if hello else []
+            model = _MODEL_CACHE.get(spec)
+            keys = _compute_keys(model, view, queries) if model else []
             cached = {number: mesh for number, key in enumerate(keys) if (mesh := self._read_cached(key)) is not None}
             answers = cached | reasons
             missing = {number: key for number, key in enumerate(keys) if number not in answers}
-            if hello and not missing:
+            if model and not missing:
                 return [answers[number] for number in range(len(queries))]
-            answer = request_meshes(self._command, self._build_request(hello, view, queries, missing)).head
+            answer = request_meshes(self._command, self._build_request(model, view, queries, missing))
             if answer["refused"]:
                 raise ModelAccessError(answer["refused"])
             if answer["given_up"]:
                 raise ModelError(answer["given_up"])
-            _HELLO_CACHE[spec] = answer["hello"]
-            is_same = answer["hello"] == hello
+            _MODEL_CACHE[spec] = answer["model"]
+            is_same = answer["model"] == model
             reasons = {int(number): reason for number, reason in answer["reasons"].items()} if is_same else {}
         raise ModelError("cached meshes disappear while they are made, or the mesh process changes again and again")
 
     def _read_cached(self, key: str) -> MeshFile | None:
         if (data := self._cache.get(key)) is None:
             return None
-        frame = MeshFrame.decode(data)
-        head = frame.head
-        model = f"{head['model']}@{head['version']}"
-        return MeshFile(frame.parts[0], head["format"], head["up"], model, head["licence"])
+        entry = json.loads(data)
+        model = f"{entry['model']}@{entry['version']}"
+        return MeshFile(base64.b64decode(entry["data"]), entry["format"], entry["up"], model, entry["licence"])
 
     def _build_request(
-        self, hello: Mapping[str, Any] | None, view: RgbdImage, queries: Sequence[MeshQuery], missing: Mapping[int, str]
-    ) -> MeshFrame:
+        self, model: Mapping[str, Any] | None, view: RgbdImage, queries: Sequence[MeshQuery], missing: Mapping[int, str]
+    ) -> dict[str, Any]:
         """Build the request to the daemon: the view once, and the mask of each missing object."""
         camera = view.camera
-        head = {
-            "hello": hello,
+        picture = {
+            "picture": _encode(encode_png(view.color, compress_level=1)) if missing else "",
+            "depth": _encode(_encode_depth(view)) if missing and model and "depth" in model["wants"] else None,
+            "camera": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
+        }
+        masks = {number: np.where(queries[number].mask, 255, 0).astype(np.uint8) for number in missing}
+        objects = [
+            {
+                "number": number,
+                "key": key,
+                "seed": queries[number].seed,
+                "mask": _encode(encode_png(masks[number], compress_level=1)),
+            }
+            for number, key in missing.items()
+        ]
+        return {
+            "model": model,
             "count": len(queries),
             "cache": str(self._cache.folder.absolute()),
             "silence_s": self._silence_s,
-            "camera": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
-            "objects": [
-                {"number": number, "key": key, "seed": queries[number].seed} for number, key in missing.items()
-            ],
+            "picture": picture,
+            "objects": objects,
         }
-        picture = encode_png(view.color, compress_level=1) if missing else b""
-        depth = _encode_depth(view) if missing and hello and "depth" in hello["wants"] else b""
-        masks = [
-            encode_png(np.where(queries[number].mask, 255, 0).astype(np.uint8), compress_level=1) for number in missing
-        ]
-        return MeshFrame(head, (picture, depth, *masks))
 
 
-def _compute_keys(hello: Mapping[str, Any], view: RgbdImage, queries: Sequence[MeshQuery]) -> list[str]:
+def _compute_keys(model: Mapping[str, Any], view: RgbdImage, queries: Sequence[MeshQuery]) -> list[str]:
     """Hash all that determines each mesh: model, version and licence, and the data that the model uses."""
     camera = view.camera
     intrinsics = struct.pack("<4d", camera.fx, camera.fy, camera.cx, camera.cy)
     parts = [str(view.color.shape).encode(), view.color.tobytes(), intrinsics]
-    if "depth" in hello["wants"]:
+    if "depth" in model["wants"]:
         parts.append(_encode_depth(view))
-    shared = [_VERSION, *(hello[name].encode() for name in ("model", "version", "licence"))]
+    shared = [_VERSION, *(model[name].encode() for name in ("model", "version", "licence"))]
     shared.append(content_hash(*parts).encode())
-    has_seed = "seed" in hello["wants"]
+    has_seed = "seed" in model["wants"]
     return [
         content_hash(*shared, np.packbits(query.mask).tobytes(), str(query.seed).encode() if has_seed else b"")
         for query in queries
     ]
+
+
+def _encode(data: bytes) -> str:
+    return base64.b64encode(data).decode()
 
 
 def _encode_depth(view: RgbdImage) -> bytes:

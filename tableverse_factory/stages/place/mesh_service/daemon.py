@@ -6,8 +6,8 @@ at once, from where the workers read them: a killed worker loses no mesh, neithe
 
 import atexit
 import json
-from collections.abc import Callable, Iterator, Sequence
-from itertools import count
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +16,11 @@ import numpy as np
 from schemas.identity import content_hash
 from tableverse_factory.models.local.batch_server import Arrays, BatchModel, Heartbeat
 from tableverse_factory.models.local.model_daemon import Spec, ask_daemon, run_daemon
-from tableverse_factory.stages.place.mesh_service.process import (
-    MeshFrame,
-    MeshProcess,
-    ProcessFaultError,
-    select_environment,
-)
-from tableverse_factory.stages.place.mesh_service.requests import (
-    MeshRequest,
-    SceneRequest,
-    build_message,
-    describe_process,
-)
+from tableverse_factory.stages.place.mesh_service.process import MeshProcess, ProcessFaultError, select_environment
+from tableverse_factory.stages.place.mesh_service.requests import MeshRequest, SceneRequest, build_question
 
-SCENES, OBJECTS = 8, 32
-"""Maximum number of scenes in a batch, and of objects in one request to the process."""
+SCENES = 8
+"""Maximum number of scenes in a batch."""
 _CLOSE_S = 2.0
 """Time for the process to end by itself [s]."""
 
@@ -41,17 +31,24 @@ def build_spec(command: tuple[str, ...]) -> Spec:
     return {"command": json.dumps(command), "folder": str(Path.cwd()), "environment": content_hash(passed)}
 
 
-def request_meshes(command: tuple[str, ...], request: MeshFrame) -> MeshFrame:
+def request_meshes(command: tuple[str, ...], request: Mapping[str, Any]) -> Any:
     """Send a request of `client.MeshClient` to the daemon of a command.
 
     Raises:
         ModelAccessError: if the process cannot be started.
         ModelError: if the daemon dies at every attempt.
     """
-    (answer,) = ask_daemon(
-        __name__, build_spec(command), [np.frombuffer(b"".join(request.encode_parts()), dtype=np.uint8)]
-    )
-    return MeshFrame.decode(answer.tobytes())
+    return decode_json(ask_daemon(__name__, build_spec(command), encode_json(request)))
+
+
+def encode_json(message: Any) -> Arrays:
+    """Encode a message of a worker or the daemon for the connection between them."""
+    return [np.frombuffer(json.dumps(message).encode(), dtype=np.uint8)]
+
+
+def decode_json(arrays: Arrays) -> Any:
+    """Decode a message of a worker or the daemon."""
+    return json.loads(arrays[0].tobytes())
 
 
 class MeshDaemon:
@@ -69,23 +66,19 @@ class MeshDaemon:
         """
         self._command, self._heartbeat = command, heartbeat
         self._process: MeshProcess | None = None
-        self._hello: dict[str, Any] = {}
-        self._numbers = count()
+        self._model: dict[str, Any] = {}
         self.ensure_process()
 
     def answer_scenes(self, questions: Sequence[Arrays]) -> Iterator[Arrays]:
         """Yield the answer to each scene, in order, as soon as its last object is settled."""
-        scenes = [SceneRequest(MeshFrame.decode(question.tobytes())) for (question,) in questions]
+        scenes = [SceneRequest(decode_json(question)) for question in questions]
         self.ensure_process()
         for scene in scenes:
-            scene.check_process(self._hello)
-        work = self._settle_open(scenes)
+            scene.check_model(self._model)
         for scene in scenes:
             while scene.open_meshes():
-                next(work)
-            yield [np.frombuffer(b"".join(scene.build_answer(self._hello).encode_parts()), dtype=np.uint8)]
-        for _ in work:  # objects of a request whose scene was given up meanwhile
-            pass
+                self._settle_next([mesh for scene in scenes for mesh in scene.open_meshes()])
+            yield encode_json(scene.build_answer(self._model))
 
     def close(self) -> None:
         """End the process."""
@@ -93,34 +86,29 @@ class MeshDaemon:
             self._process.close(_CLOSE_S)
             self._process = None
 
-    def _settle_open(self, scenes: Sequence[SceneRequest]) -> Iterator[None]:
-        """Settle all open objects; yields whenever an object may have been settled."""
-        while meshes := [mesh for scene in scenes for mesh in scene.open_meshes()]:
-            yield from self._settle_request(meshes)
-            yield
+    def _settle_next(self, meshes: Sequence[MeshRequest]) -> None:
+        """Settle the next objects, each content once, as many as the process makes at a time.
 
-    def _settle_request(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
-        """Settle the objects of one request, each content once.
-
-        A process that dies, falls silent or sends an invalid message is replaced, and the open objects are requested
+        A process that dies, falls silent or sends an invalid answer is replaced, and the open objects are requested
         again one at a time; an object at which it fails again has no mesh.
         """
         by_key: dict[str, MeshRequest] = {}
         for mesh in meshes:
             by_key.setdefault(mesh.key, mesh)
-        requested = [mesh for mesh in list(by_key.values())[:OBJECTS] if not mesh.find_cached()]
+        missing = (mesh for mesh in by_key.values() if not mesh.find_cached())
+        requested = list(islice(missing, self.ensure_process().hello.batch))
         try:
-            yield from self._ask(requested)
+            self._ask(requested)
         except ProcessFaultError:
             for mesh in requested:
                 if mesh.is_open:
                     try:
-                        yield from self._ask([mesh])
+                        self._ask([mesh])
                     except ProcessFaultError as fault:
                         mesh.fail(fault)
 
-    def _ask(self, meshes: Sequence[MeshRequest]) -> Iterator[None]:
-        """Request the objects whose scenes expect this process; caches meshes as they come, and yields after each.
+    def _ask(self, meshes: Sequence[MeshRequest]) -> None:
+        """Request the objects whose scenes expect this process, and cache their meshes.
 
         Raises:
             ModelAccessError: if the process cannot be started, or cannot load its weights.
@@ -128,24 +116,19 @@ class MeshDaemon:
         """
         process = self.ensure_process()
         for mesh in meshes:
-            mesh.scene.check_process(self._hello)
+            mesh.scene.check_model(self._model)
         meshes = [mesh for mesh in meshes if mesh.is_open]
         if not meshes:
             return
-        silence_s = max(mesh.scene.silence_s for mesh in meshes)
-        open_meshes = {str(next(self._numbers)): mesh for mesh in meshes}
         try:
             process.load()
-            process.send(build_message(open_meshes), silence_s)
-            while open_meshes:
-                frame = process.receive(silence_s)
-                name = frame.head.get("id")
-                if not isinstance(name, str) or name not in open_meshes:
-                    raise ProcessFaultError("it answered for an object that was not asked for")
-                open_meshes[name].store_answer(frame, self._hello)
-                del open_meshes[name]
-                yield
-        except BaseException as error:  # the process may still send answers to this request
+            silence_s = max(mesh.scene.silence_s for mesh in meshes)
+            answers = process.post_question(build_question(meshes), silence_s).get("meshes")
+            if not isinstance(answers, list) or len(answers) != len(meshes):
+                raise ProcessFaultError("it sent not as many 'meshes' as objects")
+            for mesh, answer in zip(meshes, answers, strict=True):
+                mesh.store_answer(answer, self._model)
+        except BaseException as error:  # the process may still work on this request
             self._process = None
             process.close()
             if not isinstance(error, ProcessFaultError):
@@ -158,7 +141,7 @@ class MeshDaemon:
         if self._process is None or not self._process.is_alive:
             self.close()
             self._process = MeshProcess(self._command, self._heartbeat)
-            self._hello = describe_process(self._process.hello)
+            self._model = self._process.hello.describe_model()
         return self._process
 
 

@@ -1,40 +1,40 @@
-"""Mesh model in a process of its own, with which frames are exchanged (docs/mesh-process.md)."""
+"""Mesh model in a process of its own, which is asked over HTTP (docs/mesh-process.md)."""
 
-import json
+import asyncio
 import os
 import re
-import select
 import shlex
-import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import psutil
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
-from tableverse_factory.core.errors import ModelAccessError
+from schemas.address import is_loopback
+from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.stages.place.mesh_service.stderr_tail import StderrTail
+from tableverse_factory.models.remote.endpoint import Endpoint
+from tableverse_factory.models.remote.http import BoundedClient, send_with_retries
+from tableverse_factory.models.remote.http_errors import format_host
+from tableverse_factory.stages.place.mesh_service.process_output import ProcessOutput
 
-PROTOCOL = 1
+PROTOCOL = 2
 HELLO_S = 120.0
 """Limit until the process says hello: interpreters, containers and imports, but no weights [s]."""
 LOAD_S = 900.0
 """Limit for loading weights [s]."""
-MAX_HEAD_BYTES = 64 * 1024
-MAX_MESH_BYTES = 256 * 1024 * 1024
-"""Maximum size of a mesh file; longer ones are not read."""
+MAX_ANSWER_BYTES = 352 * 1024 * 1024
+"""Maximum size of an answer: meshes of 256 MiB and a little more, in base64; longer ones are not read."""
+MAX_BATCH = 32
+"""Maximum number of objects in one request."""
 
 _END_S = 0.5
-"""Time in which a process that closed its pipes ends [s]."""
-_LENGTH = struct.Struct("<I")
-_BLOCK = 1 << 16
+"""Time in which a process that closed its connection ends [s]."""
 _SHOWN = 200
 _PASSED_VARIABLES = re.compile(
     "PATH|HOME|USER|LOGNAME|SHELL|TMPDIR|TZ|LANG|LANGUAGE|LC_(ALL|COLLATE|CTYPE|MESSAGES|MONETARY|NUMERIC|TIME)"
@@ -56,52 +56,55 @@ _LAUNCH = Path(__file__).with_name("launcher.py")
 
 
 class ProcessFaultError(Exception):
-    """Fault of a process that died, fell silent or sent an invalid message, in one line."""
+    """Fault of a process that died, fell silent or sent an invalid answer, in one line."""
 
 
-@dataclass(frozen=True, slots=True)
-class MeshFrame:
-    """A message: JSON head and binary parts."""
-
-    head: Mapping[str, Any]
-    parts: tuple[bytes, ...] = ()
-
-    def encode_parts(self) -> list[bytes]:
-        """Encode the frame as a list of byte strings, to be sent or stored."""
-        head = json.dumps({**self.head, "parts": [len(part) for part in self.parts]}, allow_nan=False).encode()
-        return [_LENGTH.pack(len(head)) + head, *self.parts]
-
-    @classmethod
-    def decode(cls, data: bytes) -> "MeshFrame":
-        """Decode a trusted frame."""
-        (length,) = _LENGTH.unpack_from(data)
-        head = json.loads(data[_LENGTH.size : _LENGTH.size + length])
-        ends = list(accumulate(head["parts"], initial=_LENGTH.size + length))
-        return cls(head, tuple(data[start:end] for start, end in pairwise(ends)))
+def _check_printable(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("has characters that cannot be printed")
+    return text
 
 
-@dataclass(frozen=True, slots=True)
-class Hello:
-    """First message of a process.
+def _check_loopback(url: str) -> str:
+    if not url.startswith("http://") or not is_loopback(url):
+        raise ValueError("is no http:// address of this machine")
+    return url
+
+
+_Name = Annotated[str, Field(min_length=1, max_length=100), AfterValidator(_check_printable)]
+
+
+class Hello(BaseModel, frozen=True):
+    """Line of JSON with which a process says that it listens.
 
     Attributes:
+        protocol: Version of the protocol.
+        url: Address on this machine at which it answers.
         model: Name of the model.
         version: Version of code and weights; part of the cache key.
         licence: Licence of the meshes.
         wants: Further inputs of the model besides picture and mask: `depth`, `seed`.
+        batch: Number of objects that it makes at a time.
     """
 
-    model: str
-    version: str
-    licence: str
-    wants: frozenset[str]
+    protocol: Literal[2]
+    url: Annotated[str, Field(max_length=200), AfterValidator(_check_loopback)]
+    model: _Name
+    version: _Name
+    licence: _Name
+    wants: frozenset[Literal["depth", "seed"]] = frozenset()
+    batch: Annotated[int, Field(ge=1, le=MAX_BATCH)] = 1
+
+    def describe_model(self) -> dict[str, Any]:
+        """Return what determines meshes, as JSON for answers and the cache."""
+        return {"model": self.model, "version": self.version, "licence": self.licence, "wants": sorted(self.wants)}
 
 
 class MeshProcess:
     """A running mesh process.
 
     Attributes:
-        hello: First message of the process.
+        hello: What the process said when it began to listen.
     """
 
     def __init__(self, command: tuple[str, ...], heartbeat: Callable[[], None] = lambda: None) -> None:
@@ -120,19 +123,14 @@ class MeshProcess:
             [sys.executable, "-I", "-S", str(_LAUNCH), str(os.getpid()), *command],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            bufsize=0,
+            stderr=subprocess.STDOUT,
             process_group=0,  # killing our group leaves the launcher time to end its descendants
             env=select_environment(),
         )
         assert self._process.stdin is not None  # noqa: S101 for the type checker
         assert self._process.stdout is not None  # noqa: S101
-        assert self._process.stderr is not None  # noqa: S101
-        self._stderr = StderrTail(self._process.stderr)
-        self._to, self._from = self._process.stdin.fileno(), self._process.stdout.fileno()
-        os.set_blocking(self._to, False)
-        self._ahead = bytearray()
-        self.hello = self._await_answer("start", HELLO_S, _parse_hello)
+        self._stdin, self._output = self._process.stdin, ProcessOutput(self._process.stdout)
+        self.hello = self._require("start", self._await_hello)
 
     @property
     def is_alive(self) -> bool:
@@ -146,52 +144,47 @@ class MeshProcess:
             ModelAccessError: if it cannot.
         """
         if not self._loaded:
-            self._await_answer("load", LOAD_S, _check_ready)
+            self._require("load", lambda: self.post_question({"pictures": [], "objects": []}, LOAD_S))
             self._loaded = True
 
-    def send(self, frame: MeshFrame, within_s: float) -> None:
-        """Send a message.
+    def post_question(self, question: Mapping[str, Any], within_s: float) -> Mapping[str, Any]:
+        """Post objects and return the process's answer.
 
         Raises:
-            ProcessFaultError: if the process does not read it.
+            ProcessFaultError: if it does not come in time, is too long, or is no JSON object.
         """
-        until = time.monotonic() + within_s
-        for piece in frame.encode_parts():
-            left = memoryview(piece)
-            while left:
-                self._wait(until, within_s, writing=True)
-                try:
-                    left = left[os.write(self._to, left[: 16 * _BLOCK]) :]
-                except BlockingIOError:
-                    continue
-                except OSError as error:
-                    raise ProcessFaultError(self._describe_exit()) from error
+        endpoint = Endpoint(
+            "meshes",
+            self.hello.url,
+            self.hello.model,
+            timeout_s=within_s,
+            read_s=within_s,
+            max_body_bytes=MAX_ANSWER_BYTES,
+            attempts=1,
+        )
 
-    def receive(self, within_s: float) -> MeshFrame:
-        """Receive the next message.
+        async def send(client: BoundedClient) -> Mapping[str, Any]:
+            post = asyncio.ensure_future(client.post(f"{self.hello.url.rstrip('/')}/meshes", json=question))
+            try:
+                while not (await asyncio.wait([post], timeout=_POLL_S))[0]:
+                    self._heartbeat()
+                return post.result().json()
+            finally:
+                post.cancel()
 
-        Raises:
-            ProcessFaultError: if it does not come in time, is too long, or is invalid.
-        """
         until = time.monotonic() + within_s
-        start = self._receive_exactly(_LENGTH.size, until, within_s)
-        (length,) = _LENGTH.unpack(start)
-        if length > MAX_HEAD_BYTES:
-            raise ProcessFaultError(
-                f"its stdout holds {sanitize_line(repr(start))} where a message begins: what prints?"
-            )
         try:
-            head = json.loads(self._receive_exactly(length, until, within_s))
-        except (ValueError, RecursionError) as error:
-            raise ProcessFaultError("it sent a message whose head is no JSON") from error
-        return MeshFrame(head, tuple(self._receive_exactly(size, until, within_s) for size in _parse_sizes(head)))
+            return send_with_retries(endpoint, send, {}, until)
+        except ModelError as error:
+            if time.monotonic() >= until:
+                raise ProcessFaultError(f"it was silent for {within_s:g} s") from error
+            problem = str(error).replace(f"{format_host(endpoint.base_url)}: ", "")
+            raise ProcessFaultError(self._describe_exit() or problem) from error
 
     def close(self, grace_s: float = 0.0) -> None:
         """End the process and its descendants; it has `grace_s` to end by itself."""
-        assert self._process.stdin is not None  # noqa: S101
-        assert self._process.stdout is not None  # noqa: S101
         self._note_descendants()
-        self._process.stdin.close()
+        self._stdin.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(grace_s)
         for process in self._descendants:
@@ -199,16 +192,32 @@ class MeshProcess:
                 process.kill()
         self._process.kill()
         self._process.wait()
-        self._process.stdout.close()
 
-    def _await_answer(self, step: str, within_s: float, read: Any) -> Any:
-        """Parse the answer of the process to its start, or to the message to load."""
+    def read_last_line(self) -> str:
+        """Return the last line of output; call it after `close`."""
+        return self._output.read_last_line()
+
+    def _await_hello(self) -> Hello:
+        until = time.monotonic() + HELLO_S
+        while not self._output.is_settled.wait(max(0.0, min(_POLL_S, until - time.monotonic()))):
+            if time.monotonic() >= until:
+                raise ProcessFaultError(f"it was silent for {HELLO_S:g} s")
+            self._heartbeat()
+        if not self._output.hello:
+            raise ProcessFaultError(self._describe_exit() or "it closed its output without a hello")
         try:
-            if step == "load":
-                self.send(MeshFrame({"type": "load"}), within_s)
-            answer = read(self.receive(within_s).head)
+            return Hello.model_validate_json(self._output.hello)
+        except ValidationError as error:
+            first = error.errors()[0]
+            problem = sanitize_line(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", _SHOWN)
+            raise ProcessFaultError(f"its first message is no hello of protocol {PROTOCOL}: {problem}") from None
+
+    def _require(self, step: str, attempt: Callable[[], Any]) -> Any:
+        """Do what must succeed before meshes can be made, or end the process."""
+        try:
+            result = attempt()
             self._note_descendants()
-            return answer
+            return result
         except ProcessFaultError as fault:
             self.close()
             line = self.read_last_line()
@@ -217,36 +226,13 @@ class MeshProcess:
                 f"the mesh process `{shown}` does not {step}: {fault}" + (f"; it says: {line}" if line else "")
             ) from None
 
-    def _receive_exactly(self, size: int, until: float, within_s: float) -> bytes:
-        """Receive exactly so many bytes; further ones stay in the buffer."""
-        while len(self._ahead) < size:
-            self._wait(until, within_s, writing=False)
-            block = os.read(self._from, max(_BLOCK, min(size - len(self._ahead), 1 << 20)))
-            if not block:
-                raise ProcessFaultError(self._describe_exit())
-            self._ahead += block
-        data = bytes(memoryview(self._ahead)[:size])
-        del self._ahead[:size]
-        return data
-
-    def _wait(self, until: float, within_s: float, *, writing: bool) -> None:
-        while (left := until - time.monotonic()) > 0.0:
-            reads, writes = ([], [self._to]) if writing else ([self._from], [])
-            if any(select.select(reads, writes, [], min(left, _POLL_S))):
-                return
-            self._heartbeat()
-        raise ProcessFaultError(f"it was silent for {within_s:g} s")
-
     def _describe_exit(self) -> str:
+        """Describe how the process ended; empty if it runs."""
         try:
             code = self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
-            return "it closed its stdin or stdout"
+            return ""
         return f"it was killed by signal {-code}" if code < 0 else f"it ended with exit code {code}"
-
-    def read_last_line(self) -> str:
-        """Return the last line on stderr; call it after `close`."""
-        return self._stderr.read_last_line()
 
     def _note_descendants(self) -> None:
         """Note the descendants of the launcher, to end them should it be killed."""
@@ -259,30 +245,3 @@ def select_environment() -> dict[str, str]:
     """Select the variables that the process may see: where programs, GPUs, weights and caches are."""
     known = {name: value for name, value in os.environ.items() if _PASSED_VARIABLES.fullmatch(name)}
     return {name: value for name, value in known.items() if not _USER_IN_URL.search(value)}
-
-
-def _parse_sizes(head: Any) -> list[int]:
-    sizes = head.get("parts", []) if isinstance(head, dict) else None
-    if not isinstance(sizes, list) or len(sizes) > 1 or not all(type(size) is int and size >= 0 for size in sizes):
-        raise ProcessFaultError("it sent a message that says not what follows it")
-    if sizes and sizes[0] > MAX_MESH_BYTES:
-        raise ProcessFaultError(f"it sent a mesh of {sizes[0]} bytes; at most {MAX_MESH_BYTES} are read")
-    return sizes
-
-
-def _parse_hello(head: Mapping[str, Any]) -> Hello:
-    if head.get("type") != "hello" or head.get("protocol") != PROTOCOL:
-        raise ProcessFaultError(f"its first message is no hello of protocol {PROTOCOL}")
-    fields = [head.get(name) for name in ("model", "version", "licence")]
-    wants = head.get("wants", [])
-    if not all(isinstance(text, str) and 0 < len(text) <= 100 and text.isprintable() for text in fields):
-        raise ProcessFaultError("its hello must name model, version and licence, in 1 to 100 characters each")
-    if not isinstance(wants, list) or not set(map(str, wants)) <= {"depth", "seed"}:
-        raise ProcessFaultError("its hello may want 'depth' and 'seed'")
-    model, version, licence = map(str, fields)
-    return Hello(model, version, licence, frozenset(map(str, wants)))
-
-
-def _check_ready(head: Mapping[str, Any]) -> None:
-    if head.get("type") != "ready":
-        raise ProcessFaultError("it answered 'load' with something else than 'ready'")

@@ -1,13 +1,15 @@
 """Requests to the mesh daemon: the objects of a scene that have no mesh yet, and their outcomes."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.disk_cache import DiskCache
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.stages.place.mesh_service.process import Hello, MeshFrame, ProcessFaultError
+from tableverse_factory.stages.place.mesh_service.process import ProcessFaultError
 
 FORMATS = ("glb", "obj", "ply", "stl")
 UPS = ("y", "z")
@@ -20,23 +22,23 @@ class SceneRequest:
     """Request of a worker for the objects of a scene.
 
     Attributes:
-        silence_s: Longest wait between two meshes [s].
+        silence_s: Longest wait for an answer [s].
+        picture: Picture with depth and intrinsics, as the process gets them.
         cache: Cache of meshes.
     """
 
-    def __init__(self, frame: MeshFrame) -> None:
-        """Decode a request of `client.MeshClient`."""
-        head, (self.picture, self.depth, *masks) = frame.head, frame.parts
-        self._hello: dict[str, Any] | None = head["hello"]
-        self.silence_s, self.camera, self._count = float(head["silence_s"]), head["camera"], head["count"]
-        self.cache = DiskCache(Path(head["cache"]), ".frame", durable=True)
-        self._meshes = [MeshRequest(self, mask, **entry) for mask, entry in zip(masks, head["objects"], strict=True)]
+    def __init__(self, request: Mapping[str, Any]) -> None:
+        """Read a request of `client.MeshClient`."""
+        self._model: dict[str, Any] | None = request["model"]
+        self.silence_s, self.picture, self._count = float(request["silence_s"]), request["picture"], request["count"]
+        self.cache = DiskCache(Path(request["cache"]), ".json", durable=True)
+        self._meshes = [MeshRequest(self, **entry) for entry in request["objects"]]
         self._faults: dict[int, str] = {}
         self._given_up = self._refused = ""
 
-    def check_process(self, hello: dict[str, Any]) -> None:
-        """Drop the objects if the worker expects another process; the answer tells it which this one is."""
-        if self._hello != hello:
+    def check_model(self, model: dict[str, Any]) -> None:
+        """Drop the objects if the worker expects another model; the answer tells it which this one is."""
+        if self._model != model:
             self._meshes = []
 
     def open_meshes(self) -> list["MeshRequest"]:
@@ -56,10 +58,10 @@ class SceneRequest:
         """Note that the cache folder takes no meshes, which a person must resolve."""
         self._refused = reason
 
-    def build_answer(self, hello: dict[str, Any]) -> MeshFrame:
+    def build_answer(self, model: dict[str, Any]) -> dict[str, Any]:
         """Build the answer to the worker."""
         reasons = {str(mesh.number): mesh.reason for mesh in self._meshes if mesh.reason}
-        return MeshFrame({"hello": hello, "reasons": reasons, "given_up": self._given_up, "refused": self._refused})
+        return {"model": model, "reasons": reasons, "given_up": self._given_up, "refused": self._refused}
 
 
 @dataclass(slots=True, eq=False)
@@ -68,7 +70,7 @@ class MeshRequest:
 
     Attributes:
         scene: Request that it belongs to.
-        mask: PNG file.
+        mask: PNG file in base64.
         number: Index in the scene.
         key: Cache key of the mesh.
         seed: Random seed for the model.
@@ -76,7 +78,7 @@ class MeshRequest:
     """
 
     scene: SceneRequest
-    mask: bytes
+    mask: str
     number: int
     key: str
     seed: int
@@ -93,24 +95,27 @@ class MeshRequest:
             self.reason = ""
         return self.reason is not None
 
-    def store_answer(self, frame: MeshFrame, hello: dict[str, Any]) -> None:
+    def store_answer(self, answer: Any, model: dict[str, Any]) -> None:
         """Note the answer of the process; cache a mesh with its model, version and licence.
 
         Raises:
-            ProcessFaultError: if the message is no answer.
+            ProcessFaultError: if it is neither a mesh nor an error.
         """
-        head = frame.head
-        if head.get("type") == "failed":
-            self.reason = f"the model has no mesh: {sanitize_line(str(head.get('reason')), _MAX_REASON)}"
+        if not isinstance(answer, dict) or not isinstance(answer.get("error", answer.get("data")), str):
+            raise ProcessFaultError("it sent an object with neither 'data' nor 'error'")
+        if "error" in answer:
+            self.reason = f"the model has no mesh: {sanitize_line(answer['error'], _MAX_REASON)}"
             return
-        if head.get("type") != "mesh" or len(frame.parts) != 1:
-            raise ProcessFaultError("it sent a message that is no answer")
-        if head.get("format") not in FORMATS or head.get("up") not in UPS:
+        if answer.get("format") not in FORMATS or answer.get("up") not in UPS:
             self.reason = f"its mesh names no format of {', '.join(FORMATS)} with an up axis of {' or '.join(UPS)}"
             return
-        entry = MeshFrame({**hello, "format": head["format"], "up": head["up"]}, frame.parts)
         try:
-            self.scene.cache.put(self.key, b"".join(entry.encode_parts()))
+            base64.b64decode(answer["data"], validate=True)
+        except ValueError:
+            raise ProcessFaultError("it sent a mesh that is not in base64") from None
+        entry = {**model, **{name: answer[name] for name in ("format", "up", "data")}}
+        try:
+            self.scene.cache.put(self.key, json.dumps(entry).encode())
         except OSError as error:
             self.scene.refuse(
                 f"meshes cannot be kept in {self.scene.cache.folder}: {error.strerror or error}. Free space, or set "
@@ -125,27 +130,8 @@ class MeshRequest:
         self.scene.fail(self.number, self.reason, fault)
 
 
-def describe_process(hello: Hello) -> dict[str, Any]:
-    """Return a hello as JSON for answers and the cache."""
-    return {**asdict(hello), "wants": sorted(hello.wants)}
-
-
-def build_message(meshes: Mapping[str, MeshRequest]) -> MeshFrame:
-    """Build the message that requests meshes by name, with each picture once."""
-    parts: list[bytes] = []
-    pictures: list[dict[str, Any]] = []
-    indices: dict[SceneRequest, int] = {}
-    objects = []
-
-    def put(part: bytes) -> int:
-        parts.append(part)
-        return len(parts) - 1
-
-    for name, mesh in meshes.items():
-        scene = mesh.scene
-        if scene not in indices:
-            indices[scene] = len(pictures)
-            depth = put(scene.depth) if scene.depth else None
-            pictures.append({"picture": put(scene.picture), "depth": depth, "camera": scene.camera})
-        objects.append({"id": name, "picture": indices[scene], "mask": put(mesh.mask), "seed": mesh.seed})
-    return MeshFrame({"type": "make", "pictures": pictures, "objects": objects}, tuple(parts))
+def build_question(meshes: Sequence[MeshRequest]) -> dict[str, Any]:
+    """Build the question for meshes, with each picture once."""
+    scenes = list(dict.fromkeys(mesh.scene for mesh in meshes))
+    objects = [{"picture": scenes.index(mesh.scene), "mask": mesh.mask, "seed": mesh.seed} for mesh in meshes]
+    return {"pictures": [scene.picture for scene in scenes], "objects": objects}

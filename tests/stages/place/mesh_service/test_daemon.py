@@ -1,5 +1,6 @@
 """One mesh process for many workers: real processes ask, some are killed, and nobody gets other bytes for it."""
 
+import base64
 import json
 import os
 import socket
@@ -19,9 +20,7 @@ from tableverse_factory.models.local.batch_server import serve_batches
 from tableverse_factory.models.local.wire import send_arrays
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.client import MeshClient
-from tableverse_factory.stages.place.mesh_service.daemon import OBJECTS, MeshDaemon
-from tableverse_factory.stages.place.mesh_service.process import MeshFrame
-from tableverse_factory.stages.place.mesh_service.requests import describe_process
+from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon, decode_json, encode_json
 from tests.helpers.mesh_asker import hashes
 from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS, ROOT
@@ -29,8 +28,13 @@ from tests.helpers.paths import HELPERS, ROOT
 BAD = 666
 
 
-def command_of(folder: Path, behaviour: str) -> tuple[str, ...]:
-    return "env", f"MESH_LOG={folder / 'log'}", sys.executable, "-I", str(HELPERS / "mesh_server.py"), behaviour
+BATCH = 32
+
+
+def command_of(folder: Path, behaviour: str, batch: int = BATCH) -> tuple[str, ...]:
+    """The helper's command; the model makes that many objects at a time."""
+    variables = f"MESH_LOG={folder / 'log'}", f"MESH_BATCH={batch}"
+    return "env", *variables, sys.executable, "-I", str(HELPERS / "mesh_server.py"), behaviour
 
 
 def noted(folder: Path, what: str = "") -> list[str]:
@@ -140,29 +144,28 @@ def build_request(
     folder: Path, daemon: MeshDaemon, name: str, *seeds: int, silence_s: float = 20.0
 ) -> list[np.ndarray]:
     """What a worker sends that knows who answers."""
-    head = {
-        "hello": describe_process(daemon.ensure_process().hello),
+    request = {
+        "model": daemon.ensure_process().hello.describe_model(),
         "count": len(seeds),
         "cache": str(folder / "kept"),
         "silence_s": silence_s,
-        "camera": {"fx": 5.0, "fy": 5.0, "cx": 3.0, "cy": 2.0},
-        "objects": [{"number": k, "key": f"{name}{k:063d}", "seed": seed} for k, seed in enumerate(seeds)],
+        "picture": {"picture": base64.b64encode(name.encode()).decode(), "depth": None, "camera": {}},
+        "objects": [{"number": k, "key": f"{name}{k:063d}", "seed": seed, "mask": ""} for k, seed in enumerate(seeds)],
     }
-    frame = MeshFrame(head, (name.encode(), b"", *(b"mask" for _ in seeds)))
-    return [np.frombuffer(b"".join(frame.encode_parts()), dtype=np.uint8)]
+    return list(encode_json(request))
 
 
 def read_outcomes(answers: Iterable[Sequence[np.ndarray]]) -> list[tuple[list[int], str]]:
     """For each scene the objects that have no mesh, and why it is given up."""
-    heads = [MeshFrame.decode(answer.tobytes()).head for (answer,) in answers]
-    return [(sorted(map(int, head["reasons"])), head["given_up"]) for head in heads]
+    found = [decode_json(answer) for answer in answers]
+    return [(sorted(map(int, answer["reasons"])), answer["given_up"]) for answer in found]
 
 
 def kept_seeds(folder: Path, name: str, n: int) -> list[int]:
     """For which object each mesh was made that is kept of a scene; of a process that opens its gate."""
-    files = DiskCache(folder / "kept", ".frame")
-    kept = [files.get(f"{name}{number:063d}") or b"" for number in range(n)]
-    return [int(data.rpartition(b"# ")[2].split()[0]) for data in kept]
+    files = DiskCache(folder / "kept", ".json")
+    kept = [json.loads(files.get(f"{name}{number:063d}") or b"{}") for number in range(n)]
+    return [int(base64.b64decode(entry["data"]).rpartition(b"# ")[2].split()[0]) for entry in kept]
 
 
 def make_full_folder(folder: Path) -> Path:
@@ -173,11 +176,11 @@ def make_full_folder(folder: Path) -> Path:
 
 
 @pytest.fixture
-def start_daemon(tmp_path: Path) -> Iterator[Callable[[str], MeshDaemon]]:
+def start_daemon(tmp_path: Path) -> Iterator[Callable[..., MeshDaemon]]:
     kept: list[MeshDaemon] = []
 
-    def start(behaviour: str) -> MeshDaemon:
-        kept.append(MeshDaemon(command_of(tmp_path, behaviour)))
+    def start(behaviour: str, batch: int = BATCH) -> MeshDaemon:
+        kept.append(MeshDaemon(command_of(tmp_path, behaviour, batch)))
         return kept[-1]
 
     yield start
@@ -186,7 +189,7 @@ def start_daemon(tmp_path: Path) -> Iterator[Callable[[str], MeshDaemon]]:
 
 
 def test_an_object_that_kills_the_process_costs_no_other_scene_anything(tmp_path, start_daemon):
-    one = start_daemon("crash")
+    one = start_daemon("crash", 1)
     asked = [("a", 1, 2), ("b", 3, BAD, 4), ("c", BAD), ("d", 5, BAD, 1000 + BAD, 2000 + BAD, 6), ("e", 7)]
     answers = read_outcomes(one.answer_scenes([build_request(tmp_path, one, *scene) for scene in asked]))
     assert [missing for missing, _ in answers] == [[], [1], [0], [1, 2, 3], []]
@@ -206,22 +209,22 @@ def test_many_objects_are_several_requests_and_each_scene_is_told_when_its_own_a
     asked = [("a", *range(20)), ("b", *range(20, 40)), ("c", *range(40, 75))]
     answers = one.answer_scenes([build_request(tmp_path, one, *scene) for scene in asked])
     next(answers)
-    assert 20 <= len(noted(tmp_path, "make")) <= OBJECTS
+    assert 20 <= len(noted(tmp_path, "make")) <= BATCH
     list(answers)
     sizes = [int(line.split()[-2]) for line in noted(tmp_path, "request")]
-    assert (max(sizes), sum(sizes), len(sizes)) == (OBJECTS, 75, 3)
+    assert (max(sizes), sum(sizes), len(sizes)) == (BATCH, 75, 3)
 
 
-def test_a_scene_is_told_while_the_process_works_on_another_of_the_same_request(tmp_path, start_daemon):
-    one = start_daemon("gate")
+def test_a_scene_is_told_before_the_process_works_on_another_that_is_asked_with_it(tmp_path, start_daemon):
+    one = start_daemon("gate", 2)
     answers = one.answer_scenes(
-        [build_request(tmp_path, one, "a", 1, silence_s=3.0), build_request(tmp_path, one, "b", 2, BAD)]
+        [build_request(tmp_path, one, "a", 1, 3, silence_s=3.0), build_request(tmp_path, one, "b", 2, BAD)]
     )
     assert read_outcomes([next(answers)]) == [([], "")]
     assert not (tmp_path / "log.gate").exists()
     (tmp_path / "log.gate").touch()
     assert read_outcomes(answers) == [([], "")]
-    assert len(noted(tmp_path, "start")) == len(noted(tmp_path, "request")) == 1
+    assert (len(noted(tmp_path, "start")), len(noted(tmp_path, "request"))) == (1, 2)
 
 
 def test_of_two_scenes_in_a_request_the_more_patient_one_is_heeded(tmp_path, start_daemon):
@@ -240,15 +243,13 @@ def test_a_disk_that_refuses_costs_its_own_scene_and_no_other(tmp_path, start_da
     asked = [("b", 11, 12), ("c", 21, 22)]
     scenes = [build_request(full, one, "a", 1, 2, 3), *(build_request(tmp_path, one, *scene) for scene in asked)]
     answers = list(one.answer_scenes(scenes))
-    refused = [MeshFrame.decode(answer.tobytes()).head["refused"] for (answer,) in answers]
+    refused = [decode_json(answer)["refused"] for answer in answers]
     assert ["Free space" in why for why in refused] == [True, False, False]
     list(one.answer_scenes([build_request(full, one, "a", 1, 2, 3)]))
     assert read_outcomes(one.answer_scenes([build_request(tmp_path, one, "d", 31, 32, 33)])) == [([], "")]
     found = [kept_seeds(tmp_path, name, n) for name, n in (("b", 2), ("c", 2), ("d", 3))]
     assert found == [[11, 12], [21, 22], [31, 32, 33]]
     assert len(noted(tmp_path, "start")) == 1
-    named = [name for line in noted(tmp_path, "named") for name in line.split()[1:-1]]
-    assert len(named) == len(set(named)) == 13, "a name is used once"
 
 
 def test_whatever_ends_a_request_ends_the_process_and_its_answers_with_it(tmp_path):
