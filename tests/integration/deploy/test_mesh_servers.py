@@ -1,6 +1,7 @@
 """The model's side of the mesh protocol; packages that answer as theirs do stand in for the models themselves."""
 
 import io
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -152,7 +153,8 @@ def test_other_weights_or_settings_are_another_version(tmp_path):
     ):
         config.write_text(text)
         line = [sys.executable, "-S", "-E", HERE / options[0], *options[1:]]
-        versions.append(subprocess.run(line, input=b"", capture_output=True, check=True).stdout)
+        hello = json.loads(subprocess.run(line, input=b"", capture_output=True, check=True).stdout)
+        versions.append((hello["model"], hello["version"]))
     assert len(set(versions)) == 5
 
 

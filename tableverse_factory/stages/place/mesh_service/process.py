@@ -178,7 +178,8 @@ class MeshProcess:
         except ModelError as error:
             if time.monotonic() >= until:
                 raise ProcessFaultError(f"it was silent for {within_s:g} s") from error
-            problem = str(error).replace(f"{format_host(endpoint.base_url)}: ", "")
+            host = format_host(endpoint.base_url)  # the port is another each time, and records quote the message
+            problem = str(error).replace(f"{host}: ", "").replace(host, "it")
             raise ProcessFaultError(self._describe_exit() or problem) from error
 
     def close(self, grace_s: float = 0.0) -> None:

@@ -117,7 +117,7 @@ def test_one_process_serves_scene_after_scene_and_nothing_is_made_twice(make: Ma
         ("drip", "silent for 0.5 s"),
         ("half", "exit code 0"),
         ("close", "the connection failed: RemoteProtocolError"),
-        ("refuse", "HTTP 404"),
+        ("refuse", "it knows no model 'tetra' at this address (HTTP 404)"),
         ("list", "no whole JSON object"),
         ("nothing", "not as many 'meshes' as objects"),
         ("too many", "not as many 'meshes' as objects"),
@@ -181,7 +181,7 @@ def test_what_is_kept_changes_no_result(make: Make):
 def test_a_process_that_fails_at_one_object_after_the_other_is_given_up(make: Make, log: Log):
     with pytest.raises(ModelError, match="at 3 objects in a row the mesh process failed twice: it ended"):
         make("crash", 1, *(1000 * k + BAD for k in range(5)))
-    assert log().count("load") == 4
+    assert log().count("load") == 6
 
 
 @pytest.mark.parametrize(
