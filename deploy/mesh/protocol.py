@@ -6,10 +6,12 @@ Runs in the model's own environment and needs only Python 3.10.
 import ctypes
 import hashlib
 import json
+import os
 import secrets
 import signal
 import sys
 import threading
+import traceback
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -108,9 +110,10 @@ class MeshServer(HTTPServer):
         self.path, self.answer = f"/{secrets.token_urlsafe(16)}", answer
 
     def handle_error(self, *_: object) -> None:
-        """Raise errors other than those of a connection, at which the process ends with their message."""
+        """End the process at once, with the error as its last line, unless only the connection failed."""
         if not isinstance(sys.exc_info()[1], ConnectionError):
-            raise
+            traceback.print_exc()
+            os._exit(1)
 
 
 class MeshHandler(BaseHTTPRequestHandler):

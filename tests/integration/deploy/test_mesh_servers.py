@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+import httpx
 import numpy as np
 import pytest
 from PIL import Image
 
 from schemas.geometry import Camera
+from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.client import MeshClient, MeshFile, MeshQuery, RgbdImage
 from tableverse_factory.stages.place.mesh_service.model_completion import convert_mesh
@@ -217,6 +219,25 @@ def asked(command: list[object], folder: Path, count: int) -> list[MeshFile | st
     masks = [np.arange(24).reshape(4, 6) // 2 == 3 + k for k in range(count)]
     line = (sys.executable, *map(str, command))
     return MeshClient(line, 60.0, Services(folder / "cache")).make_meshes(view, [MeshQuery(mask, 5) for mask in masks])
+
+
+def test_only_who_was_told_the_address_is_answered():
+    line = [sys.executable, "-S", "-E", HERE / "sam3d.py", "--self-test"]
+    with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        url = httpx.URL(json.loads(process.stdout.readline())["url"])
+        question = {"pictures": [], "objects": []}
+        assert httpx.post(url.copy_with(path="/meshes"), json=question).status_code == 404
+        assert httpx.post(f"{url}/meshes", json=question).json() == {"meshes": []}
+        process.communicate()
+    assert process.returncode == 0
+
+
+def test_a_model_that_cannot_be_loaded_ends_the_process_with_its_error_as_the_last_line(inside, tmp_path):
+    with pytest.raises(
+        ModelAccessError, match="does not load: it ended with exit code 1; it says: ModuleNotFoundError"
+    ):
+        asked([HERE / "triposr.py", "--checkout", tmp_path], tmp_path, 1)
 
 
 @pytest.mark.slow

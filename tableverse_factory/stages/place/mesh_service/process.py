@@ -33,7 +33,7 @@ MAX_ANSWER_BYTES = 352 * 1024 * 1024
 MAX_BATCH = 32
 """Maximum number of objects in one request."""
 
-_END_S = 0.5
+_END_S = 1.0
 """Time in which a process that closed its connection ends [s]."""
 _SHOWN = 200
 _PASSED_VARIABLES = re.compile(
