@@ -41,6 +41,7 @@ def entries(tmp_path_factory) -> list[ImageRow]:
     return list(make_manifest([str(folder / "in")], Config().observe).rows)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", [SceneKind.CAPTURE, SceneKind.LAYOUT])
 def test_stages_read_what_they_declare(entries, tmp_path, kind):
     row = next(row for row in entries if row.kind is kind)

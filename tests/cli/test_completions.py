@@ -12,6 +12,8 @@ from tableverse_factory.core.config import list_keys
 from tests.helpers.paths import ROOT
 from tests.helpers.small_dataset import write_small_dataset
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(scope="module")
 def here(tmp_path_factory) -> Path:

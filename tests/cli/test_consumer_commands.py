@@ -58,6 +58,7 @@ def test_query_shows_the_names_that_tasks_use_and_says_where_nothing_is(tablever
     assert "0 rows" not in answer.out
 
 
+@pytest.mark.heavy
 def test_query_takes_no_more_than_asked(tableverse, out, monkeypatch):
     assert len(json.loads(tableverse("query", out, "--limit", "2", "--json").out)) == 2
     assert len(tableverse("query", out, "--limit", "2").out.splitlines()) == 3

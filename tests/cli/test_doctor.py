@@ -23,6 +23,7 @@ def test_this_machine_is_ready(tableverse):
     assert found["ready"] == all(check["ok"] for check in found["checks"] if check["required"])
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("code", "found"),
     [
@@ -40,6 +41,7 @@ def test_whatever_crashes_or_hangs_is_a_finding(monkeypatch, code, found):
     assert check.advice == "do this"
 
 
+@pytest.mark.heavy
 def test_what_works_needs_no_advice():
     assert doctor_checks._check_script("trial", "print('fine')", "do this") == doctor_checks.Check(
         "trial", True, True, "fine", ""
@@ -66,6 +68,7 @@ def test_a_full_disk_is_a_finding(monkeypatch, tmp_path):
     assert not doctor_checks._check_free_space("disk", tmp_path).ok
 
 
+@pytest.mark.heavy
 def test_trials_are_run_by_this_python():
     assert Path(doctor_checks._check_script("trial", "import sys; print(sys.executable)", "").found) == Path(
         sys.executable

@@ -18,6 +18,8 @@ from tests.helpers.captures_on_disk import write_picture
 from tests.helpers.paths import ROOT
 from tests.helpers.small_dataset import write_small_dataset
 
+pytestmark = pytest.mark.heavy
+
 TABLEVERSE = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 PLAIN = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "FORCE_COLOR", "TABLEVERSE_DEBUG")}
 

@@ -2,6 +2,8 @@
 
 import re
 
+import pytest
+
 from schemas.config import Config
 from tableverse_factory.core.config import format_commented_yaml, list_keys, load_config
 
@@ -40,6 +42,7 @@ def test_nothing_is_overwritten(tableverse, tmp_path, monkeypatch):
     assert not (tmp_path / "config.yaml").exists()
 
 
+@pytest.mark.heavy
 def test_captures_are_made_and_found_in_it(tableverse, tmp_path, monkeypatch):
     """What `init` says comes next works in the folder that it made."""
     monkeypatch.chdir(tmp_path)

@@ -44,6 +44,7 @@ def clock(monkeypatch) -> Clock:
     return clock
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("hours", "most"), [(0.1, 80), (10.0, 260), (240.0, 3000)])
 def test_a_build_of_100_000_scenes_says_few_lines(clock, hours, most):
     """Every scene fails and is noted, as where a model is misconfigured."""
@@ -91,6 +92,7 @@ def test_what_is_quick_says_nothing(capsys):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.heavy
 def test_a_real_build_in_a_pipe_keeps_its_streams_apart(tmp_path):
     """What is said goes to stderr and the outcome to stdout, plain, and the data of other commands alone on stdout."""
     rows = [{"scene_id": f"s{i}", "kind": "capture", "uri": "/x", "rejected": "unreadable_color"} for i in range(2000)]

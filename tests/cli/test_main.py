@@ -41,6 +41,7 @@ def test_every_command_has_help_with_an_example(tableverse, command):
     assert f"tableverse {' '.join(command)}" in answer.out.partition("Example")[2]
 
 
+@pytest.mark.heavy
 def test_nothing_heavy_is_imported_before_a_command_runs():
     """`--help` must answer at once; who imports pyarrow for it waits a second."""
     code = (
@@ -75,6 +76,7 @@ def test_a_wrong_option_is_exit_code_2(tableverse):
     assert tableverse("nosuch").code == 2
 
 
+@pytest.mark.heavy
 def test_the_traceback_is_there_for_who_asks(tmp_path):
     ended = subprocess.run(
         [*LAUNCH, "query", str(tmp_path / "nowhere")], env={"TABLEVERSE_DEBUG": "1"}, capture_output=True, text=True
@@ -83,6 +85,7 @@ def test_the_traceback_is_there_for_who_asks(tmp_path):
     assert "Traceback" in ended.stderr
 
 
+@pytest.mark.heavy
 def test_ctrl_c_is_130_without_a_traceback():
     code = (
         "from tableverse_factory.cli.main import app, main\n"
@@ -94,6 +97,7 @@ def test_ctrl_c_is_130_without_a_traceback():
     assert ended.stderr == ""
 
 
+@pytest.mark.heavy
 def test_a_closed_pipe_is_no_traceback(tmp_path):
     """`tableverse config | head -1`."""
     shell = f"{sys.executable} -c '{LAUNCH[2]}' config | head -1"
@@ -103,6 +107,7 @@ def test_a_closed_pipe_is_no_traceback(tmp_path):
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.heavy
 def test_colour_is_left_out_where_it_is_not_wanted():
     coloured = {"FORCE_COLOR": "1", "TERM": "xterm-256color"}
     with_colour = subprocess.run([*LAUNCH, "--help"], env=coloured, capture_output=True)

@@ -29,6 +29,7 @@ def home(tmp_path_factory) -> Path:
     return home
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("line", "code", "says"),
     [

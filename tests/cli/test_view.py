@@ -19,6 +19,7 @@ def dataset(tmp_path_factory):
     return write_viewed_dataset(tmp_path_factory.mktemp("viewed") / "out")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_it_prints_its_address_answers_and_ends_cleanly(tmp_path, dataset, stop):
     source = dataset

@@ -92,6 +92,7 @@ def test_a_wrong_override_says_the_key_the_value_and_what_is_right(override, wor
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -128,12 +129,14 @@ def test_an_absent_file_is_named(tmp_path):
         load_config(tmp_path)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("key", list_keys())
 def test_every_key_has_a_section_a_type_and_can_be_set_to_its_default(key):
     default = list_keys()[key]["default"]
     assert load_config(None, [f"{key}={json.dumps(default)}"]) == Config()
 
 
+@pytest.mark.heavy
 @given(st.integers(0, 2**40), st.floats(0.0, 100.0))
 def test_equal_configurations_have_one_fingerprint_however_written(seed, clearance):
     a = load_config(None, [f"run.seed={seed}", f"rectify.clearance_m={clearance!r}"])

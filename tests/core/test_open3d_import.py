@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.heavy
+
 CAST = """
 import numpy as np, open3d as o3d
 scene = o3d.t.geometry.RaycastingScene()

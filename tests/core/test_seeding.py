@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,6 +13,7 @@ from tableverse_factory.core.seeding import make_rng
 names = st.text(max_size=30)
 
 
+@pytest.mark.heavy
 @given(st.integers(0, 2**63), names, names)
 def test_the_same_three_give_the_same_numbers(seed, scene, stage):
     first = make_rng(seed, scene, stage).integers(0, 2**63, 4)
@@ -28,6 +30,7 @@ def test_scene_and_stage_do_not_run_together():
     assert make_rng(0, "ab", "c").integers(0, 2**63) != make_rng(0, "a", "bc").integers(0, 2**63)
 
 
+@pytest.mark.heavy
 def test_another_process_with_another_hash_seed_draws_the_same():
     """Python's own `hash` of a text changes with every process."""
     code = (

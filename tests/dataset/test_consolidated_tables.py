@@ -22,6 +22,8 @@ from tests.helpers.builds import build, digests, scenes, write_manifest
 from tests.helpers.small_dataset import write_small_dataset
 from workers.plan.invalidate import reopen_scenes
 
+pytestmark = pytest.mark.heavy
+
 N_SHARDS = MANY_SHARDS + 3
 
 

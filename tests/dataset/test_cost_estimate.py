@@ -110,6 +110,7 @@ def test_costs():
     assert point(measured).costs == {}
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("spread", [0.3, 1.0])
 @pytest.mark.parametrize("n", [MIN_SCENES, 150])
 def test_the_interval_holds_the_truth_nine_times_in_ten(spread, n):
@@ -124,6 +125,7 @@ def test_the_interval_holds_the_truth_nine_times_in_ten(spread, n):
     assert inside >= 180, inside
 
 
+@pytest.mark.heavy
 def test_the_interval_narrows_and_is_the_same_every_time():
     times = np.random.default_rng(0).lognormal(size=6400)
     widths = [bootstrap_total(times[:n], 1).high - bootstrap_total(times[:n], 1).low for n in (100, 1600, 6400)]

@@ -199,6 +199,7 @@ def test_a_model_that_mujoco_refuses_is_said(out):
         dataset.scene("a-1").model()
 
 
+@pytest.mark.heavy
 def test_scenes_are_read_back_without_physics():
     code = (
         "import sys, tableverse_factory.dataset.committed_scene, tableverse_factory.dataset.scene_meta;"
@@ -208,6 +209,7 @@ def test_scenes_are_read_back_without_physics():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.heavy
 def test_importing_the_package_is_cheap():
     code = (
         "import sys, tableverse_factory; heavy = {'pyarrow', 'numpy', 'mujoco', 'fsspec'} & set(sys.modules);"

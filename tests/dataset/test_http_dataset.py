@@ -49,6 +49,7 @@ def test_a_damaged_one_is_not_taken_for_none(dataset, damaged, run):
     assert not (dataset.parent / "site").exists()
 
 
+@pytest.mark.heavy
 def test_one_that_a_server_fails_to_give_is_not_taken_for_none(dataset, monkeypatch):
     monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
     with range_server(dataset) as server:

@@ -119,6 +119,7 @@ conditions = st.recursive(
 )
 
 
+@pytest.mark.heavy
 @settings(max_examples=300, deadline=None)
 @given(conditions)
 def test_a_condition_selects_what_python_selects(condition):

@@ -99,6 +99,7 @@ def test_a_texture_lies_on_the_table_and_nothing_else_changed(scene):
     assert after.ntex == before.ntex
 
 
+@pytest.mark.heavy
 def test_it_is_the_same_each_time_and_the_scene_keeps_its_files(scene):
     files = scene.files()
     look = {"texture": 12, "lights": 3, "camera": 4}
@@ -109,6 +110,7 @@ def test_it_is_the_same_each_time_and_the_scene_keeps_its_files(scene):
     assert len({scene.restyle(**look).xml, *others}) == 3
 
 
+@pytest.mark.heavy
 def test_a_restyled_scene_is_as_certified(scene):
     restyled = scene.restyle(texture=5, lights=1, camera=1)
     assert audit_scene("scene", restyled.files()).problems == ()
@@ -216,6 +218,7 @@ def test_seeds_of_numpy_are_seeds(scene):
     np.testing.assert_array_equal(make_texture(np.uint8(7), 32), make_texture(7, 32))
 
 
+@pytest.mark.heavy
 def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_path):
     folder = tmp_path / "scene"
     arguments = ["extract", str(out), "scene", str(folder), "--texture", "square_tiles-0", "--lights", "2"]

@@ -31,6 +31,7 @@ def test_rows_of_a_scene_are_those_of_the_tables(dataset):
         scene.object_rows()
 
 
+@pytest.mark.heavy
 def test_a_scene_that_is_opened_asks_for_its_own_shard(dataset):
     with range_server(dataset) as server:
         shelf = SceneCache(open_dataset(server.address))

@@ -31,6 +31,7 @@ def _tar(scenes: list[ExportedScene]) -> tuple[bytes, dict[str, tuple[int, int]]
     return file.getvalue(), places
 
 
+@pytest.mark.heavy
 @given(names=st.lists(ids, min_size=1, max_size=6, unique=True), data=st.data())
 def test_members_are_sorted_offsets_are_true_and_order_does_not_matter(names, data):
     scenes = [

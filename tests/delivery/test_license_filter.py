@@ -72,6 +72,7 @@ def _write_shard(out, number, licences, meshes=None):
         write_atomic(shard_path(out, table, number), encode_parquet(build_table(rows, schema)))
 
 
+@pytest.mark.heavy
 def test_meshes_of_models_bind_a_scene_as_its_picture_does(dataset, tmp_path):
     meshes = {"s-2-2": ["MIT", "SAM License"], "s-2-3": ["MIT"]}
     _write_shard(dataset, 2, {f"s-2-{k}": licence for k, licence in enumerate(LICENCES[2])}, meshes)
@@ -88,6 +89,7 @@ def tree(folder):
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*.*")}
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("profile", "kept"),
     [
@@ -117,6 +119,7 @@ def test_a_profile_decides_and_what_stays_behind_leaves_no_trace(dataset, tmp_pa
         assert all("/" not in uri for uri in pq.read_table(path)["uri"].to_pylist())
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("survivor", ["run.json", "scenes/shard-00000.parquet", "mjcf/shard-00001.tar"])
 def test_a_killed_export_goes_on_to_the_same_bytes(dataset, tmp_path, survivor):
     write_filtered_dataset(dataset, tmp_path / "whole", "permissive")
@@ -134,6 +137,7 @@ def _folders():
     return [("mjcf", "tar"), *parquet]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("left", ["plan.parquet.partial", "run.json.partial", ".work/lock"])
 def test_an_export_killed_before_it_began_is_begun_again(dataset, tmp_path, left):
     path = tmp_path / "public" / left

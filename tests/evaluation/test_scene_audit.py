@@ -94,6 +94,7 @@ def test_verify_reads_a_dataset(scene: ExportedScene, tmp_path: Path) -> None:
     assert report["scenes"][0]["at_rest"] is True
 
 
+@pytest.mark.heavy
 def test_verify_fails_on_a_dataset_that_lies(scene: ExportedScene, tmp_path: Path) -> None:
     dataset_of(scene, tmp_path / "out", piece_penetration_m=0.01)
     result = CliRunner().invoke(app, ["verify", str(tmp_path / "out")])
@@ -147,6 +148,7 @@ def test_what_cannot_be_verified_says_what_can(tmp_path: Path, given: str) -> No
     assert "give OUT of `tableverse build`, an MJCF file" in str(result.exception)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("bodies", ["", '<body><geom type="box" size=".1 .1 .1"/></body>'])
 def test_nothing_that_moves_is_nothing_to_certify(tmp_path: Path, bodies: str) -> None:
     (tmp_path / "scene.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")

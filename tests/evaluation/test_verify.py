@@ -15,6 +15,8 @@ from tableverse_factory.core.process_pool import count_available_cpus
 from tableverse_factory.evaluation.verify import verify_scenes
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):

@@ -200,6 +200,7 @@ trees = st.recursive(
 )
 
 
+@pytest.mark.heavy
 @given(trees)
 def test_any_tree_comes_back(tree):
     """Also a mapping whose keys look like the codec's own marks."""
@@ -276,6 +277,7 @@ def test_a_forged_message_is_a_value_error(forged):
         decode(forged)
 
 
+@pytest.mark.heavy
 @settings(max_examples=300, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_a_damaged_message_decodes_or_is_a_value_error(seed):

@@ -44,6 +44,7 @@ def test_object_ids_sort_like_their_numbers():
     assert sorted(ids) == ids
 
 
+@pytest.mark.heavy
 @given(st.text(max_size=400))
 def test_labels_are_one_clean_line(text):
     label = clean_label(text)

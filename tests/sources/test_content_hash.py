@@ -53,6 +53,7 @@ def test_every_recorded_mesh_is_part_of_the_capture(capture: Path) -> None:
     assert digest(capture) not in seen
 
 
+@pytest.mark.heavy
 def test_more_meshes_than_a_picture_has_objects_are_refused(capture: Path) -> None:
     (capture / "meshes").mkdir()
     for number in range(1, MAX_RECORDED_MESHES + 2):

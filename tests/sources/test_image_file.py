@@ -65,6 +65,7 @@ def test_the_first_picture_of_a_phone_counts():
     assert decode_upright(data, "a", BOUNDS).shape == (30, 40, 3)
 
 
+@pytest.mark.heavy
 def test_a_text_that_unpacks_to_very_much_is_not_unpacked():
     from PIL.PngImagePlugin import PngInfo
 

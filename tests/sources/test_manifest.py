@@ -392,6 +392,7 @@ def test_any_name_gives_a_safe_unique_id(tmp_path_factory, name):
         assert row.name.isprintable()
 
 
+@pytest.mark.heavy
 @pytest.mark.shared
 def test_the_real_captures_and_layouts_enter(shared_dir):
     rows = rows_of(shared_dir / "captures", shared_dir / "layouts")

@@ -11,6 +11,8 @@ from tests.helpers.builds import Silent, digests, write_manifest
 from tests.helpers.builds import build as build_with_tiny_line
 from workers import build
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture
 def tiny(monkeypatch, tmp_path):

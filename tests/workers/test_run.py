@@ -17,6 +17,8 @@ from workers.plan.invalidate import reopen_scenes
 from workers.progress.build_state import read_build_state
 from workers.state.lock import create_writer_lock
 
+pytestmark = pytest.mark.heavy
+
 MIXED = ["fine", "empty_1", "fine", "sad", "fine", "fell", "fine", "segfault", "fine", "raise", "escape", "fine"]
 
 

@@ -21,6 +21,8 @@ from tableverse_factory.core.storage.files import (
 )
 from tableverse_factory.core.storage.s3 import ObjectStore
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.mark.parametrize(
     ("text", "meant"),

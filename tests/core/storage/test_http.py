@@ -44,6 +44,7 @@ def server(dataset, monkeypatch) -> Iterator[RangeServer]:
         yield running
 
 
+@pytest.mark.heavy
 def test_a_scene_of_a_shard_of_a_gigabyte_costs_its_own_bytes(server):
     """Held to: less than twice the scene's bytes. Counted: all that the server sent, tables too."""
     scene = open_dataset(server.address).scene("s-1-1")
@@ -64,6 +65,7 @@ def test_the_next_scene_of_the_same_shard_needs_no_plan(server):
     assert set(server.asked) == {"scenes/shard-00001.parquet", TAR}
 
 
+@pytest.mark.heavy
 def test_the_tables_are_read_and_queried(server, run):
     others = list(_OPEN_FILES)  # of tests before this one
     opened = open_dataset(server.address)
@@ -82,6 +84,7 @@ def test_the_tables_are_read_and_queried(server, run):
     assert len(_OPEN_FILES) <= len(others), "Arrow lets go of every file, or the interpreter would wait for it"
 
 
+@pytest.mark.heavy
 def test_a_scene_is_extracted(server, run, tmp_path):
     assert run("extract", server.address, "s-1-1", tmp_path / "scene")[0] == 0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "scene" / "scene.xml")).nbody == 3
@@ -90,6 +93,7 @@ def test_a_scene_is_extracted(server, run, tmp_path):
     assert "nearest: s-1-1" in errors
 
 
+@pytest.mark.heavy
 def test_a_dataset_goes_to_another_process(server):
     """As the workers of a DataLoader get it."""
     opened = open_dataset(server.address)
@@ -99,6 +103,7 @@ def test_a_dataset_goes_to_another_process(server):
     assert copy.objects.count_rows() == 4
 
 
+@pytest.mark.heavy
 def test_many_shards_are_read_from_one_table(tmp_path):
     out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
     write_merged_tables(out, 20)
@@ -114,6 +119,7 @@ def test_many_shards_are_read_from_one_table(tmp_path):
         assert open_dataset(server.address).objects.count_rows() == 20
 
 
+@pytest.mark.heavy
 def test_a_merged_table_that_a_server_fails_to_give_is_an_error_and_not_a_thousand_questions(tmp_path, monkeypatch):
     monkeypatch.setattr(http, "RETRY_POLICY", replace(http.RETRY_POLICY, backoff_s=0.01))
     out = write_public_dataset(tmp_path / "out", shards=20, scenes=1, n_bytes=10)
@@ -125,6 +131,7 @@ def test_a_merged_table_that_a_server_fails_to_give_is_an_error_and_not_a_thousa
             _ = opened.objects
 
 
+@pytest.mark.heavy
 def test_what_is_not_finished_is_read_as_far_as_it_is(tmp_path):
     out = write_public_dataset(tmp_path / "out", shards=3, n_bytes=10)
     (out / "scenes" / "shard-00001.parquet").unlink()
@@ -179,6 +186,7 @@ def answering(status: int, body: bytes = b"", **headers: str):
     return fault
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -236,6 +244,7 @@ def test_a_busy_server_is_asked_again(server):
     assert server.asked[TAR] == 3
 
 
+@pytest.mark.heavy
 def test_a_file_that_changed_is_not_mixed_with_what_it_was(tmp_path):
     out = write_public_dataset(tmp_path / "out", n_bytes=10)
     with range_server(out) as server:
@@ -247,6 +256,7 @@ def test_a_file_that_changed_is_not_mixed_with_what_it_was(tmp_path):
         assert open_dataset(server.address).scene("s-1-1").files() == dict(files_of("s-1-1", 10))
 
 
+@pytest.mark.heavy
 def test_a_server_without_ranges_still_gives_small_files(server):
     server.ranges = False
     opened = open_dataset(server.address)
@@ -255,6 +265,7 @@ def test_a_server_without_ranges_still_gives_small_files(server):
         opened.scene("s-1-1")
 
 
+@pytest.mark.heavy
 def test_a_bucket_that_may_not_be_listed_lacks_what_it_refuses(tmp_path):
     """As public buckets on S3 answer: 403 for every name that is not there."""
     out = write_public_dataset(tmp_path / "out", shards=4, scenes=1, n_bytes=10)
@@ -424,6 +435,7 @@ def test_an_address_that_is_none_is_said_without_its_secrets(address):
     assert str(caught.value).isprintable()
 
 
+@pytest.mark.heavy
 def test_nothing_there_and_nobody_there_are_said(server, run):
     for place, message in ((f"{server.address}/nowhere", "no such folder"), ("http://127.0.0.1:9/x", "no answer (")):
         code, _, errors = run("query", place)

@@ -12,6 +12,7 @@ def test_without_a_command_a_dataset_is_passed_on(run, tmp_path, words):
     assert "there is no such folder" in error
 
 
+@pytest.mark.heavy
 def test_both_formats_are_written_and_counted(run, out, tmp_path):
     small = ("--width", "32", "--height", "24", "--fps", "4", "--camera", "robot")
     code, said, _ = run("export", "lerobot", out, tmp_path / "made", *small)

@@ -122,6 +122,7 @@ def test_a_film_never_mirrors_left_and_right(figure, yaw):
     assert np.diff(project(seen, eye.camera)[:, 0])[0] > 0
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("yaw", [0.0, 1.6, -2.5])
 def test_the_arm_does_not_stand_before_the_object_in_the_end(out, figure, yaw):
     """Beside the robot's line and straight below its hand, the object shows in the last picture."""

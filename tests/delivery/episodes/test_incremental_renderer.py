@@ -35,6 +35,7 @@ def whole(pose: Pose) -> np.ndarray:
     return render(parts, CAMERA, EYE, paints=paints, sky_rays=6, samples=2).color
 
 
+@pytest.mark.heavy
 def test_a_frame_looks_like_the_whole_scene_rendered(pictures):
     frame, truth = pictures.render([TURNED]).astype(int), whole(TURNED).astype(int)
     off = np.abs(frame - truth).max(axis=2)

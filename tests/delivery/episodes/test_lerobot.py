@@ -17,6 +17,8 @@ from tableverse_factory.robotics.execution.arrays import encode_recording
 from tableverse_factory.robotics.robots.registry import load_arm
 from tests.helpers.recorded_dataset import STEP_S, recording, trajectory_row, two_scenes, write_recorded_dataset
 
+pytestmark = pytest.mark.heavy
+
 SMALL = {"width": 64, "height": 48}
 CAMERAS = ["observation.images.robot", "observation.images.scene"]
 LENGTHS = [41, 31, 31]

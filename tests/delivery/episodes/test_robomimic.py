@@ -17,6 +17,8 @@ from tableverse_factory.delivery.episodes.selection import Episode
 from tableverse_factory.robotics.robots.registry import load_arm
 from tests.helpers.recorded_dataset import STEP_S, X_ID, Y_ID, recording
 
+pytestmark = pytest.mark.heavy
+
 LENGTHS = {"demo_0": 41, "demo_1": 31, "demo_2": 31}
 OBSERVATIONS = {
     "object": 14,

@@ -21,6 +21,8 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 
+pytestmark = pytest.mark.heavy
+
 SIMULATED_S = 5.0
 TOLERANCE = 0.01
 MOST_LOST = 0.2

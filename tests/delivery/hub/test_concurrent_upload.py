@@ -28,6 +28,7 @@ def publish(run, dataset, *options: str) -> str:
     return str(said)
 
 
+@pytest.mark.heavy
 def test_a_hub_without_xet_is_written_to_without(hub, dataset, run):
     """With hf_xet installed, which comes with huggingface_hub, and nothing set: as users have it."""
     publish(run, dataset)
@@ -35,6 +36,7 @@ def test_a_hub_without_xet_is_written_to_without(hub, dataset, run):
     assert huggingface_hub.constants.HF_HUB_DISABLE_XET is False
 
 
+@pytest.mark.heavy
 def test_a_xet_storage_that_does_not_answer_ends_in_one_line(hub, dataset, tmp_path):
     """A real process: what waits in it is native, and must not keep it from ending."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -59,6 +61,7 @@ def test_a_xet_storage_that_does_not_answer_ends_in_one_line(hub, dataset, tmp_p
     assert "0 %  Card, plan and record" in process.stdout, "what is done is said before it"
 
 
+@pytest.mark.heavy
 def test_a_card_that_was_edited_on_the_hub_is_kept(hub, dataset, run):
     publish(run, dataset)
     there = hub.repositories[NAME]
@@ -70,6 +73,7 @@ def test_a_card_that_was_edited_on_the_hub_is_kept(hub, dataset, run):
     assert there.files["README.md"] == ours
 
 
+@pytest.mark.heavy
 def test_a_card_that_was_there_first_is_kept(hub, dataset, run):
     begin(hub, {"README.md": EDITED})
     with pytest.raises(BuildError, match="private on the Hub"):
@@ -80,6 +84,7 @@ def test_a_card_that_was_there_first_is_kept(hub, dataset, run):
     assert on_the_hub(hub).keys() == tree_of(dataset, left_behind(dataset)).keys()
 
 
+@pytest.mark.heavy
 def test_our_own_card_grows_with_the_dataset(hub, dataset, run):
     scenes = dataset / "scenes" / "shard-00001.parquet"
     data = scenes.read_bytes()
@@ -91,6 +96,7 @@ def test_our_own_card_grows_with_the_dataset(hub, dataset, run):
     assert hub.repositories[NAME].files["README.md"] != before
 
 
+@pytest.mark.heavy
 def test_two_that_publish_under_one_empty_name_do_not_mix(hub, dataset, run):
     """The other one's first commit falls between our look and our first commit."""
     theirs = {"run.json": b'{"seed": 7}', "plan.parquet": b"theirs"}
@@ -102,6 +108,7 @@ def test_two_that_publish_under_one_empty_name_do_not_mix(hub, dataset, run):
     assert len(on_the_hub(hub)) == 2
 
 
+@pytest.mark.heavy
 def test_a_dataset_that_takes_our_place_meanwhile_is_not_replaced(hub, dataset, run):
     """--replace speaks of what was there when it was typed."""
     meanwhile(hub, lambda _: {"run.json": b'{"seed": 7}'}, after=1)
@@ -111,6 +118,7 @@ def test_a_dataset_that_takes_our_place_meanwhile_is_not_replaced(hub, dataset, 
     assert on_the_hub(hub) == {"run.json": b'{"seed": 7}'}
 
 
+@pytest.mark.heavy
 def test_a_card_that_is_edited_meanwhile_is_kept_and_the_rest_arrives(hub, dataset, run):
     meanwhile(hub, lambda files: {**files, "README.md": EDITED}, after=1)
     assert "inspecting it again" in publish(run, dataset)
@@ -118,6 +126,7 @@ def test_a_card_that_is_edited_meanwhile_is_kept_and_the_rest_arrives(hub, datas
     assert on_the_hub(hub) == tree_of(dataset, left_behind(dataset))
 
 
+@pytest.mark.heavy
 def test_files_that_the_dataset_no_longer_has_are_taken_away(hub, dataset, run):
     publish(run, dataset)
     there = hub.repositories[NAME]
@@ -129,6 +138,7 @@ def test_files_that_the_dataset_no_longer_has_are_taken_away(hub, dataset, run):
     assert on_the_hub(hub) == {**tree_of(dataset, left_behind(dataset)), **others}
 
 
+@pytest.mark.heavy
 def test_an_unfinished_copy_takes_no_finished_shard_away(hub, dataset, run):
     publish(run, dataset)
     whole = on_the_hub(hub)
@@ -137,6 +147,7 @@ def test_an_unfinished_copy_takes_no_finished_shard_away(hub, dataset, run):
     assert on_the_hub(hub) == whole | {name: data for name, data in tree_of(dataset).items() if name in whole}
 
 
+@pytest.mark.heavy
 def test_our_own_faults_are_not_laid_at_the_hubs_door(hub, dataset):
     def broken(_: str) -> None:
         raise KeyError("a bug of ours")
@@ -145,6 +156,7 @@ def test_our_own_faults_are_not_laid_at_the_hubs_door(hub, dataset):
         upload(collect_upload_set(dataset), NAME, UploadOptions(), broken)
 
 
+@pytest.mark.heavy
 def test_a_file_that_goes_while_it_is_sent_is_named(hub, dataset):
     contents = collect_upload_set(dataset)
     (dataset / "mjcf" / "shard-00001.tar").unlink()

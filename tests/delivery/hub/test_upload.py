@@ -47,6 +47,7 @@ def test_without_upload_nobody_is_asked(hub, dataset, run):
     assert tree_of(dataset) == before
 
 
+@pytest.mark.heavy
 def test_what_was_uploaded_is_the_dataset_and_nothing_else(hub, dataset, run):
     before = tree_of(dataset)
     code, said, errors = run("publish", dataset, "--repo", NAME, "--upload")
@@ -59,6 +60,7 @@ def test_what_was_uploaded_is_the_dataset_and_nothing_else(hub, dataset, run):
     assert not hub.tokens_seen
 
 
+@pytest.mark.heavy
 def test_the_card_is_what_the_hub_reads_tables_by(hub, dataset, run):
     run("publish", dataset, "--repo", NAME, "--upload")
     files = hub.repositories[NAME].files
@@ -72,12 +74,14 @@ def test_the_card_is_what_the_hub_reads_tables_by(hub, dataset, run):
         assert len([name for name in files if Path(name).match(str(pattern))]) == 3
 
 
+@pytest.mark.heavy
 def test_a_card_with_a_head_of_its_own_is_kept(hub, dataset, run):
     (dataset / "README.md").write_text("---\nlicense: mit\nconfigs: []\n---\n# My words\n")
     run("publish", dataset, "--repo", NAME, "--upload")
     assert hub.repositories[NAME].files["README.md"] == (dataset / "README.md").read_bytes()
 
 
+@pytest.mark.heavy
 def test_again_sends_nothing(hub, dataset, run):
     run("publish", dataset, "--repo", NAME, "--upload")
     puts, commits = dict(hub.put), len(hub.repositories[NAME].commits)
@@ -85,6 +89,7 @@ def test_again_sends_nothing(hub, dataset, run):
     assert (dict(hub.put), len(hub.repositories[NAME].commits)) == (puts, commits)
 
 
+@pytest.mark.heavy
 def test_killed_in_the_middle_it_goes_on_with_what_is_missing(hub, tmp_path):
     """A real process, and a real kill -9 while a file is under way in the second commit of shards."""
     out = write_public_dataset(tmp_path / "out", shards=20, scenes=1)
@@ -128,6 +133,7 @@ def test_killed_in_the_middle_it_goes_on_with_what_is_missing(hub, tmp_path):
     assert TOKEN not in process.stdout + process.stderr + said.decode() + errors.decode()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -155,6 +161,7 @@ def test_share_alike_goes_and_is_counted(hub, dataset, run):
     assert "not permissive: 6 scenes (6 share-alike)" in said
 
 
+@pytest.mark.heavy
 def test_a_build_that_names_its_machine_is_exported_first(hub, dataset, run, tmp_path):
     path = dataset / "scenes" / "shard-00000.parquet"
     table = pq.read_table(path, partitioning=None)
@@ -170,6 +177,7 @@ def test_a_build_that_names_its_machine_is_exported_first(hub, dataset, run, tmp
     assert run("publish", f"{dataset}-public", "--repo", NAME, "--upload")[0] == 0
 
 
+@pytest.mark.heavy
 def test_an_unfinished_dataset_goes_where_that_is_asked_for_and_is_finished_later(hub, dataset, run):
     scenes = dataset / "scenes" / "shard-00001.parquet"
     data = scenes.read_bytes()
@@ -182,6 +190,7 @@ def test_an_unfinished_dataset_goes_where_that_is_asked_for_and_is_finished_late
     assert all(count == 1 for count in hub.put.values())
 
 
+@pytest.mark.heavy
 def test_another_dataset_is_replaced_only_where_that_is_asked_for(hub, dataset, run, tmp_path):
     run("publish", dataset, "--repo", NAME, "--upload")
     other = write_public_dataset(tmp_path / "other", shards=1)
@@ -195,6 +204,7 @@ def test_another_dataset_is_replaced_only_where_that_is_asked_for(hub, dataset, 
     assert on_the_hub(hub) == tree_of(other)
 
 
+@pytest.mark.heavy
 def test_what_somebody_else_keeps_there_is_left_alone(hub, dataset, run):
     run("publish", dataset, "--repo", NAME, "--upload")
     hub.repositories[NAME].commit("mine", {"thesis.tex": b"x"})
@@ -203,6 +213,7 @@ def test_what_somebody_else_keeps_there_is_left_alone(hub, dataset, run):
     assert "holds something else (thesis.tex)" in errors
 
 
+@pytest.mark.heavy
 def test_what_is_public_stays_not_unnoticed(hub, dataset, run):
     assert run("publish", dataset, "--repo", NAME, "--upload", "--public")[0] == 0
     assert hub.repositories[NAME].private is False
@@ -224,6 +235,7 @@ def failing(status: int, times: int, where: str, **headers: str):
     return fault
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "fault",
     [
@@ -241,6 +253,7 @@ def test_a_hub_that_is_busy_is_asked_again(hub, dataset, run, fault):
     assert all(count == 1 for count in hub.put.values())
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
@@ -264,6 +277,7 @@ def test_what_the_hub_refuses_is_one_line_without_secrets(hub, dataset, run, fau
         assert secret not in out + errors
 
 
+@pytest.mark.heavy
 def test_without_a_token_it_says_where_one_comes_from(hub, dataset, run, monkeypatch):
     monkeypatch.delenv("HF_TOKEN")
     code, _, errors = run("publish", dataset, "--repo", NAME, "--upload")
@@ -271,6 +285,7 @@ def test_without_a_token_it_says_where_one_comes_from(hub, dataset, run, monkeyp
     assert "set HF_TOKEN, or log in with `hf auth login`" in errors
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["tables", "a/b/c", "../x", "me/..", "me/x y", "me/x.git", "me/\x1b[2J", "-me/x", ""])
 def test_a_name_that_is_none_is_refused(hub, dataset, run, name):
     code, _, errors = run("publish", dataset, f"--repo={name}", "--upload")
@@ -288,6 +303,7 @@ def test_without_the_library_it_says_what_to_install(dataset, run, monkeypatch):
         assert "pip install 'tableverse-factory[hub]'" in errors
 
 
+@pytest.mark.heavy
 def test_large_datasets_become_many_commits_of_whole_shards(dataset, monkeypatch):
     monkeypatch.setattr(upload, "MAX_BYTES_A_COMMIT", 1)
     commits = dict(upload._plan_commits(collect_upload_set(dataset)))
@@ -314,6 +330,7 @@ def test_licences_are_named_as_the_hub_names_them(licences, head):
     assert found["size_categories"] == ["1K<n<10K"]
 
 
+@pytest.mark.heavy
 def test_a_scene_opens_from_the_hub_by_its_own_bytes(hub, dataset, run, tmp_path):
     run("publish", dataset, "--repo", NAME, "--upload")
     hub.sent.clear()
@@ -326,6 +343,7 @@ def test_a_scene_opens_from_the_hub_by_its_own_bytes(hub, dataset, run, tmp_path
     assert "s-1-0" in run("query", f"hf://datasets/{NAME}@main", "--where", "shard = 1")[1]
 
 
+@pytest.mark.heavy
 def test_what_is_pushed_later_does_not_mix_into_what_was_opened(hub, dataset, run):
     run("publish", dataset, "--repo", NAME, "--upload")
     opened, found = pickle.loads(pickle.dumps(open_dataset(f"hf://datasets/{NAME}"))), hub.repositories[NAME]

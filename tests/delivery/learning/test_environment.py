@@ -18,6 +18,8 @@ from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
 from tableverse_factory.delivery.learning.variation import displace_objects
 
+pytestmark = pytest.mark.heavy
+
 ID = "TableVerse/PickPlace-v0"
 
 

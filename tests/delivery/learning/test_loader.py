@@ -22,6 +22,7 @@ def loaded(dataset, workers, context=None):
     return list(DataLoader(dataset, batch_size=None, num_workers=workers, **how))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("workers", "context"), [(0, None), (1, "fork"), (3, "fork"), (2, "spawn")])
 def test_every_scene_comes_once_and_in_the_same_order_again(out, workers, context):
     dataset = SceneDataset(SceneStream(out, ("photograph", "poses", "motions"), columns=("licence",), seed=1))
@@ -44,6 +45,7 @@ def test_every_scene_comes_once_and_in_the_same_order_again(out, workers, contex
         assert following != ids
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("even", [False, True])
 def test_ranks_share_nothing_and_miss_nothing(out, even):
     stream = SceneStream(out, ("labels",), seed=3)
@@ -114,6 +116,7 @@ def test_a_dataset_that_was_left_early_begins_its_next_epoch_with_all(out):
     assert len(Worker(dataset, state).take(7)) == 7
 
 
+@pytest.mark.heavy
 def test_what_workers_have_given_is_not_told_as_nothing(out):
     dataset = SceneDataset(SceneStream(out, ("labels",), seed=1))
     running = iter(DataLoader(dataset, batch_size=None, num_workers=2, multiprocessing_context="fork"))
@@ -122,6 +125,7 @@ def test_what_workers_have_given_is_not_told_as_nothing(out):
         dataset.state_dict()
 
 
+@pytest.mark.heavy
 def test_workers_that_stay_are_refused_in_their_second_epoch(out):
     dataset = SceneDataset(SceneStream(out, ("labels",), seed=1))
     list(dataset)
@@ -134,6 +138,7 @@ def test_workers_that_stay_are_refused_in_their_second_epoch(out):
         list(loader)
 
 
+@pytest.mark.heavy
 def test_a_rank_is_that_of_the_process_when_it_iterates(out, monkeypatch):
     stream = SceneStream(out, ("labels",), seed=3)
     for rank, ranks in ((None, 4), (1, None)):

@@ -22,6 +22,7 @@ def cup(wall: float = 0.004) -> TriangleMesh:
     return from_trimesh(trimesh.creation.revolve(np.array(outline), sections=48))
 
 
+@pytest.mark.heavy
 def test_a_cup_is_hollow_and_a_ring_or_an_upturned_cup_is_not():
     upturned = TriangleMesh(cup().vertices * [1.0, 1.0, -1.0] + [0.0, 0.0, 0.08], cup().faces[:, ::-1])
     ring = from_trimesh(trimesh.creation.annulus(0.036, 0.04, 0.03))
@@ -51,6 +52,7 @@ def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
     assert "holds no meshes: give a folder with *.obj in it\n" in err
 
 
+@pytest.mark.heavy
 def test_figures_come_as_strict_json_too(tmp_path, run):
     (tmp_path / "NaN.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))
     code, out, _ = run("bench", "completion", tmp_path, "--json")

@@ -27,6 +27,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.heavy
 def test_a_box_is_one_piece_of_its_own_volume_and_a_bowl_stays_open(folder: Path) -> None:
     bowl, box = bench_decompose(find_meshes(folder, None), ["cut"])
     assert (bowl.mesh, box.mesh) == ("bowl.obj", "box.obj")
@@ -62,6 +63,7 @@ def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Pat
         bench_decompose(find_meshes(tmp_path / "empty", None), ["cut"])
 
 
+@pytest.mark.heavy
 def test_coacd_and_open3d_load_in_one_process():
     code = (
         "from tableverse_factory.geometry.convex.coacd import load_coacd; load_coacd();"

@@ -15,6 +15,8 @@ from tableverse_factory.evaluation.bench.process_meter import measure_command
 from tableverse_factory.evaluation.bench.query import OBJECTS_PER_SCENE, bench_query, write_query_dataset
 from tableverse_factory.pipeline import STAGES
 
+pytestmark = pytest.mark.heavy
+
 
 def _measured(
     what: str, workers: int, scenes: int, once_s: float, each_ms: float, steady_rate: float = 1.0

@@ -73,6 +73,7 @@ def scene(folder: Path, boxes: Boxes) -> ReleasedScene:
     return make_scene(case.item, case.pieces, [placed.pose for placed in case.item.objects])
 
 
+@pytest.mark.heavy
 def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     config = Config()
     methods = ("Direct", "MuJoCo alone", "LCCR", "LCCR + sim")
@@ -118,6 +119,7 @@ def test_steps_differ_from_lccr_in_the_search_alone(folder: Path, tmp_path: Path
         np.testing.assert_array_equal(a.body.offset, b.body.offset)
 
 
+@pytest.mark.heavy
 def test_what_stays_and_what_bursts(folder: Path) -> None:
     step = 0.002
     standing = scene(folder, {"a": (0, 0, 0.05), "b": (0.3, 0, 0.05)})
@@ -204,6 +206,7 @@ def bowl_of_balls(folder: Path) -> Path:
     return folder / "bowl.json"
 
 
+@pytest.mark.heavy
 def test_every_method_starts_from_filled_containers_and_copies_count_only_where_they_can(bowl_of_balls: Path) -> None:
     config, cache = Config(), bowl_of_balls.parent.parent / "cache"
     case = read_case(bowl_of_balls, None, config, cache)
@@ -219,6 +222,7 @@ def test_every_method_starts_from_filled_containers_and_copies_count_only_where_
         assert row["colliding by > 0.1 mm, pieces [%]"] == 0.0
 
 
+@pytest.mark.heavy
 def test_counted_things_that_do_not_fit_are_counted_as_left_out(bowl_of_balls: Path) -> None:
     config = Config(rectify=RectifyConfig(max_contents=2))
     cache = bowl_of_balls.parent.parent / "cache"

@@ -121,6 +121,7 @@ def test_a_truth_that_does_not_say_what_lies_in_what_is_refused(tmp_path):
         read_true_pairs(tmp_path)
 
 
+@pytest.mark.heavy
 def test_the_command_says_what_lies_in_what_in_json(tmp_path):
     bowl, block = Bowl(0.0, 0.0, 0.09), Box(0.0, 0.01, (0.045, 0.045, 0.06), z=0.012, color=(230, 200, 40))
     write_look(tmp_path / "a", [bowl, block], contained_in={2: 1})

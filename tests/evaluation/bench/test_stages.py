@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from tableverse_factory.cli.main import app
 from tableverse_factory.evaluation.bench.stages import COMMIT, RECORDS
 
+pytestmark = pytest.mark.heavy
+
 STAGES = ["read_layout", "rectify", "settle", "curate", "export", RECORDS, COMMIT]
 CORNERS = [(x, y, z) for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)]
 FACES = ["1 2 4", "1 4 3", "5 7 8", "5 8 6", "1 5 6", "1 6 2", "3 4 8", "3 8 7", "1 3 7", "1 7 5", "2 6 8", "2 8 4"]

@@ -14,6 +14,8 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
+pytestmark = pytest.mark.heavy
+
 CONFIG = Config.model_validate({"trajectories": {"tries": 2, "placements": 6, "candidates": 400}})
 
 

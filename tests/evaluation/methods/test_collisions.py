@@ -94,6 +94,7 @@ def test_no_dressing_hides_a_collision(solid, second, extra, tmp_path):
     assert json.loads(verified.stdout)["scenes"][0]["mesh_penetration_m"] == pytest.approx(0.01, abs=1e-5)
 
 
+@pytest.mark.heavy
 def test_a_collider_around_what_is_drawn_is_not_its_shape(tmp_path):
     """A cup closed by the box that it collides with: what stands in it does not lie inside its mesh."""
     cup = trimesh.creation.revolve([[0, 0], [0.05, 0], [0.05, 0.08], [0.049, 0.08], [0.049, 0.001], [0, 0.001]])
@@ -175,6 +176,7 @@ def test_a_file_that_leads_round_in_circles_ends(tmp_path):
     assert scene.depth_m in (0.0, pytest.approx(0.002, abs=1e-5)), "what is read of it is right"
 
 
+@pytest.mark.heavy
 def test_a_small_file_that_shows_one_mesh_thousands_of_times(tmp_path):
     """Refused before the copies are made: 20 kB would become 6 million triangles."""
     scene = trimesh.Scene()

@@ -96,6 +96,7 @@ def judge(server) -> list[str]:
     return [part for setting in settings for part in ("--set", f"curate.{setting}")]
 
 
+@pytest.mark.heavy
 def test_marks_reach_the_method_that_stood_in_the_column(folder, server, monkeypatch, tmp_path):
     monkeypatch.setenv("TABLEVERSE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("JUDGE_KEY", "sk-never-shown-0123456789")
@@ -205,6 +206,7 @@ def test_few_scenes_have_no_interval():
     assert format_interval(found) == "6.50"
 
 
+@pytest.mark.heavy
 def test_many_scenes_take_little_memory():
     ballots = tuple(Vote(str(scene), 0, ("a",), {"a": _marks(1, 1 + scene % 10)}) for scene in range(1500))
     tracemalloc.start()
@@ -254,6 +256,7 @@ def test_fences_and_prose_around_an_answer_do_no_harm():
     assert parse_vote(text, 3).columns["B"].rank == 1
 
 
+@pytest.mark.heavy
 def test_a_bad_answer_is_asked_for_again_and_then_refused(folder, server, monkeypatch, tmp_path):
     monkeypatch.setenv("TABLEVERSE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("JUDGE_KEY", "key")
@@ -269,6 +272,7 @@ def test_a_bad_answer_is_asked_for_again_and_then_refused(folder, server, monkey
     assert json.loads((folder / "score" / "gpt-score.json").read_text())["methods"] == {}
 
 
+@pytest.mark.heavy
 def test_gemini_is_asked_in_its_own_words(folder, server, monkeypatch, tmp_path):
     monkeypatch.setenv("TABLEVERSE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("JUDGE_KEY", "key")
@@ -279,6 +283,7 @@ def test_gemini_is_asked_in_its_own_words(folder, server, monkeypatch, tmp_path)
     assert server.paths[0].endswith("/models/eyes:generateContent")
 
 
+@pytest.mark.heavy
 def test_what_cannot_be_shown_is_refused_by_name(folder, server, monkeypatch, tmp_path):
     monkeypatch.setenv("TABLEVERSE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("JUDGE_KEY", "key")

@@ -22,6 +22,8 @@ from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
 from tableverse_factory.geometry.relations.preserved import PreservedRelations
 from tableverse_factory.physics.render.render import look_at
 
+pytestmark = pytest.mark.heavy
+
 
 def turned(degrees: float, position: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Pose:
     return Pose(np.array(position), quaternion_about_z(np.deg2rad(degrees)))

@@ -32,6 +32,8 @@ from tableverse_factory.stages.export.export import export
 from tests.helpers.planted import write_glbs
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
+pytestmark = pytest.mark.heavy
+
 SIDE, PLACED_DEPTH = 0.06, 0.004
 
 

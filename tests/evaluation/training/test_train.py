@@ -51,6 +51,7 @@ class StoppedError(Exception):
     """As a kill would."""
 
 
+@pytest.mark.heavy
 def test_the_same_scene_gives_the_same_views_and_every_view_shows_things(
     scene: list[TrainingView], tmp_path: Path
 ) -> None:
@@ -83,12 +84,14 @@ def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple
     return train_network(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
 
 
+@pytest.mark.heavy
 def test_it_learns(learnt: tuple[object, list[TrainProgress]]) -> None:
     first, last = learnt[1][:6], learnt[1][-6:]
     assert sum(p.objects for p in last) < 0.65 * sum(p.objects for p in first)
     assert sum(p.offset_m for p in last) < 0.85 * sum(p.offset_m for p in first)
 
 
+@pytest.mark.heavy
 def test_what_seconds_of_training_find_are_things(
     learnt: tuple[object, list[TrainProgress]], scene: list[TrainingView], tmp_path: Path
 ) -> None:
@@ -107,6 +110,7 @@ def test_what_seconds_of_training_find_are_things(
     assert (said & true).sum() > 0.5 * true.sum()
 
 
+@pytest.mark.heavy
 def test_stopped_and_resumed_gives_the_weights_of_one_go(views: list[Path], tmp_path: Path) -> None:
     def stop(progress: TrainProgress) -> None:
         if progress.step == 3:
@@ -134,6 +138,7 @@ def test_processes_beside_it_change_no_weight(views: list[Path], tmp_path: Path)
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
 
 
+@pytest.mark.heavy
 def test_a_checkpoint_of_another_training_or_net_or_of_nothing_is_refused(
     views: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -187,6 +192,7 @@ def test_a_process_that_dies_beside_it_ends_in_one_line(views: list[Path], tmp_p
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.heavy
 def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> None:
     network = make_network(1)
     generator = torch.Generator().manual_seed(0)
@@ -211,6 +217,7 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
     assert 2e9 < count_multiply_adds(240, 320) < 2.5e9
 
 
+@pytest.mark.heavy
 def test_the_command_trains_exports_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tableverse_factory.evaluation.training.views.VIEWS_PER_SCENE", 1)
     options = "--scenes 1 --steps 1 --batch 1 --jobs 0 --device cpu"

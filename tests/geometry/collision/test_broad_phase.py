@@ -35,6 +35,7 @@ def placed(name: str, at: tuple[float, ...], turn: int) -> TriangleMesh:
     return from_trimesh(mesh)
 
 
+@pytest.mark.heavy
 @settings(max_examples=200)
 @given(NAMES, NAMES, AT, TURNS, TURNS)
 # Where faces are flat, a cut that folds them within their plane loses part of what is shared, or all of it.
@@ -58,6 +59,7 @@ def test_the_same_is_shared(a, b, apart, turn_a, turn_b):
     assert less.surface_area() == pytest.approx(whole.surface_area(), abs=1e-12)
 
 
+@pytest.mark.heavy
 @given(NAMES, NAMES, AT, TURNS)
 def test_each_lies_on_its_side_of_the_slab(a, b, apart, turn):
     one, other = placed(a, (0.0, 0.0, 0.0), turn), placed(b, apart, turn + 1)
@@ -67,6 +69,7 @@ def test_each_lies_on_its_side_of_the_slab(a, b, apart, turn):
     assert (other.vertices @ slab.normal).max() == pytest.approx(slab.high, abs=1e-12)
 
 
+@pytest.mark.heavy
 @given(st.floats(2e-3, 0.05), TURNS)
 def test_between_what_stands_side_by_side_there_is_a_gap(apart, turn):
     # Whatever way two balls lie; the axes alone would find no gap between most of them.

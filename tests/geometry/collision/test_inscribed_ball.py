@@ -52,6 +52,7 @@ def test_a_film_around_something_thick_hides_nothing_and_is_not_thick(film, deep
     assert min(deep + film, 2 / 3 * wide) * 0.99 <= both <= deep + film
 
 
+@pytest.mark.heavy
 @given(st.integers(0, 2**31), st.floats(0.02, 0.06))
 def test_no_ball_reaches_out_of_what_two_rings_share(turn, apart):
     ring = mesh_to_solid(RING)
@@ -63,6 +64,7 @@ def test_no_ball_reaches_out_of_what_two_rings_share(turn, apart):
         assert found <= 0.03 * 1.01
 
 
+@pytest.mark.heavy
 def test_a_finely_divided_shell_takes_no_time_to_speak_of():
     # Centres that all begin in its middle, from which every face is as near as any other, take half a minute.
     outer, inner = trimesh.creation.icosphere(5, 0.05), trimesh.creation.icosphere(5, 0.045)

@@ -39,6 +39,7 @@ def gap_at(a: MovingSolid, b: MovingSolid, shift: np.ndarray) -> float:
     return min(gaps)
 
 
+@pytest.mark.heavy
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_no_smaller_distance_is_clear(seed: int) -> None:

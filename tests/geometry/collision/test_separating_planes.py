@@ -34,6 +34,7 @@ def stance(solids: Solids, shift: np.ndarray, turn: np.ndarray | None = None) ->
     return PosedPieces(solids, rotation_matrix(quaternion_from_rotation_vector(vector)), shift)
 
 
+@pytest.mark.heavy
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([-1.0, 0.0, 1.0]))
 def test_a_translation_that_satisfies_every_plane_is_free(seed: int, rise: float) -> None:
@@ -85,6 +86,7 @@ def test_a_stance_turns_about_the_origin_and_moves_then() -> None:
     assert there.most == pytest.approx([0.05, 0.25, 0.35])
 
 
+@pytest.mark.heavy
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6))
 def test_room_ends_where_the_clearance_begins(seed: int) -> None:

@@ -51,6 +51,7 @@ def bowl_pieces(tmp_path_factory: pytest.TempPathFactory) -> ConvexPieces:
     return decompose(bowl(), CONFIG, tmp_path_factory.mktemp("cache"))
 
 
+@pytest.mark.heavy
 def test_a_bowl_keeps_its_cavity(bowl_pieces: ConvexPieces) -> None:
     probe = manifold3d.Manifold.sphere(0.055, 48).translate([0, 0, -0.012])
     assert (filled(bowl_pieces) ^ probe).volume() == 0.0
@@ -59,6 +60,7 @@ def test_a_bowl_keeps_its_cavity(bowl_pieces: ConvexPieces) -> None:
     assert len(bowl_pieces.hulls) <= CONFIG.max_pieces
 
 
+@pytest.mark.heavy
 def test_a_cup_keeps_its_cavity_and_its_handle_some_room(tmp_path: Path) -> None:
     pieces = decompose(cup(), CONFIG, tmp_path)
     water = manifold3d.Manifold.cylinder(0.09, 0.031, 0.031, 48).translate([0, 0, 0.012])
@@ -83,6 +85,7 @@ def test_what_is_convex_is_one_piece_without_a_search(shape: trimesh.Trimesh, tm
     assert pieces.uncovered_m < 1e-4
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("make", [bowl, cup, l_shape])
 def test_pieces_are_convex_closed_small_and_cover_the_mesh(make: type, tmp_path: Path) -> None:
     mesh = make()
@@ -102,12 +105,14 @@ def test_pieces_are_convex_closed_small_and_cover_the_mesh(make: type, tmp_path:
     assert pieces.volume_ratio == pytest.approx(filled(pieces).volume() / mesh_to_solid(mesh).volume(), rel=1e-6)
 
 
+@pytest.mark.heavy
 def test_a_warm_cache_gives_the_bytes_of_a_cold_one(tmp_path: Path) -> None:
     cold = encode(decompose(cup(), CONFIG, tmp_path / "a"))
     assert encode(decompose(cup(), CONFIG, tmp_path / "a")) == cold
     assert encode(decompose(cup(), CONFIG, tmp_path / "b")) == cold
 
 
+@pytest.mark.heavy
 def test_a_damaged_or_foreign_cache_file_is_no_answer(tmp_path: Path) -> None:
     expected = encode(decompose(l_shape(), CONFIG, tmp_path))
     [path] = tmp_path.rglob("*.arrow")
@@ -136,6 +141,7 @@ def test_other_parameters_are_another_entry(tmp_path: Path) -> None:
     assert len(decompose(l_shape(), few, tmp_path).hulls) == 1
 
 
+@pytest.mark.heavy
 def test_a_budget_is_kept(tmp_path: Path) -> None:
     pieces = decompose(bowl(), CONFIG.model_copy(update={"max_pieces": 7}), tmp_path)
     assert len(pieces.hulls) <= 7
@@ -186,6 +192,7 @@ def test_coplanar_points_span_no_volume() -> None:
         make_bounded_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), 64, 1e-4)
 
 
+@pytest.mark.heavy
 def test_coacd_is_an_option_and_its_pieces_are_another_cache_entry(tmp_path):
     corner = trimesh.util.concatenate(
         [
@@ -203,6 +210,7 @@ def test_coacd_is_an_option_and_its_pieces_are_another_cache_entry(tmp_path):
     assert len(searched.hulls) == 2
 
 
+@pytest.mark.heavy
 def test_few_vertices_do_not_cost_more_volume_than_is_allowed(tmp_path: Path) -> None:
     """Rods across one another: hulls of 64 vertices around round things add some percent each."""
     rod = manifold3d.Manifold.cylinder(0.2, 0.01, 0.01, 96).translate([0, 0, -0.1])
@@ -211,6 +219,7 @@ def test_few_vertices_do_not_cost_more_volume_than_is_allowed(tmp_path: Path) ->
     assert pieces.volume_ratio <= 1.0 + CONFIG.volume_error or len(pieces.hulls) == CONFIG.max_pieces
 
 
+@pytest.mark.heavy
 def test_hulls_of_thin_patches_are_convex_and_have_no_thorns() -> None:
     """Parts of a shell, where manifold3d's own hull may go wrong."""
     outer, inner = (mesh_to_solid(from_trimesh(trimesh.creation.icosphere(4, radius))) for radius in (0.5, 0.48))

@@ -1,6 +1,7 @@
 """A pixel with its depth is a point, and the point is seen in that pixel."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +19,7 @@ cameras = st.builds(
 )
 
 
+@pytest.mark.heavy
 @given(cameras, st.integers(0, 2**32 - 1))
 def test_pixels_come_back(camera, seed):
     depth = np.random.default_rng(seed).uniform(0.2, 5.0, (24, 32)).astype(np.float32)

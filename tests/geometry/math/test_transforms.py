@@ -34,6 +34,7 @@ def assert_same_motion(a: Pose, b: Pose) -> None:
     np.testing.assert_allclose(matrix_from_pose(a), matrix_from_pose(b), atol=1e-9)
 
 
+@pytest.mark.heavy
 @given(quaternions)
 def test_a_rotation_keeps_lengths_and_handedness(q):
     R = rotation_matrix(q)
@@ -54,12 +55,14 @@ def test_half_turns_come_back(axis):
     np.testing.assert_allclose(quaternion_from_matrix(rotation_matrix(q)), q, atol=1e-12)
 
 
+@pytest.mark.heavy
 @given(quaternions, quaternions)
 def test_products_of_quaternions_are_products_of_matrices(a, b):
     expected = rotation_matrix(a) @ rotation_matrix(b)
     np.testing.assert_allclose(rotation_matrix(multiply_quaternions(a, b)), expected, atol=1e-12)
 
 
+@pytest.mark.heavy
 @given(quaternions)
 def test_a_quaternion_and_its_negative_are_written_alike(q):
     np.testing.assert_array_equal(normalize_quaternion(-q), normalize_quaternion(q))
@@ -72,6 +75,7 @@ def test_a_quaternion_without_direction_is_refused(bad):
         normalize_quaternion(bad)
 
 
+@pytest.mark.heavy
 @given(poses, poses, poses)
 def test_motions_are_a_group(a, b, c):
     assert_same_motion(compose_poses(compose_poses(a, b), c), compose_poses(a, compose_poses(b, c)))
@@ -81,6 +85,7 @@ def test_motions_are_a_group(a, b, c):
     assert_same_motion(compose_poses(invert_pose(a), a), identity_pose())
 
 
+@pytest.mark.heavy
 @given(poses, poses)
 def test_composition_is_the_product_of_matrices(a, b):
     np.testing.assert_allclose(
@@ -88,11 +93,13 @@ def test_composition_is_the_product_of_matrices(a, b):
     )
 
 
+@pytest.mark.heavy
 @given(poses)
 def test_matrix_and_pose_are_one_motion(pose):
     assert_same_motion(pose_from_matrix(matrix_from_pose(pose)), pose)
 
 
+@pytest.mark.heavy
 @given(poses, poses, points)
 def test_moving_points_twice_is_moving_them_by_the_composition(a, b, p):
     np.testing.assert_allclose(
@@ -100,6 +107,7 @@ def test_moving_points_twice_is_moving_them_by_the_composition(a, b, p):
     )
 
 
+@pytest.mark.heavy
 @given(poses, points, st.floats(0.1, 10.0))
 def test_scale_comes_before_the_motion(pose, p, scale):
     by_hand = (rotation_matrix(pose.quaternion_wxyz) @ (scale * p).T).T + pose.position

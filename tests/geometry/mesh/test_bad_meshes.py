@@ -14,6 +14,8 @@ from tableverse_factory.geometry.convex.decompose import decompose
 from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_mesh
 from tests.helpers.bad_meshes import BAD_MESHES, LARGE_MESHES, BadMesh
 
+pytestmark = pytest.mark.heavy
+
 CONFIG = RectifyConfig()
 REFUSED_FOR_THEIR_SIZE = ("three_micrometres", "forty_metres")  # by the stage, which knows that this is a table
 

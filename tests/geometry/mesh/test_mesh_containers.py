@@ -16,6 +16,8 @@ from tableverse_factory.physics.simulate.freefall import simulate_fall
 from tableverse_factory.sources.synthetic.catalogue import CATEGORIES
 from tests.helpers.cavity_probe import holds_probe
 
+pytestmark = pytest.mark.heavy
+
 UPRIGHT = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 VESSELS = ("bowl", "cup", "mug", "pan")
 SCANNED = (

@@ -158,6 +158,7 @@ def test_a_truncated_file_is_an_error_or_a_smaller_mesh(suffix):
         assert int(mesh.faces.max()) < len(mesh.vertices)
 
 
+@pytest.mark.heavy
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from(sorted(FILES)), st.integers(0, 2**32 - 1))
 def test_damaged_files_never_give_numbers_that_cannot_be_computed_with(suffix, seed):

@@ -35,6 +35,7 @@ def outcome(data: bytes) -> tuple[object, ...]:
     return ("read", mesh.vertices, mesh.faces, mesh.vertex_colors)
 
 
+@pytest.mark.heavy
 @pytest.mark.shared
 def test_real_files_are_read_alike(shared_dir: Path) -> None:
     for path in sorted((shared_dir / "meshes").glob("*.obj")):
@@ -92,6 +93,7 @@ def obj_files(draw: st.DrawFn) -> bytes:
     return (end.join(lines) + draw(st.sampled_from([end, ""]))).encode()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("few_bytes", [plain_obj._FEW_BYTES, 0], ids=["numpy", "arrow"])
 @given(data=obj_files())
 def test_any_small_file_is_read_alike_or_left_alone(few_bytes: int, data: bytes) -> None:

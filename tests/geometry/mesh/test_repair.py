@@ -92,6 +92,7 @@ def test_overlapping_shells_count_their_union() -> None:
     assert make_closed_solid(joined(box, moved))[0].volume() == pytest.approx(0.0015, rel=1e-9)
 
 
+@pytest.mark.heavy
 def test_an_open_bowl_of_one_sheet_becomes_a_bowl_and_no_dome() -> None:
     below = (BALL.vertices[BALL.faces][:, :, 2] < 1e-9).all(axis=1)
     solid, repaired = make_closed_solid(TriangleMesh(BALL.vertices, BALL.faces[below]))
@@ -118,6 +119,7 @@ def test_what_has_no_thickness_is_given_some(flat: TriangleMesh) -> None:
     assert solid.volume() > 1e-7 * 0.1**3
 
 
+@pytest.mark.heavy
 def test_the_remeshed_surface_lies_near_the_triangles() -> None:
     rng = np.random.default_rng(0)
     torn = soup(BALL)
@@ -144,6 +146,7 @@ def test_what_is_no_surface_is_refused_with_the_reason(mesh: TriangleMesh, says:
         make_closed_solid(mesh)
 
 
+@pytest.mark.heavy
 def test_triangles_at_random_end_in_a_solid() -> None:
     rng = np.random.default_rng(1)
     mesh = TriangleMesh(rng.normal(size=(60, 3)), rng.integers(0, 60, (80, 3)).astype(np.int32))

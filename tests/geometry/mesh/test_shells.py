@@ -32,6 +32,7 @@ def turned_box(sides: tuple[float, ...], at: tuple[float, ...], turn: int) -> Tr
     return from_trimesh(box.apply_transform(_transform(at, turn)))
 
 
+@pytest.mark.heavy
 @settings(max_examples=50)
 @given(BOXES, st.booleans())
 @example([((0.1, 0.1, 0.1), (0.0, 0.0, 0.0), 0), ((0.05, 0.05, 0.05), (0.06, 0.03, 0.0), 1)], True)

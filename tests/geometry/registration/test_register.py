@@ -87,6 +87,7 @@ def placed(mesh: TriangleMesh, view: PartialView) -> np.ndarray:
     return transform_points(found.pose, mesh.vertices * found.size)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("degrees", "unit"), [(-160.0, 1.0), (-50.0, 40.0), (0.0, 1e-6), pytest.param(85.0, 1e6), (172.0, 1.0)]
 )
@@ -102,6 +103,7 @@ def test_heading_position_and_size_come_back_whatever_the_unit_of_the_mesh(degre
     assert found.uncertainty.position_std_m < 0.005
 
 
+@pytest.mark.heavy
 def test_a_mesh_that_lies_on_its_side_is_turned_over() -> None:
     mesh = boot()
     lying = mesh.vertices @ np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]).T
@@ -109,6 +111,7 @@ def test_a_mesh_that_lies_on_its_side_is_turned_over() -> None:
     np.testing.assert_allclose(np.ptp(placed(mesh, view_of(truth)), axis=0), np.ptp(truth.vertices, axis=0), atol=8e-3)
 
 
+@pytest.mark.heavy
 def test_a_round_mesh_has_no_heading_to_find_and_still_fits() -> None:
     cylinder = trimesh.creation.cylinder(0.04, 0.1, sections=24)
     cylinder.apply_translation((0.02, 0.1, 0.05))
@@ -118,11 +121,13 @@ def test_a_round_mesh_has_no_heading_to_find_and_still_fits() -> None:
     np.testing.assert_allclose(ours.max(axis=0), truth.vertices.max(axis=0), atol=5e-3)
 
 
+@pytest.mark.heavy
 def test_the_same_view_gives_the_same_answer() -> None:
     view = view_of(boot(), every=4)
     np.testing.assert_array_equal(placed(boot(), view), placed(boot(), view))
 
 
+@pytest.mark.heavy
 def test_of_headings_that_look_alike_the_one_nearest_to_the_meshs_own_is_taken_and_said() -> None:
     box = from_trimesh(
         trimesh.creation.box((0.16, 0.09, 0.06), trimesh.transformations.translation_matrix((0, 0, 0.03)))

@@ -58,6 +58,7 @@ def ball(radius, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
     return compute_body_features(mesh_of(trimesh.creation.icosphere(3, radius), x, y, z))
 
 
+@pytest.mark.heavy
 @settings(max_examples=40, deadline=None)
 @given(sizes, places, sizes, places)
 def test_converse_relations(size_a, at_a, size_b, at_b):
@@ -71,6 +72,7 @@ def test_converse_relations(size_a, at_a, size_b, at_b):
         assert not relation_holds(relation, a, b) or relation_nearly_holds(relation, a, b)
 
 
+@pytest.mark.heavy
 @settings(max_examples=30, deadline=None)
 @given(sizes, places, sizes, places)
 def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
@@ -81,6 +83,7 @@ def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
         assert relation_holds(relation, a, b) == relation_holds(relation, mirrored_a, mirrored_b)
 
 
+@pytest.mark.heavy
 @settings(max_examples=30, deadline=None)
 @given(sizes, places, sizes, places)
 def test_the_gap_of_axis_aligned_boxes_is_the_gap_of_their_boxes(size_a, at_a, size_b, at_b):
@@ -89,6 +92,7 @@ def test_the_gap_of_axis_aligned_boxes_is_the_gap_of_their_boxes(size_a, at_a, s
     assert measure_outline_gap(a, b) == pytest.approx(float(np.hypot(*apart)), abs=1e-9)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("relation", "at"),
     [
@@ -149,6 +153,7 @@ def test_what_a_tilted_vessel_stands_on_is_not_inside_it():
     assert relation_holds(Relation.OUTSIDE, under, vessel)
 
 
+@pytest.mark.heavy
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(0.004, 0.1))
 def test_inside_implies_within_the_box_of_the_vessel(x, y, z):
@@ -179,6 +184,7 @@ def test_a_vessel_needs_depth_and_width(shape, is_vessel):
         assert cavity.volume_m3 == pytest.approx(true, rel=0.15)
 
 
+@pytest.mark.heavy
 @settings(max_examples=40, deadline=None)
 @given(
     radius=st.floats(0.02, 0.07),

@@ -110,6 +110,7 @@ def test_the_device_is_what_the_machine_has():
             select_device(ModelsConfig(device="cuda"))
 
 
+@pytest.mark.heavy
 def test_a_model_is_made_once_and_again_after_its_release():
     made = []
     assert load_once(("a",), lambda: made.append(1) or len(made)) == 1

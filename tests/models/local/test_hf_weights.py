@@ -12,6 +12,8 @@ from tableverse_factory.stages.perceive.sam.model import load_sam
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.weights_hub import Model, weights_hub
 
+pytestmark = pytest.mark.heavy
+
 CPU = Device("cpu", "float32")
 KEY = "perceive.segmenter_weights"
 NAME = "someone/tiny-sam"

@@ -18,6 +18,8 @@ from tableverse_factory.models.local.batch_server import REFUSED, serve_batches
 from tableverse_factory.models.local.wire import WireError, decode_error, receive_arrays, send_arrays
 from tests.helpers.paths import ROOT
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture
 def desk(tmp_path):

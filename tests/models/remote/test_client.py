@@ -44,6 +44,7 @@ def client(server, tmp_path):
     return make
 
 
+@pytest.mark.heavy
 def test_a_chat_server_gets_prompt_picture_schema_and_key(client, server):
     server.say(OK)
     png, jpeg = picture(), picture("JPEG")
@@ -123,6 +124,7 @@ def test_a_resumed_build_needs_no_key_for_what_is_paid(client, server, monkeypat
         client().ask("Something else.", [], SCHEMA)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("status", [408, 429, 500, 502, 503, 504, 529])
 def test_what_may_pass_is_asked_again(client, server, status):
     server.say(Scripted({"error": {"message": "busy"}}, status), Scripted(b"<html>", status), OK)
@@ -152,6 +154,7 @@ def test_half_answers_and_errors_in_disguise_are_asked_again(client, server, bro
     assert client().ask("Look.", [], SCHEMA) == {"a": 1}
 
 
+@pytest.mark.heavy
 def test_the_server_says_when_to_come_back(client, server):
     server.say(Scripted(status=429, headers={"Retry-After": "1"}), OK)
     started = time.monotonic()
@@ -256,6 +259,7 @@ def test_a_flood_is_not_read_to_its_end(client, server):
     assert sum(sent) < 50_000_000
 
 
+@pytest.mark.heavy
 def test_an_answer_that_drips_ends_with_the_time_for_it(client, server):
     def drip(handler):
         handler.send_response(200)
@@ -271,6 +275,7 @@ def test_an_answer_that_drips_ends_with_the_time_for_it(client, server):
     assert time.monotonic() - started < 2.0
 
 
+@pytest.mark.heavy
 def test_a_silent_server_and_one_that_is_not_there(client, server, tmp_path):
     server.say(Scripted(write=lambda handler: time.sleep(1.0)))
     with pytest.raises(ModelError, match="no answer in time"):
@@ -351,6 +356,7 @@ BROKEN_OFF = (
 )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("broken", BROKEN_OFF)
 def test_an_answer_without_words_is_asked_again(client, server, broken):
     dialect = "openai" if "choices" in broken.body else "gemini"
@@ -361,6 +367,7 @@ def test_an_answer_without_words_is_asked_again(client, server, broken):
     assert len(server.asked) == 2
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("broken", BROKEN_OFF)
 def test_an_answer_without_words_is_not_kept(client, server, broken):
     dialect = "openai" if "choices" in broken.body else "gemini"
@@ -422,6 +429,7 @@ def test_a_proxy_of_no_use_stops_and_names_the_variables(tmp_path, monkeypatch, 
     assert "hidden" not in str(caught.value)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("dialect", ["openai", "gemini"])
 def test_nothing_in_the_environment_changes_where_and_with_which_key_is_asked(client, server, monkeypatch, dialect):
     for name in ("OPENAI_API_KEY", "OPENAI_ORG_ID", "OPENAI_PROJECT_ID", "GOOGLE_API_KEY", "GEMINI_API_KEY"):

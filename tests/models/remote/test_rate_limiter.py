@@ -28,6 +28,7 @@ def soon(seconds=5.0) -> float:
     return time.monotonic() + seconds
 
 
+@pytest.mark.heavy
 def test_no_more_questions_than_allowed_are_under_way(tmp_path):
     under_way, most = [], []
 
@@ -43,6 +44,7 @@ def test_no_more_questions_than_allowed_are_under_way(tmp_path):
     assert max(most) == 2
 
 
+@pytest.mark.heavy
 def test_another_process_counts_and_one_that_is_killed_does_not(tmp_path):
     holder = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert holder.stdout.readline() == "here\n"
@@ -58,6 +60,7 @@ def test_another_process_counts_and_one_that_is_killed_does_not(tmp_path):
         pass
 
 
+@pytest.mark.heavy
 def test_questions_begin_evenly_within_the_minute(tmp_path):
     begun = []
 

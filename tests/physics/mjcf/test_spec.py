@@ -35,6 +35,7 @@ def body_of(mesh: TriangleMesh, pose: Pose, object_id: str = "obj_000", mass: fl
     return make_scene_body(object_id, mesh, (mesh,), 1.0, mass, pose)
 
 
+@pytest.mark.heavy
 @settings(max_examples=25, deadline=None)
 @given(POSES)
 def test_pose_in_is_pose_out(pose: Pose) -> None:

@@ -60,6 +60,7 @@ class TestLookAt:
 
 
 class TestGeometry:
+    @pytest.mark.heavy
     def test_sphere_depth_is_analytic(self) -> None:
         radius, distance = 0.3, 1.5
         picture = render([sphere(radius, (0.0, 0.0, distance), 6)], CAMERA, Pose(np.zeros(3), np.array([1.0, 0, 0, 0])))

@@ -147,6 +147,7 @@ def test_a_sketch_wears_textures_vertex_colours_and_plain_ones():
     assert [int(picture[ids == k].mean(axis=0).argmax()) for k in range(3)] == [0, 1, 2]
 
 
+@pytest.mark.heavy
 def test_tags_of_a_crowd_do_not_cover_one_another():
     grid = [ball(0.09 * i, 0.09 * j) for i in range(4) for j in range(4)]
     scenery = make_scenery([str(i) for i in range(16)], grid, SLAB)

@@ -68,6 +68,7 @@ def test_a_collision_of_meshes_behind_free_pieces_is_found() -> None:
     assert found.colliding(0.001)
 
 
+@pytest.mark.heavy
 @settings(max_examples=40, deadline=None)
 @given(
     st.tuples(*[st.floats(-0.03, 0.03)] * 3),

@@ -97,6 +97,7 @@ def test_one_inside_another_counts_its_own_thickness() -> None:
     assert within.pieces[0] > 0.008  # the way out is longer
 
 
+@pytest.mark.heavy
 @settings(max_examples=25, deadline=None)
 @given(
     st.tuples(*[st.floats(-0.05, 0.05)] * 3),

@@ -36,6 +36,8 @@ from tests.helpers.picking import (
     station,
 )
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(scope="module")
 def good() -> RolloutResult:

@@ -28,6 +28,8 @@ from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.picking import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scene_files, station
 
+pytestmark = pytest.mark.heavy
+
 NAME = "trajectories/task_000.npz"
 ASKED = "Put the small block next to the large one."
 TASK = {"scene_id": "scene", "task_id": "task_000", "instruction": ASKED, "x_id": BLOCK, "y_id": REFERENCE}

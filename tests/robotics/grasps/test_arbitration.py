@@ -58,6 +58,7 @@ def test_order_does_not_matter_where_scores_differ(rows, random):
     assert one.scores.tolist() == other.scores.tolist()
 
 
+@pytest.mark.heavy
 @given(st.lists(scored, min_size=1, max_size=30))
 def test_a_wider_cone_never_loses_a_grasp_within_a_stage(rows):
     narrow, first = arbitrate(grasps_of(rows), -0.95)

@@ -77,6 +77,7 @@ def test_their_frames_become_ours(put, server, arm):
     assert held.widths[0] == pytest.approx(0.03, abs=1e-6)
 
 
+@pytest.mark.heavy
 def test_grasps_are_moved_to_where_both_fingers_touch_and_empty_ones_are_left_out(put, server, arm):
     sideways = np.array([-np.sin(0.4), np.cos(0.4)]) * 0.01
     server.say(answer(from_above(*sideways), from_above(z=0.2), from_above(x=0.04)))
@@ -136,6 +137,7 @@ NONSENSE = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", NONSENSE)
 def test_nonsense_is_refused_and_not_kept(put, server, name):
     server.say(NONSENSE[name])
@@ -145,6 +147,7 @@ def test_nonsense_is_refused_and_not_kept(put, server, name):
     assert len(put()) == 1
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("status", [429, 500, 503])
 def test_what_may_pass_is_asked_again(put, server, status):
     server.say(Scripted(b"", status=status, headers={"Retry-After": "0"}), answer(from_above()))
@@ -152,12 +155,14 @@ def test_what_may_pass_is_asked_again(put, server, status):
     assert len(server.asked) == 2
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("body", [b'{"grasps": [[[1, 0', b"", b"[]", b"\xff\xfe"])
 def test_broken_json_is_asked_again(put, server, body):
     server.say(Scripted(body, headers={"Retry-After": "0"}), answer(from_above()))
     assert len(put()) == 1
 
 
+@pytest.mark.heavy
 def test_an_answer_that_breaks_off_is_asked_again(put, server):
     def cut(handler):
         handler.send_response(200)
@@ -170,6 +175,7 @@ def test_an_answer_that_breaks_off_is_asked_again(put, server):
     assert len(put()) == 1
 
 
+@pytest.mark.heavy
 def test_a_slow_server_is_given_up(put, server):
     given_up = threading.Event()
     server.say(Scripted(write=lambda handler: given_up.wait(60.0)))
@@ -205,6 +211,7 @@ def test_a_configuration_that_cannot_work_is_refused(options, words):
         TrajectoriesConfig(grasp_model="graspgen", **options)
 
 
+@pytest.mark.heavy
 def test_the_bridge_of_the_docs_is_understood(tmp_path):
     page = (ROOT / "docs" / "trajectories.md").read_text()
     (code,) = [block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Bridge" in block]

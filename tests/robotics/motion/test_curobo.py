@@ -39,6 +39,7 @@ def world(base: Pose | None = None) -> CollisionWorld:
     return CollisionWorld(station(), base)
 
 
+@pytest.mark.heavy
 @settings(max_examples=25)
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-3, 3))
 def test_an_obstacle_seen_from_the_base_is_where_it_is_on_the_table(x, y, yaw):

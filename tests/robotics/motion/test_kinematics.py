@@ -25,6 +25,7 @@ def configuration(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(chain.lower + LIMIT_MARGIN_RAD, chain.upper - LIMIT_MARGIN_RAD)
 
 
+@pytest.mark.heavy
 @given(SEEDS)
 def test_forward_is_what_mujoco_says(seed):
     world, q = alone(), configuration(seed)
@@ -38,6 +39,7 @@ def test_forward_is_what_mujoco_says(seed):
     assert rotation_angle(tcp.quaternion_wxyz, turned) < 1e-6
 
 
+@pytest.mark.heavy
 @given(SEEDS)
 @settings(max_examples=40)
 def test_solutions_have_the_pose_within_limits_and_differ(seed):
@@ -55,6 +57,7 @@ def test_solutions_have_the_pose_within_limits_and_differ(seed):
     np.testing.assert_array_equal(found, solve_ik(chain, wanted, HOME, 4))
 
 
+@pytest.mark.heavy
 def test_poses_of_the_arm_itself_are_nearly_always_found():
     chain = alone().chain
     reachable = [pose_from_matrix(chain.pose_matrix(configuration(seed))) for seed in range(100)]

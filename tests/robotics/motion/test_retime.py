@@ -22,6 +22,7 @@ def corners(seed: int, count: int) -> np.ndarray:
     return HOME + np.cumsum(np.random.default_rng(seed).normal(0, 0.25, (count, 7)), axis=0) * (np.arange(7) != 3)
 
 
+@pytest.mark.heavy
 @given(st.integers(0, 1000), st.integers(2, 6), st.sampled_from([0.5, 0.1, 0.03]))
 @settings(max_examples=30)
 def test_a_blend_keeps_the_ends_and_stays_near_the_corners(seed, count, radius):

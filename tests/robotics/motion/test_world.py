@@ -35,6 +35,7 @@ def near_the_table(count: int) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("carrying", [False, True])
 def test_free_agrees_with_the_distance_of_every_pair(carrying):
     world = clutter()

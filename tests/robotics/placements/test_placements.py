@@ -76,6 +76,7 @@ def scene() -> tuple[SceneObject, SceneObject, list[SceneObject]]:
     return x, y, others
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("relation", ON_TABLE)
 def test_beside_the_reference_all_stand_clear_on_the_table_where_the_relation_holds(relation):
     x, y, others = scene()
@@ -243,6 +244,7 @@ def test_the_first_ones_differ_so_that_a_planner_has_a_choice():
     assert np.ptp(positions, axis=0).min() > 0.1
 
 
+@pytest.mark.heavy
 @settings(max_examples=25, deadline=None)
 @given(
     st.tuples(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.floats(-3.1, 3.1)),
@@ -264,6 +266,7 @@ def test_no_placement_leaves_a_turned_table_or_the_relation(where, size, relatio
             assert table.holds(rest.vertices).all()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "changes",
     [{"epsilon_m": 0.0, "delta_margin_m": 0.0}, {"epsilon_m": 5.0}, {"delta_margin_m": 50.0}, {"placements": 1}],

@@ -19,6 +19,8 @@ from tableverse_factory.physics.render.raycast import Raycaster
 from tableverse_factory.sources.capture import Capture, read_capture
 from tableverse_factory.sources.synthetic.sensor import DepthSensor
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(params=[0, 1])
 def folder(request: pytest.FixtureRequest, synthetic_folders: list[Path]) -> Path:

@@ -102,6 +102,7 @@ class TestEveryCategory:
             assert cavity.rim - cavity.floor > 0.02
 
 
+@pytest.mark.heavy
 def test_containers_and_roles_exist() -> None:
     containers = [name for name in CATEGORIES if specimens(name)[0].cavity is not None]
     assert {"bowl", "mug", "cup", "pan"} <= set(containers)
@@ -109,6 +110,7 @@ def test_containers_and_roles_exist() -> None:
     assert all(specimens(name)[0].top is not None for name, c in CATEGORIES.items() if {*c.roles} & {"base", "dish"})
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", RECIPES)
 def test_recipes_place_things_apart_and_above_the_table(name: str) -> None:
     for seed in range(10):

@@ -19,6 +19,8 @@ from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 from tableverse_factory.sources.synthetic.synthesize import make_synthetic_scene
 from tableverse_factory.stages.observe.observe import read_layout
 
+pytestmark = pytest.mark.heavy
+
 SEED, SCENES = 5, 6
 
 

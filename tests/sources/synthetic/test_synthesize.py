@@ -29,6 +29,7 @@ def run_command(*arguments: str, hash_seed: str) -> subprocess.CompletedProcess[
     )
 
 
+@pytest.mark.heavy
 def test_same_bytes_in_another_process_fewer_scenes_and_after_an_interruption(
     synthetic_folders: list[Path], tmp_path: Path
 ) -> None:

@@ -51,6 +51,7 @@ def test_a_small_one_is_a_large_one_seen_from_afar(family):
     assert large.shape == (512, 512, 3)
 
 
+@pytest.mark.heavy
 def test_a_few_hundred_look_different():
     gaps, _ = nearest_distances([descriptor(make_texture(seed, 128)) for seed in range(384)])
     assert gaps.min() >= MIN_DISTANCE
@@ -64,6 +65,7 @@ def test_all_of_them_look_different():
     assert gaps.min() >= MIN_DISTANCE, f"{name_texture(worst)} and {name_texture(int(partner[worst]))}"
 
 
+@pytest.mark.heavy
 def test_a_hundred_take_less_than_ten_seconds():
     start = time.process_time()
     for seed in range(100):
@@ -77,6 +79,7 @@ def test_the_distance_of_plain_greys_is_their_difference_in_lightness():
     assert distance(lighter, lighter) == 0.0
 
 
+@pytest.mark.heavy
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, TEXTURE_COUNT - 1), st.integers(0, 127), st.integers(0, 127))
 def test_the_same_texture_shifted_or_stored_again_is_nearer_than_any_other(seed, right, down):

@@ -140,6 +140,7 @@ def test_a_licence_is_what_something_states_and_nothing_else(tmp_path):
     assert len(row["licence"]) <= 200
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("files", "reason"),
     [

@@ -124,6 +124,7 @@ ANSWERS = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("what", ANSWERS)
 def test_what_a_server_does_wrong_is_a_row_with_its_reason(pictures, tmp_path, what):
     pictures.answers["/x.jpg"] = ANSWERS[what]
@@ -133,6 +134,7 @@ def test_what_a_server_does_wrong_is_a_row_with_its_reason(pictures, tmp_path, w
     assert "hush" not in row.rejected_detail
 
 
+@pytest.mark.heavy
 def test_a_busy_server_is_asked_again_and_waited_for(pictures, tmp_path):
     sound = body(encoded(photo(1)))
     pictures.answers["/500.jpg"] = in_turn(body(b"", 500), sound)
@@ -196,6 +198,7 @@ def test_a_name_is_resolved_once_and_the_connection_goes_where_it_was_checked(pi
     assert only(tmp_path, "http://mixed.example/x.jpg", allow_private=False).rejected == "private_address"
 
 
+@pytest.mark.heavy
 def test_a_silent_address_and_slow_names_cost_others_nothing(pictures, tmp_path, monkeypatch):
     """The first address of the host is a full queue; many names take longer than a picture may."""
     pictures.answers["/x.jpg"] = body(encoded(photo(1)))
@@ -218,6 +221,7 @@ def test_a_silent_address_and_slow_names_cost_others_nothing(pictures, tmp_path,
     assert [row.rejected for row in rows] == ["too_slow"] * 4 + [""]
 
 
+@pytest.mark.heavy
 def test_the_rest_of_a_dead_host_is_not_asked_and_the_next_run_asks_again(pictures, tmp_path):
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))
@@ -230,6 +234,7 @@ def test_the_rest_of_a_dead_host_is_not_asked_and_the_next_run_asks_again(pictur
     assert rows[0].rejected == ""
 
 
+@pytest.mark.heavy
 def test_redirects_to_one_host_count_as_requests_to_it(pictures, tmp_path, monkeypatch):
     def write(request, before):
         time.sleep(0.05)
@@ -282,6 +287,7 @@ def test_hostile_rows_are_rows_with_their_reason(tmp_path, suffix):
         assert row.model_dump_json().isprintable()
 
 
+@pytest.mark.heavy
 def test_a_small_file_of_many_long_cells_is_refused_before_they_are_made(tmp_path):
     long = pa.DictionaryArray.from_arrays(pa.array(np.zeros(200_000, np.int32)), ["http://127.0.0.1/" + "a" * 4000])
     pq.write_table(pa.table({"url": long}), tmp_path / "list.parquet")
@@ -331,6 +337,7 @@ def test_strange_addresses_are_rows_with_a_reason(tmp_path, pictures):
     write_manifest(tmp_path / "m.parquet", rows)
 
 
+@pytest.mark.heavy
 def test_the_same_rows_come_out_in_whatever_order_downloads_end(pictures, tmp_path):
     def slow(seconds, data):
         def write(request, before):
@@ -354,6 +361,7 @@ def test_the_same_rows_come_out_in_whatever_order_downloads_end(pictures, tmp_pa
     assert [row["rejected"] for row in found[0]] == ["", "duplicate_of", ""]
 
 
+@pytest.mark.heavy
 def test_a_host_is_asked_for_a_few_at_a_time(pictures, tmp_path):
     def write(request, before):
         time.sleep(0.02)
@@ -409,6 +417,7 @@ def test_captures_are_never_sifted(tmp_path):
     assert [row.rejected for row in rows] == ["", "too_small"]
 
 
+@pytest.mark.heavy
 def test_a_long_list_costs_little(tmp_path):
     rows = [(f"http://example.org/{n}.jpg", "somewhere", "CC-BY-4.0") for n in range(10_000)]
     path = write_list(tmp_path / "list.csv", rows)
@@ -417,6 +426,7 @@ def test_a_long_list_costs_little(tmp_path):
     assert time.process_time() - began < 2
 
 
+@pytest.mark.heavy
 def test_killed_and_run_again_fetches_only_the_rest(pictures, tmp_path):
     """Half of the pictures never come in the first run, which is killed while it waits for them."""
     sound = {f"/{number}.jpg": body(encoded(photo(number))) for number in range(8)}

@@ -153,6 +153,7 @@ def test_a_picture_of_one_colour_or_one_pixel_can_be_looked_at():
         assert (seen.contrast, seen.sharpness) == (0.0, 0.0)
 
 
+@pytest.mark.heavy
 @pytest.mark.shared
 def test_real_table_tops_pass_and_their_blurred_copies_do_not(shared_dir):
     for path in sorted((shared_dir / "captures").glob("*/color.png")):

@@ -81,6 +81,7 @@ def test_who_counts_objects_counts_everything() -> None:
     assert "the rightmost object" in phrases[3]
 
 
+@pytest.mark.heavy
 def test_nobody_counts_what_only_may_be_meant() -> None:
     """A thing that is a third blue is counted by some among the blue ones: then no ordinal is of any use."""
     clear = [Thing("cup", vessel(0.04, 0.08, color=BLUE), x) for x in (-0.3, -0.1, 0.1)]

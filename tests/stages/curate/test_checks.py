@@ -72,6 +72,7 @@ def refusals(case, sound, *tasks: dict) -> list[str]:
     return [t.refusal for t in verdict(case, {**sound, "generated_tasks": list(tasks)}).tasks]
 
 
+@pytest.mark.heavy
 def test_the_rules_agree_with_their_own_checks(case, sound):
     assessment = verdict(case, sound)
     assert assessment.tasks
@@ -260,6 +261,7 @@ def corrupted(draw, node):
     return [corrupted(draw, value) for value in node] if isinstance(node, list) else node
 
 
+@pytest.mark.heavy
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_whatever_parts_of_an_answer_are_exchanged_it_is_a_verdict_or_none(case, sound, data):

@@ -22,6 +22,7 @@ def judged(scene: SettledScene, tmp_path, **options) -> Assessment:
     return outcome.value.assessment
 
 
+@pytest.mark.heavy
 def test_same_scene_same_bytes(tmp_path):
     assert judged(kitchen(), tmp_path) == judged(kitchen(), tmp_path)
 
@@ -78,6 +79,7 @@ def test_stand_ins_belong_on_a_table(label, tmp_path):
     assert judged(settled([Thing(label, box(0.08, 0.08, 0.08))]), tmp_path).usable
 
 
+@pytest.mark.heavy
 def test_fewer_than_five_objects_cost_points(tmp_path):
     scores = []
     for count in range(1, 7):
@@ -100,6 +102,7 @@ def test_an_impossible_size_is_a_severe_error_and_a_generic_label_is_not(tmp_pat
     assert assessment.objects[1].label_confidence < 0.7
 
 
+@pytest.mark.heavy
 def test_masses_are_sensible(tmp_path):
     masses = {o.relabel_name: o.mass_kg for o in judged(kitchen(), tmp_path).objects}
     assert 0.05 < masses["mug"] < 0.6
@@ -115,6 +118,7 @@ def test_hinges_come_from_the_category(tmp_path):
     assert [o.has_hinge for o in objects] == [True, True, True, False, False]
 
 
+@pytest.mark.heavy
 def test_names_never_carry_an_index(tmp_path):
     things = [Thing(f"bowl_{i}", vessel(0.06, 0.05), 0.2 * i) for i in range(3)]
     for item in judged(settled(things, (1, 1)), tmp_path).objects:
@@ -146,6 +150,7 @@ def test_a_phrase_is_not_given_where_it_would_be_true_of_two(tmp_path):
     assert "the blue cup" in phrases[3]
 
 
+@pytest.mark.heavy
 def test_containment_makes_a_phrase(tmp_path):
     things = [
         Thing("bowl", vessel(0.08, 0.06)),
@@ -185,6 +190,7 @@ def test_nothing_is_asked_of_what_no_gripper_holds(tmp_path):
     assert {t.x_id for t in tasks} == {"obj_001"}
 
 
+@pytest.mark.heavy
 def test_a_single_object_has_no_task(tmp_path):
     assert judged(settled([Thing("mug", vessel(0.04, 0.09))]), tmp_path).tasks == ()
 

@@ -26,6 +26,8 @@ from tableverse_factory.stages.export.rows import build_scene_row, build_task_ro
 from tests.helpers.curate_scenes import kitchen
 from tests.helpers.model_server import Scripted, chat, gemini
 
+pytestmark = pytest.mark.heavy
+
 BOWL, RED_MUG, BLUE_MUG, PLATE, LEMON, CRACKERS, BLOCK = range(7)
 
 

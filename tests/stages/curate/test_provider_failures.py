@@ -84,6 +84,7 @@ def ask_of(door: str, dialect: str, server: ModelServer, services: Services, cas
     return lambda: judge.judge(case)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("failure", list(FAILURES))
 @pytest.mark.parametrize("dialect", list(SPEAK))
 @pytest.mark.parametrize("door", ["detector", "judge"])

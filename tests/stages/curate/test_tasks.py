@@ -18,6 +18,8 @@ from tableverse_factory.stages.curate.curate import curate
 from tests.helpers.curate_scenes import BLUE, RED, WHITE, Thing, ball, box, cylinder, kitchen, settled, vessel
 from tests.helpers.task_referee import faults
 
+pytestmark = pytest.mark.heavy
+
 _KINDS = (
     lambda s, c: ("mug", vessel(0.035 * s, 0.09 * s, color=c)),
     lambda s, c: ("bowl", vessel(0.075 * s, 0.055 * s, color=c)),

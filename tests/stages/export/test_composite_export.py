@@ -24,6 +24,8 @@ from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.settle import settle
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
+pytestmark = pytest.mark.heavy
+
 COPIES = 4
 
 

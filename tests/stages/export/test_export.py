@@ -56,6 +56,7 @@ def model_of(scene: ExportedScene) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(files["scene.xml"].decode(), assets)
 
 
+@pytest.mark.heavy
 def test_the_executor_can_commit_it(scene: ExportedScene) -> None:
     check_exported(scene, "scene")
     assert encode(decode(encode(scene))) == encode(scene)
@@ -84,6 +85,7 @@ def test_rows_meta_and_xml_agree(scene: ExportedScene) -> None:
     assert read_meta(dict(scene.files)["meta.json"]).certificate == scene.certificate
 
 
+@pytest.mark.heavy
 def test_quality_of_pieces_is_recorded_at_the_size_of_the_exported_object() -> None:
     settled = as_settled(layout([Solid(ball(1.0), (0.0, 0.0, 0.03), scale=0.03)]))
     pieces = replace(
@@ -115,6 +117,7 @@ def test_hostile_labels_survive_in_json_and_stay_out_of_the_xml(scene: ExportedS
     assert scene.task_rows[0]["instruction"] == TASK.instruction
 
 
+@pytest.mark.heavy
 def test_equal_scenes_give_equal_bytes(scene: ExportedScene) -> None:
     assert encode(exported(curated(as_settled(layout(SOLIDS)), tasks=(TASK,)))) == encode(scene)
 
@@ -157,6 +160,7 @@ def test_what_topples_on_its_true_mass_settles_again() -> None:
     assert dict(certificate.displacement_m)["obj_000"] == pytest.approx(0.003, abs=2e-4)
 
 
+@pytest.mark.heavy
 def test_a_scene_whose_object_leaves_the_table_is_dropped() -> None:
     far = as_settled(layout(SOLIDS))
     poses = (*far.poses[:2], Pose(np.array([5.0, 0.0, 0.03]), UPRIGHT))

@@ -285,6 +285,7 @@ def test_a_layout_outside_the_schema_is_refused(tmp_path, changes):
     assert refusal(laid_out(write_layout(tmp_path / "a.json", **changes))) == "bad_layout"
 
 
+@pytest.mark.heavy
 @pytest.mark.shared
 def test_every_real_capture_and_layout_is_read(shared_dir):
     captures = sorted(p for p in (shared_dir / "captures").iterdir() if p.is_dir())

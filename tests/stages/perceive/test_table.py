@@ -16,6 +16,8 @@ from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table, refit_table_to_box
 from tests.helpers.tabletop_views import Box, camera_above, look
 
+pytestmark = pytest.mark.heavy
+
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 
 

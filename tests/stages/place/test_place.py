@@ -25,6 +25,8 @@ from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.place.place import place
 
+pytestmark = pytest.mark.heavy
+
 FRONT = (np.deg2rad(-60.0), np.deg2rad(38.0))
 
 

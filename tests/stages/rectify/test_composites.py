@@ -108,6 +108,7 @@ def check_sound(result: AssembledLayout) -> None:
         check_id(o.object_id)
 
 
+@pytest.mark.heavy
 def test_twelve_marbles_fill_a_mug_each_an_object_of_its_own() -> None:
     marble = ball(0.011)
     result = assembled(
@@ -121,6 +122,7 @@ def test_twelve_marbles_fill_a_mug_each_an_object_of_its_own() -> None:
         assert (o.label, o.label_confidence, o.contained_in) == ("marble", 0.9, "mug")
 
 
+@pytest.mark.heavy
 def test_a_mug_of_marbles_does_not_depend_on_the_order_of_the_file() -> None:
     marble = ball(0.013)
     things = [
@@ -135,6 +137,7 @@ def test_a_mug_of_marbles_does_not_depend_on_the_order_of_the_file() -> None:
         assert encode(pose_of(one, name)) == encode(pose_of(two, name))
 
 
+@pytest.mark.heavy
 def test_a_spoon_that_leans_on_the_rim_as_seen_stays_there() -> None:
     lean = (np.cos(-0.62), 0.0, np.sin(-0.62), 0.0)
     spoon = thing("spoon", SPOON.mesh, (0.022, 0.004, 0.09), "mug", quaternion=lean)
@@ -148,6 +151,7 @@ def test_a_spoon_that_leans_on_the_rim_as_seen_stays_there() -> None:
     assert rotation_angle(pose_of(again, "spoon").quaternion_wxyz, rest.quaternion_wxyz) < 0.01
 
 
+@pytest.mark.heavy
 def test_a_spoon_seen_a_little_through_the_wall_is_pushed_in_not_lifted_out() -> None:
     lean = (np.cos(-0.62), 0.0, np.sin(-0.62), 0.0)
     spoon = thing("spoon", SPOON.mesh, (0.032, 0.004, 0.085), "mug", quaternion=lean)
@@ -166,6 +170,7 @@ def test_the_container_stands_still_wherever_it_stands() -> None:
     assert encode(pose_of(result, "mug")) == encode(pose)
 
 
+@pytest.mark.heavy
 def test_what_is_too_large_is_left_out_with_the_reason_and_takes_its_own_contents_along() -> None:
     huge, marble = from_trimesh(trimesh.creation.box((0.3, 0.3, 0.3))), ball(0.01)
     result = assembled(
@@ -180,6 +185,7 @@ def test_what_is_too_large_is_left_out_with_the_reason_and_takes_its_own_content
     assert "huge" in left["inner"]
 
 
+@pytest.mark.heavy
 def test_copies_that_do_not_fit_are_counted_under_the_first_missing_id() -> None:
     big = ball(0.028)
     result = assembled((MUG_AT_HOME, MUG_PIECES), (thing("ball", big, (0.0, 0.0, 0.05), "mug", 100), convex(big)))
@@ -203,6 +209,7 @@ def test_no_more_things_than_configured_those_that_were_seen_first() -> None:
     assert dict(result.placed.left_out).keys() == {"a_4"}
 
 
+@pytest.mark.heavy
 def test_contents_of_contents_are_filled_after_them() -> None:
     small = bounded = vessels.make_cup(np.random.default_rng(1))
     marble = ball(0.009)
@@ -214,6 +221,7 @@ def test_contents_of_contents_are_filled_after_them() -> None:
     assert names(result) == ["bowl", "cup", "marble", "marble_2"]
 
 
+@pytest.mark.heavy
 def test_contents_follow_a_container_that_itself_falls() -> None:
     # The cup hovers 3 cm over the bowl's floor, the marble in it: both come down together.
     cup_model, marble = vessels.make_cup(np.random.default_rng(1)), ball(0.012)
@@ -246,6 +254,7 @@ def test_ids_stay_unique_and_safe() -> None:
     assert len({name.lower() for name in names(result)}) == 6
 
 
+@pytest.mark.heavy
 def test_copies_have_the_pixels_of_what_they_repeat() -> None:
     marble = ball(0.01)
     evidence = Evidence(b"jpg", b"png", (7, 3, 9), Camera(100.0, 100.0, 1.0, 1.0, 2, 2), identity_pose())
@@ -277,6 +286,7 @@ def test_nothing_floats_on_pieces_that_close_a_vessel() -> None:
     assert "marble" in dict(result.placed.left_out)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("turn", [np.pi / 2, 2.2])
 def test_a_container_upside_down_keeps_nothing(turn: float) -> None:
     flip = multiply_quaternions(quaternion_about_z(turn), np.array([0.0, 1.0, 0.0, 0.0]))
@@ -305,6 +315,7 @@ def marble_at(name: str, x: float, z: float) -> CompositeMember:
     return member(thing(name, marble, (x, 0.0, z), "mug"), convex(marble))
 
 
+@pytest.mark.heavy
 def test_what_still_moves_when_the_time_is_up_is_not_in() -> None:
     short = filling(fall_time_s=0.5)
     assert not short.put(marble_at("marble", 0.0, 0.05), short.holder("mug"))
@@ -312,6 +323,7 @@ def test_what_still_moves_when_the_time_is_up_is_not_in() -> None:
     assert filling().put(marble_at("marble", 0.0, 0.05), short.holder("mug"))
 
 
+@pytest.mark.heavy
 def test_what_never_comes_to_rest_together_is_named() -> None:
     assert MUG.cavity is not None
     # 1.2 m deep: what starts at its top is in the air when the time is up, twice.
@@ -369,6 +381,7 @@ def test_a_mug_into_which_sixty_spoons_should_go_ends_and_says_what_is_left_out(
     assert BUDGET_SPENT in dict(result.placed.left_out).values()
 
 
+@pytest.mark.heavy
 def test_what_leaves_when_all_are_freed_is_named_and_the_rest_still_comes_to_rest() -> None:
     marble, cup = ball(0.011), vessels.make_cup(np.random.default_rng(1))
     mug = filling(fall_time_s=3.0)

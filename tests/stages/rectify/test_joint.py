@@ -55,6 +55,7 @@ def test_nothing_stays_nothing() -> None:
     assert rectify_jointly([], CONFIG).parts == ()
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_nothing_is_below_the_table_and_every_group_stands_on_it(items: list[PlacedObject]) -> None:
@@ -65,6 +66,7 @@ def test_nothing_is_below_the_table_and_every_group_stands_on_it(items: list[Pla
         assert min(lowest[i] for entity in group for i in entity) < 1e-6
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_the_order_around_the_root_stays(items: list[PlacedObject]) -> None:
@@ -106,6 +108,7 @@ def test_a_row_moves_the_least(angle: float) -> None:
     assert np.abs(offsets(rectified(items)) - least[:, None] * along).max() < 2e-5
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_the_same_layout_gives_the_same_result(items: list[PlacedObject]) -> None:

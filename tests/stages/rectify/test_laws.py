@@ -38,12 +38,14 @@ def rectified(method: Method, items: Sequence[PlacedObject]) -> RectificationRes
     return method([part(item) for item in items], CONFIG)
 
 
+@pytest.mark.heavy
 @LAWS
 @given(items=layouts())
 def test_the_result_is_free_by_the_clearance(method: Method, items: list[PlacedObject]) -> None:
     assert smallest_gap(rectified(method, items).parts) >= CONFIG.clearance_m - 2e-6
 
 
+@pytest.mark.heavy
 @LAWS
 @given(items=layouts(), random=st.randoms(use_true_random=False))
 def test_the_order_of_the_file_means_nothing(method: Method, items: list[PlacedObject], random: object) -> None:
@@ -59,6 +61,7 @@ def test_the_order_of_the_file_means_nothing(method: Method, items: list[PlacedO
     assert names == [{shuffled[i].object_id for entity in group for i in entity} for group in again.groups]
 
 
+@pytest.mark.heavy
 @LAWS
 @given(items=layouts(), quarters=st.integers(1, 3))
 def test_a_layout_turned_by_quarters_is_rectified_the_same(
@@ -68,6 +71,7 @@ def test_a_layout_turned_by_quarters_is_rectified_the_same(
     assert np.abs(offsets(again) - offsets(result) @ quarter_turns(quarters).T).max() < 2e-6
 
 
+@pytest.mark.heavy
 @LAWS
 @given(items=layouts())
 def test_what_was_rectified_is_left_alone(method: Method, items: list[PlacedObject]) -> None:
@@ -125,6 +129,7 @@ def test_a_stack_with_its_gap_is_left_alone(method: Method) -> None:
     assert np.abs(offsets(result)).max() < 1e-15
 
 
+@pytest.mark.heavy
 @LAWS
 @given(
     where=st.lists(st.tuples(MILLIMETRES, MILLIMETRES, st.floats(-3.0, 3.0)), min_size=2, max_size=3),
@@ -145,6 +150,7 @@ def test_what_a_mesh_sticks_out_of_its_pieces_is_left_room_for(method: Method) -
     assert abs(np.diff(offsets(result)[:, 0])[0]) == pytest.approx(0.01 + 0.003 + CONFIG.clearance_m, abs=1e-5)
 
 
+@pytest.mark.heavy
 def test_many_objects_in_one_place_end_free(method: Method) -> None:
     items = [placed(f"obj_{k:03d}", box(0.05, 0.05, 0.05 + 0.001 * k), (0, 0, 0), 0.1 * k) for k in range(8)]
     assert smallest_gap(rectified(method, items).parts) >= CONFIG.clearance_m - 2e-6

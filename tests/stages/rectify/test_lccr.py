@@ -29,6 +29,7 @@ def smallest_gap_to(one: RigidPart, others: Sequence[RigidPart]) -> float:
     return min(smallest_gap([one, other]) for other in others)
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_the_azimuth_of_every_group_stays_and_the_root_does_not_move(items: list[PlacedObject]) -> None:
@@ -41,6 +42,7 @@ def test_the_azimuth_of_every_group_stays_and_the_root_does_not_move(items: list
     assert not offsets(result)[root, :2].any()
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_groups_move_outward_and_as_one(items: list[PlacedObject]) -> None:
@@ -54,6 +56,7 @@ def test_groups_move_outward_and_as_one(items: list[PlacedObject]) -> None:
         assert moves[0] @ away >= -1e-12
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_groups_are_taken_by_their_distance_from_the_root(items: list[PlacedObject]) -> None:
@@ -64,6 +67,7 @@ def test_groups_are_taken_by_their_distance_from_the_root(items: list[PlacedObje
     assert all(a <= b + 1e-9 for a, b in pairwise(distances))
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_every_group_stands_on_the_table(items: list[PlacedObject]) -> None:
@@ -74,6 +78,7 @@ def test_every_group_stands_on_the_table(items: list[PlacedObject]) -> None:
     assert lowest.max() < (1e-9 if moved else MAX_HOVER_M + 1e-9)
 
 
+@pytest.mark.heavy
 @LAWS
 @given(layouts())
 def test_no_group_could_have_stopped_earlier(items: list[PlacedObject]) -> None:

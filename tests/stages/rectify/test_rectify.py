@@ -66,6 +66,7 @@ def test_scale_is_applied(tmp_path: Path) -> None:
     assert layout.poses[1].position[0] - layout.poses[0].position[0] == pytest.approx(0.1005, abs=1e-5)
 
 
+@pytest.mark.heavy
 def test_the_same_layout_gives_the_same_bytes_with_a_cold_and_a_warm_cache(tmp_path: Path) -> None:
     item = scene(placed("a", ball(0.05), (0, 0, 0)), placed("b", box(0.1, 0.1, 0.03), (0.03, 0, 0)))
     first = encode(run(item, tmp_path / "one"))
@@ -112,6 +113,7 @@ def test_what_is_left_out_takes_its_pixels_along_and_frees_its_contents(tmp_path
     assert layout.poses[1].position[2] == pytest.approx(0.02, abs=0.002)
 
 
+@pytest.mark.heavy
 def test_many_objects_in_one_place_end_free(tmp_path: Path) -> None:
     items = [placed(f"obj_{k:03d}", box(0.05, 0.05, 0.05 + 0.001 * k), (0, 0, 0), 0.1 * k) for k in range(12)]
     layout = done(run(scene(*items), tmp_path))
@@ -123,6 +125,7 @@ def colliding(score: LayoutScore) -> tuple[int, int]:
     return sum(depth > 1e-4 for depth in score.piece_depths_m), sum(depth > 1e-4 for depth in score.mesh_depths_m)
 
 
+@pytest.mark.heavy
 @pytest.mark.shared
 @pytest.mark.parametrize("method", ["LCCR", "joint"])
 def test_a_real_layout_ends_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path, method: str) -> None:

@@ -31,6 +31,7 @@ def heap(count: int) -> list[PlacedObject]:
     ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("count", "method"), [(10, "joint"), (80, "radial")])
 def test_many_things_in_one_place_end_free_and_it_is_told_how(count: int, method: str) -> None:
     result = rectify_jointly([part(item) for item in heap(count)], CONFIG)
@@ -65,6 +66,7 @@ def test_a_heap_beyond_the_work_allowed_does_not_keep_the_rest_from_its_least_mo
     assert smallest_gap(result.parts) >= CONFIG.clearance_m - 2e-6
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("bound", "most"), [("MAX_WORK", 1.5e7), ("MAX_WAYS_OUT", 130)])
 def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
     bound: str, most: float, monkeypatch: pytest.MonkeyPatch

@@ -18,6 +18,8 @@ from tableverse_factory.core.errors import (
 )
 from tableverse_factory.stages.trajectories.fork_pool import ItemFailure, map_in_fork
 
+pytestmark = pytest.mark.heavy
+
 MEMORY_MB = 4000
 
 

@@ -35,6 +35,8 @@ from tableverse_factory.stages.trajectories.search import (
 from tableverse_factory.stages.trajectories.work_cell import WorkCell
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, cylinder, layout
 
+pytestmark = pytest.mark.heavy
+
 SERVICES = Services(Path("unused"))
 ASLANT = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
 CONFIG = Config()

@@ -30,6 +30,8 @@ from tableverse_factory.stages.trajectories.trajectories import plan_trajectorie
 from tests.helpers.model_server import Scripted
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, cylinder, layout
 
+pytestmark = pytest.mark.heavy
+
 SMALL, FLAT, HUGE = "obj_000", "obj_001", "obj_002"
 SERVICES = Services(Path("unused"))
 

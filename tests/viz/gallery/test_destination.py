@@ -108,6 +108,7 @@ def test_a_mark_that_lists_nothing_licenses_nothing(tmp_path, mark):
         check_replaceable(tmp_path, "here")
 
 
+@pytest.mark.heavy
 def test_how_the_dataset_was_named_does_not_show(out, tmp_path, monkeypatch):
     """Neither as typed nor as it lies on the builder's machine, in the pages or in what is wrong with a scene."""
     source = write_dataset(tmp_path / "out", {"a": scene_members("a", photographed=False), "b": NO_SCENE}, [])

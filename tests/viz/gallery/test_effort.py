@@ -25,6 +25,8 @@ from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.helpers.recorded_dataset import two_scenes
 from tests.viz.gallery.test_gallery import Page, digest, index_of
 
+pytestmark = pytest.mark.heavy
+
 
 def test_few_scenes_are_all_drawn_and_many_by_sample():
     assert choose_options(DRAW_ALL_LIMIT) == GalleryOptions(DRAW_ALL_LIMIT, FILMS_PER_SCENE)

@@ -21,6 +21,8 @@ from tableverse_factory.geometry.math.transforms import invert_pose, transform_p
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tests.helpers.gallery_dataset import CAMERA, EYE, HOSTILE, scene_members, write_dataset
 
+pytestmark = pytest.mark.heavy
+
 LOST = [
     {"scene_id": "lost-1", "name": HOSTILE, "status": "dropped", "stage": "perceive", "reason": "no_table_plane"},
     {"scene_id": "lost-2", "name": "two", "status": "failed", "stage": "place", "error_kind": HOSTILE, "attempts": 2},

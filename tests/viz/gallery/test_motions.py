@@ -16,6 +16,8 @@ from tests.helpers.gallery_dataset import HOSTILE
 from tests.helpers.recorded_dataset import recording, trajectory_row, write_recorded_dataset
 from tests.viz.gallery.test_gallery import Page, digest, index_of
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory) -> Path:

@@ -22,6 +22,8 @@ from tableverse_factory.viz.gallery.scene import SceneJob, write_scene
 from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.viz.gallery.test_gallery import Page
 
+pytestmark = pytest.mark.heavy
+
 LIGHT = {"scene.xml": b"no xml", "meta.json": b"{}"}
 KEYS = ("scene_id", "status", "shard", "tar_offset", "tar_size", "object_id", "task_id", "accepted")
 

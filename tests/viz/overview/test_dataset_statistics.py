@@ -20,6 +20,8 @@ from tableverse_factory.viz.overview.figure import draw_overview, sanitize_label
 from tableverse_factory.viz.overview.write import write_statistics
 from tests.helpers.small_dataset import write_small_dataset
 
+pytestmark = pytest.mark.heavy
+
 HOSTILE = (
     "$x^2$ {\\frac",
     "日本の湯呑み",

@@ -86,6 +86,7 @@ def differs(page, before: np.ndarray, share: float = 0.004) -> bool:
     return bool((np.abs(canvas(page) - before).max(axis=2) > 24).mean() > share)
 
 
+@pytest.mark.heavy
 def test_a_scene_is_seen_as_the_controls_say_and_texts_stay_texts(small, viewer, screenshots):
     visit(small, viewer.url)
     assert not is_blank(canvas(small).astype(np.uint8))
@@ -191,6 +192,7 @@ def test_scenes_are_searched_and_two_browsers_do_not_disturb_each_other(small, v
     other.close()
 
 
+@pytest.mark.heavy
 def test_a_page_from_elsewhere_sees_nothing(browser, viewer):
     assert until(lambda: not viewer.sessions())
     elsewhere = Viewer(viewer._scenes, "b-2", "127.0.0.1", 0)

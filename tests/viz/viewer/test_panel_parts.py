@@ -256,6 +256,7 @@ def _many(tmp_path):
     return open_dataset(many_scenes(tmp_path / "many", 20_000))
 
 
+@pytest.mark.heavy
 def test_few_opened_scenes_are_kept(tmp_path):
     ids = [f"s-{number}" for number in range(MAX_SCENES + 1)]
     shelf = SceneCache(opened(tmp_path / "out", ids))

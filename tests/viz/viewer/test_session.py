@@ -35,6 +35,7 @@ def goes_on(session: Session) -> bool:
     return until(lambda: session.simulated_s > then + 0.1, 30.0)
 
 
+@pytest.mark.heavy
 def test_another_task_may_be_chosen_while_one_plays(alone):
     browser, session = looker(alone)
     with browser:
@@ -52,6 +53,7 @@ def test_another_task_may_be_chosen_while_one_plays(alone):
         assert goes_on(session)
 
 
+@pytest.mark.heavy
 def test_who_waits_for_something_stops_nobody_else(alone):
     (first, busy), (second, other) = looker(alone), looker(alone)
     free = threading.Event()
@@ -74,6 +76,7 @@ def test_who_waits_for_something_stops_nobody_else(alone):
         assert goes_on(busy)
 
 
+@pytest.mark.heavy
 def test_a_mistake_costs_its_own_browser_alone(alone, caplog):
     (first, broken), (second, other) = looker(alone), looker(alone)
     with first, second, caplog.at_level(logging.ERROR):
@@ -92,6 +95,7 @@ def test_a_mistake_costs_its_own_browser_alone(alone, caplog):
     assert "an action of the viewer failed" in caplog.text
 
 
+@pytest.mark.heavy
 def test_a_scene_that_takes_long_keeps_nobody_from_another(tmp_path, monkeypatch):
     dataset = open_dataset(write_viewed_dataset(tmp_path / "out"))
     read, free, asked = dataset.scene, threading.Event(), []
@@ -140,6 +144,7 @@ def test_a_page_behind_a_proxy_is_let_in_when_it_is_named(alone):
         named.stop()
 
 
+@pytest.mark.heavy
 def test_no_browser_opens_the_public_tunnel_of_viser(alone, monkeypatch):
     opened = []
     monkeypatch.setattr("viser.ViserServer.request_share_url", lambda *_, **__: opened.append(1))

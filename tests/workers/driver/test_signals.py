@@ -10,6 +10,8 @@ import pytest
 from tests.helpers.builds import crowd
 from workers.driver.signals import HARD_END_S, StoppedError, StopSignals
 
+pytestmark = pytest.mark.heavy
+
 DEAF = """
 import hashlib, time
 from workers.driver import signals

@@ -4,6 +4,7 @@ import itertools
 import random
 from collections import Counter
 
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -156,6 +157,7 @@ def build(cluster: Cluster, stages: list[str], n: int, lose_at: int | None = Non
 needs = st.dictionaries(st.sampled_from("abcd"), st.integers(1, 4), min_size=1)
 
 
+@pytest.mark.heavy
 @given(
     needs=needs,
     nodes=st.lists(st.integers(1, 8), min_size=1, max_size=4),

@@ -23,6 +23,8 @@ from workers.executors.preflight import (
 )
 from workers.executors.ray_cluster import connect, list_alive_nodes
 
+pytestmark = pytest.mark.heavy
+
 OWN = collect_versions()
 
 

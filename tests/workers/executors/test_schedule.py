@@ -42,6 +42,7 @@ def limits_of(needs: dict[str, dict[str, float]], capacity: dict[str, float], **
     return ScheduleLimits({name: PoolLimits(need, **bounds) for name, need in needs.items()}, capacity)
 
 
+@pytest.mark.heavy
 @given(ready=ready_scenes, idle=by_pool, busy=by_pool, sizes=by_pool, batch=st.integers(1, 9))
 def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
     workers = {pool: list(range(10 * i, 10 * i + idle[pool])) for i, pool in enumerate(POOLS)}
@@ -80,6 +81,7 @@ def test_a_batch_leaves_work_for_the_other_workers():
     assert [choice.ranks for choice in chosen] == [tuple(range(5)), tuple(range(5, 10))]
 
 
+@pytest.mark.heavy
 @given(ready=ready_scenes)
 def test_the_order_in_which_scenes_wait_does_not_matter(ready):
     sizes, batches = dict.fromkeys(POOLS, 2), dict.fromkeys(POOLS, 3)
@@ -95,6 +97,7 @@ def test_cheap_scenes_travel_together(seconds, expected):
     assert choose_batch_size(seconds, 1) == 1
 
 
+@pytest.mark.heavy
 @given(seconds=seconds, cpus=st.integers(4, 30), gpus=st.integers(1, 4))
 def test_pools_fit_and_no_other_sizes_are_faster(seconds, cpus, gpus):
     needs = {pool: {"CPU": 1.0} for pool in POOLS} | {"perception": {"CPU": 1.0, "GPU": 0.5}}
@@ -130,6 +133,7 @@ def test_a_resource_that_is_not_there_does_not_fit():
     assert math.isinf(compute_throughput({}, {}))
 
 
+@pytest.mark.heavy
 @given(
     n=st.integers(0, 60),
     stages=st.lists(st.sampled_from(POOLS), min_size=1, max_size=7),

@@ -30,6 +30,8 @@ from workers.progress.build_state import read_build_state
 from workers.run import run_build
 from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore
 
+pytestmark = pytest.mark.heavy
+
 NAMES = ["fine", "empty", "fine", "fell", "fine", "sad", "fine", "fine", "fine"]
 
 

@@ -12,6 +12,8 @@ import pytest
 from tests.helpers.paths import HELPERS
 from tests.helpers.terminal import PLAIN, ROOT, watch
 
+pytestmark = pytest.mark.heavy
+
 PRETEND = [sys.executable, str(HELPERS / "show_a_build.py")]
 TABLEVERSE = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 

@@ -59,6 +59,7 @@ def told(seed, **options):
     return said, now
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("start_s", [0.0, 40.0])
 def test_the_first_word_on_the_end_is_already_a_fair_one(start_s):
     ratios = []
@@ -71,6 +72,7 @@ def test_the_first_word_on_the_end_is_already_a_fair_one(start_s):
     assert np.mean([0.4 < ratio < 2.5 for ratio in ratios]) >= 0.95, sorted(ratios)
 
 
+@pytest.mark.heavy
 def test_half_way_it_is_close():
     ratios = []
     for seed in range(15):

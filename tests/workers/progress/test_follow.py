@@ -18,6 +18,8 @@ from workers.progress.follow import BuildFollower
 from workers.run import run_build
 from workers.state.ledger import Ledger, journal_path
 
+pytestmark = pytest.mark.heavy
+
 NAMES = ["fine", "empty", "sad", "fell", "fine", "fine", "empty", "sad", "fine"]
 
 

@@ -74,6 +74,7 @@ def test_histograms_are_cumulative_and_add_up():
     assert total["tableverse_stage_wall_seconds_sum"] == pytest.approx(9003.0404)
 
 
+@pytest.mark.heavy
 @given(st.text(max_size=30))
 def test_any_name_of_a_dataset_survives(name):
     read = families(prometheus_text(name, collect_samples(busy(), None, 0.0, 0.0, running=False)))
@@ -125,6 +126,7 @@ def test_an_address_is_no_file():
         pass
 
 
+@pytest.mark.heavy
 def test_a_build_leaves_its_last_figures(tmp_path, monkeypatch):
     rows = [{"scene_id": f"s{i}", "kind": "capture", "uri": "/x", "rejected": "unreadable_color"} for i in range(70)]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "m.parquet")

@@ -10,6 +10,8 @@ from tests.helpers.builds import Silent, build, request, write_manifest
 from workers.progress.stage_costs import collect_measurements
 from workers.run import run_build
 
+pytestmark = pytest.mark.heavy
+
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 NAMES = ["slow_0.2", "empty", "sad", "fell"] * 14
 

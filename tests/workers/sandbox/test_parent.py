@@ -23,6 +23,8 @@ from tests.helpers.paths import ROOT
 from workers.sandbox.channel import Channel
 from workers.sandbox.parent import Sandbox
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture
 def sandbox(tmp_path):

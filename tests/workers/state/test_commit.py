@@ -15,6 +15,8 @@ from workers.state import commit
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger, journal_path
 
+pytestmark = pytest.mark.heavy
+
 NAMES = ["fine", "empty", "fine", "fine"]
 
 

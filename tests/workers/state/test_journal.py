@@ -31,6 +31,7 @@ def test_what_is_recorded_is_read_back(tmp_path):
     assert [again.read(name) for name in ("a", "b", "c")] == [_result(n, n.encode() * 1000) for n in ("a", "b", "c")]
 
 
+@pytest.mark.heavy
 @given(cut=st.integers(0, 2000))
 def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
     path = tmp_path_factory.mktemp("journal") / "j"
@@ -51,6 +52,7 @@ def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
     assert read_result(path, read_journal(path).results["d"]) == _result("d")
 
 
+@pytest.mark.heavy
 @given(at=st.integers(0, 2000), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_never_believed(tmp_path_factory, at, bit):
     path = tmp_path_factory.mktemp("journal") / "j"
@@ -80,6 +82,7 @@ def test_a_reopened_scene_is_to_do_until_it_has_a_new_result(tmp_path):
     assert again.reopened == {"a"}
 
 
+@pytest.mark.heavy
 def test_a_full_disk_is_a_clear_error_and_loses_nothing(tmp_path):
     """The limit on file size stands for the disk: `ulimit -f`, in a process of its own."""
     script = f"""
@@ -110,6 +113,7 @@ def test_a_folder_that_refuses_is_a_clear_error(tmp_path):
         FileJournal(tmp_path / "file" / "j")
 
 
+@pytest.mark.heavy
 def test_a_damaged_journal_is_said_and_costs_what_stood_there_alone(tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine"] * 3)
     build(manifest, tmp_path / "whole")

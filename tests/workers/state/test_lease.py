@@ -12,6 +12,8 @@ from workers.state import lease
 from workers.state.lock import create_writer_lock, describe_writer
 from workers.state.lock_owner import LockOwner, encode_owner, identify_process
 
+pytestmark = pytest.mark.heavy
+
 
 @pytest.fixture
 def place(store, monkeypatch):

@@ -10,6 +10,8 @@ from tableverse_factory.core.storage.files import list_names, read_whole, write_
 from workers.state import object_journal
 from workers.state.journal import find_journal_end, open_journal, read_journal, read_result
 
+pytestmark = pytest.mark.heavy
+
 
 def _result(scene_id: str, exported: bytes = b"\x00scene\xff") -> SceneResult:
     return SceneResult(scene_id, "done", "export", "", "", "why", 1, (StageTiming("cut", 0.5, 0.6),), exported)

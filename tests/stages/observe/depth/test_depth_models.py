@@ -175,6 +175,7 @@ def weights(tmp_path_factory):
     release_models()
 
 
+@pytest.mark.heavy
 def test_depth_anything_2_runs_from_a_folder_and_gives_the_same_bytes_again(tmp_path, weights):
     path = photo(tmp_path / "a.png", size=(120, 160))
     config = {
@@ -194,6 +195,7 @@ def test_depth_anything_2_runs_from_a_folder_and_gives_the_same_bytes_again(tmp_
     np.testing.assert_array_equal(observed(path, **config).value.depth, found.depth)
 
 
+@pytest.mark.heavy
 def test_depth_that_means_nothing_drops_the_picture_for_a_true_reason(tmp_path, weights):
     path = photo(tmp_path / "a.png", size=(120, 160))
     outcome = observed(
@@ -224,6 +226,7 @@ def test_weights_that_could_hold_code_are_not_read(tmp_path, weights):
         observed(photo(tmp_path / "a.png"), depth="depth_anything_2", depth_weights=str(folder), focal_px=90.0)
 
 
+@pytest.mark.heavy
 def test_the_door_has_every_name_that_the_configuration_allows():
     allowed = type(Config().observe).model_fields["depth"].annotation.__args__
     assert set(DEPTH_MODELS) == set(allowed)

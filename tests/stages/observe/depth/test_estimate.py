@@ -41,6 +41,7 @@ def share_in_the_air(depth, truth):
     return float((nearest > 0.015)[known].mean())
 
 
+@pytest.mark.heavy
 def test_no_reading_hangs_between_an_object_and_what_lies_behind_it():
     observation, _ = look(THINGS, camera_above(0.6, 0.8, 35.0))
     truth = observation.depth.astype(np.float32)
@@ -54,6 +55,7 @@ def test_no_reading_hangs_between_an_object_and_what_lies_behind_it():
     assert np.median(np.abs(ours - truth)[on_surface]) < 2e-4
 
 
+@pytest.mark.heavy
 @given(SIZES, SIZES, SIZES, SIZES, st.floats(-0.002, 0.002), st.floats(-0.002, 0.002))
 def test_a_slanted_plane_comes_back_as_itself(rows, columns, height, width, down, right):
     def plane(h, w):

@@ -64,6 +64,7 @@ def view():
     return look(THINGS, noise_m=0.001)[0]
 
 
+@pytest.mark.heavy
 def test_the_picture_gives_what_the_capture_gives(tmp_path, view):
     as_capture(tmp_path / "captures" / "table", view)
     as_picture(tmp_path / "pictures", view)
@@ -167,6 +168,7 @@ def test_what_lies_beside_the_picture_belongs_to_its_content(tmp_path, view):
     assert refusal(observe(row, RECORDED, np.random.default_rng(0), Services(tmp_path))) == "content_changed"
 
 
+@pytest.mark.heavy
 def test_a_capture_has_its_own_depth_whatever_the_key_says(tmp_path, view):
     folder = as_capture(tmp_path / "table", view)
     plain = observed(folder, Config())
@@ -175,6 +177,7 @@ def test_a_capture_has_its_own_depth_whatever_the_key_says(tmp_path, view):
         assert encode(other) == encode(plain)
 
 
+@pytest.mark.heavy
 def test_a_model_that_bends_the_table_still_gives_its_things(tmp_path, view):
     v, u = np.indices(view.depth.shape) / 480.0
     bent = view.depth * 1.04 * (1 + 0.012 * np.sin(4 * u + 1) * np.cos(5 * v))

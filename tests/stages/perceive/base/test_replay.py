@@ -13,6 +13,8 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.perceive import choose_detector, perceive
 from tests.helpers.tabletop_views import Bowl, Box, camera_above, look, overlap
 
+pytestmark = pytest.mark.heavy
+
 GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 REPLAY = Config.model_validate({"perceive": {"detector": "replay"}})
 

@@ -14,6 +14,8 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_hole
 from tableverse_factory.stages.perceive.perceive import perceive
 from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 
+pytestmark = pytest.mark.heavy
+
 
 def found_in(things, tmp_path, noise_m=0.0, **scene):
     observation, truth = look(things, noise_m=noise_m, **scene)

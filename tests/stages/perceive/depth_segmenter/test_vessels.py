@@ -11,6 +11,8 @@ from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 
+pytestmark = pytest.mark.heavy
+
 GREEN, YELLOW = (40, 160, 60), (230, 200, 40)
 LOW = camera_above(0.45, 0.6, 38.0)
 PARTING = Box(0.0, 0.0, (0.15, 0.03, 0.1), z=0.02, color=YELLOW)

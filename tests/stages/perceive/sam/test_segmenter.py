@@ -26,6 +26,8 @@ from tests.helpers.loopback import serving
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.tabletop_views import Box, camera_above, look
 
+pytestmark = pytest.mark.heavy
+
 CPU = Device("cpu", "float32")
 BOXES = np.array([[10.0, 10, 60, 60], [20, 20, 40, 40], [80, 50, 150, 100], [0, 40, 160, 120]])
 

@@ -68,6 +68,7 @@ def test_numbers_are_taken_in_the_order_that_was_asked_for_unless_the_answer_say
     assert read_corners({"bbox_yxyx": swapped}, "xyxy") == (x0, y0, x1, y1)
 
 
+@pytest.mark.heavy
 @given(ANYTHING, st.sampled_from(["xyxy", "yxyx"]))
 def test_whatever_stands_for_a_box_gives_four_finite_numbers_or_none(value, order):
     found = read_corners({"bbox": value}, order)
@@ -136,6 +137,7 @@ def test_in_a_picture_of_less_than_a_thousand_pixels_they_cannot_be_told():
     assert infer_scale([(0, 100, 640, 480), (10, 200, 630, 470)], (640, 480)).unit == "thousandths"
 
 
+@pytest.mark.heavy
 @given(ANYTHING, ANYTHING, ANYTHING, ANYTHING)
 def test_no_answer_breaks_the_reading_or_the_rules(label, box, people, count):
     table = {"label": "table", "bbox_xyxy": [0, 300, 1000, 1000]}

@@ -95,6 +95,7 @@ def spoken(recorded: Detections, detector: str) -> str:
     return json.dumps(tree)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("detector", list(DIALECTS))
 def test_a_model_that_sees_what_is_there_finds_the_true_objects(server, tmp_path, capture, detector):
     server.say(DIALECTS[detector](spoken(capture.recorded_detections, detector)))
@@ -121,6 +122,7 @@ def test_a_model_that_sees_what_is_there_finds_the_true_objects(server, tmp_path
     assert services.meter.paid.input_tokens == (700 if detector == "gemini" else 900)
 
 
+@pytest.mark.heavy
 def test_what_was_paid_for_is_not_asked_again(look, server):
     server.say(chat("no JSON"), chat(answer(MUG)))
     first = look()
@@ -193,6 +195,7 @@ def test_boxes_in_pixels_of_a_small_picture_are_found_out(look, server):
     assert [remark.rule for remark in found.remarks] == ["unit"]
 
 
+@pytest.mark.heavy
 def test_boxes_come_in_the_order_that_is_configured(look, server):
     there = [400.0, 450.0, 480.0, 520.0]
     turned = {"label": "mug", "box_2d": [450, 400, 520, 480]}
@@ -213,6 +216,7 @@ TAGGED = """<think>There is a {mug}.</think>Here you are:
 ```"""
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "text",
     [
@@ -254,6 +258,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("broken", list(BROKEN.values()), ids=list(BROKEN))
 def test_an_answer_that_is_none_is_sent_back_once_and_then_refused(look, server, broken, tmp_path):
     server.say(broken, chat(answer(MUG)))
@@ -277,6 +282,7 @@ def refused(why: str) -> Scripted:
     return Scripted({"choices": [{"message": {"role": "assistant", "content": None, "refusal": why}}]})
 
 
+@pytest.mark.heavy
 def test_what_ends_a_scene_and_what_ends_a_build(server, tmp_path, capture, monkeypatch):
     view = find_table(capture, make_rng(0, "synth", "perceive"))
 
@@ -306,6 +312,7 @@ def test_what_ends_a_scene_and_what_ends_a_build(server, tmp_path, capture, monk
     assert server.asked == []
 
 
+@pytest.mark.heavy
 def test_a_table_that_was_forgotten_is_asked_for(look, server):
     server.say(chat(json.dumps({"detections": [MUG]})), chat(answer(MUG)))
     assert [item.label for item in look().answer.detections] == ["table", "mug"]
@@ -343,6 +350,7 @@ def test_writing_in_the_picture_that_the_model_obeyed_ends_as_bounded_text(look,
     assert found.answer == Detections.model_validate_json(found.answer.model_dump_json())
 
 
+@pytest.mark.heavy
 def test_a_silent_server_is_given_up(look, server):
     release, ended = threading.Event(), []
     server.say(Scripted(write=lambda _: ended.append(release.wait(60.0))))

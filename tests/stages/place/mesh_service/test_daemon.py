@@ -25,6 +25,8 @@ from tests.helpers.mesh_asker import hashes
 from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS, ROOT
 
+pytestmark = pytest.mark.heavy
+
 BAD = 666
 
 

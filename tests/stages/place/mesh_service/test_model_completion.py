@@ -84,6 +84,7 @@ def test_whatever_way_a_file_names_as_up_is_up_and_nothing_is_mirrored(form: str
     np.testing.assert_allclose(to_trimesh(got).center_mass, expected.center_mass, atol=1e-3)
 
 
+@pytest.mark.heavy
 def test_a_mesh_of_many_faces_becomes_small_closed_and_keeps_its_shape_and_colours():
     ball = trimesh.creation.icosphere(6)  # 81,920 faces
     shown = np.where(ball.vertices[:, 2:] > 0.0, (200, 30, 20), (20, 30, 200))
@@ -131,6 +132,7 @@ def ply_of(n_faces: int) -> bytes:
     return head.encode() + corners + struct.pack("<B3i", 3, 0, 1, 2) * n_faces
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("data", "form", "why"),
     [
@@ -148,6 +150,7 @@ def test_what_is_no_mesh_is_an_error_that_says_so(data: bytes, form: str, why: s
         convert_mesh(file_of(data, form, "z"))
 
 
+@pytest.mark.heavy
 def test_an_object_whose_mesh_is_none_is_left_out_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene = seen(box(0.06, 0.05, 0.1), box(0.05, 0.05, 0.06, x=0.2))
     monkeypatch.setattr(model_completion, "_SEEDS", 667)
@@ -194,6 +197,7 @@ def completions(scene: PerceivedObjects, run_seed: int, cache: Path) -> Sequence
     return complete_with_model(scene, sightings, config, np.random.default_rng(run_seed), Services(cache))
 
 
+@pytest.mark.heavy
 def test_an_objects_seed_depends_on_run_scene_and_pixels_and_not_on_its_neighbours(monkeypatch, tmp_path):
     scene = seen(box(0.06, 0.05, 0.1), cup(0.04, 0.09, 0.004, x=0.2))
     both = seeds_of(scene, 0, monkeypatch, tmp_path)
@@ -201,6 +205,7 @@ def test_an_objects_seed_depends_on_run_scene_and_pixels_and_not_on_its_neighbou
     assert len({*both, *seeds_of(scene, 1, monkeypatch, tmp_path)}) == 4
 
 
+@pytest.mark.heavy
 def test_equal_input_gives_equal_bytes_with_and_without_what_was_kept(tmp_path: Path):
     scene = seen(box(0.06, 0.05, 0.1))
     first, kept = (completions(scene, 0, tmp_path / "one") for _ in range(2))

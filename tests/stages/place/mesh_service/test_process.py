@@ -26,6 +26,8 @@ from tableverse_factory.stages.place.mesh_service.process import MeshProcess
 from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS
 
+pytestmark = pytest.mark.heavy
+
 SERVER = HELPERS / "mesh_server.py"
 BAD = 666
 VIEW = RgbdImage(np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32), Camera(5.0, 5.0, 3.0, 2.0, 6, 4))
