@@ -2,9 +2,11 @@
 
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
@@ -44,11 +46,26 @@ def parallel_map(
     context = get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(items)), context, threadpool_limits, (1,)) as pool:
         try:
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children ignore Ctrl-C
-            try:
+            with _defer_interrupt():
                 results = pool.map(work, items, chunksize=chunk)
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             yield from results
         except BrokenProcessPool as error:
             raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
+
+
+@contextmanager
+def _defer_interrupt() -> Iterator[None]:
+    """Start children that ignore Ctrl-C, and raise one that comes meanwhile when they have started."""
+    interrupts: list[int] = []
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    # The mask is what children inherit; here a library's thread may still take the signal, so it needs a handler.
+    handler = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number)) if in_main_thread else None
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if in_main_thread:
+            signal.signal(signal.SIGINT, handler)
+    if interrupts:
+        signal.raise_signal(signal.SIGINT)
