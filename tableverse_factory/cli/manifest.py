@@ -55,10 +55,10 @@ def manifest(
     per_host: Annotated[
         int | None, typer.Option(min=1, max=32, help="At a time from one host; 2.", rich_help_panel=_FETCH_PANEL)
     ] = None,
-    sift: Annotated[
+    filter_pictures: Annotated[
         bool | None,
         typer.Option(
-            "--sift/--no-sift",
+            "--filter/--no-filter",
             help="Whether small, blurred, odd or repeated pictures are rejected; with a list or a key below they are.",
             rich_help_panel=_FILTER_PANEL,
         ),
@@ -112,7 +112,7 @@ def manifest(
     lists = [path for path in paths if is_list(path)]
     criteria = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
     criteria |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
-    image_filter = _make_filter(sift, bool(lists), _drop_none(criteria))
+    image_filter = _make_filter(filter_pictures, bool(lists), _drop_none(criteria))
     limits = {"timeout_s": timeout, "parallel": parallel, "per_host": per_host, "allow_private": allow_private or None}
     fetching = _make_fetch_bounds(lists, pictures, max_mb, _drop_none(limits))
     gathered = _fetch_lists(lists, _choose_folder(lists, pictures, place), fetching, bounds)
@@ -132,14 +132,14 @@ def _drop_none(options: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _make_filter(sift: bool | None, from_lists: bool, criteria: dict[str, Any]) -> "FilterCriteria | None":
-    """Make the filter of bare pictures: on with a list, a criterion or `--sift`, unless it is refused."""
+def _make_filter(wanted: bool | None, from_lists: bool, criteria: dict[str, Any]) -> "FilterCriteria | None":
+    """Make the filter of bare pictures: on with a list, a criterion or `--filter`, unless it is refused."""
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.sources.urls.image_filter import FilterCriteria
 
-    if sift is False and criteria:
-        raise InputError("--no-sift takes every picture that decodes: leave out the options about sifting")
-    return FilterCriteria(**criteria) if sift or (sift is None and (from_lists or criteria)) else None
+    if wanted is False and criteria:
+        raise InputError("--no-filter accepts every picture that decodes: leave out the options of the filter")
+    return FilterCriteria(**criteria) if wanted or (wanted is None and (from_lists or criteria)) else None
 
 
 def _make_fetch_bounds(

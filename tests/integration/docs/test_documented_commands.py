@@ -4,6 +4,8 @@ Not run is what `CANNOT` names, each with its reason; of it the `tableverse` com
 as are all of them. Pages beyond `SHORT` are run where slow tests are; otherwise they are only read.
 """
 
+import ast
+import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -19,16 +21,16 @@ CANNOT = (
     (r"make |git |pip |source ", "sets up the environment that this test runs in"),
     (r"sbatch |ray |RAY_AUTH", "needs a cluster, containers or an account"),
     (r"export AWS_", "would point all that follows at a store that is not there"),
-    (r".*\bs3://", "needs an object store; tests/storage has one"),
-    (r".*\b(hf|https?)://|tableverse publish ", "needs a server; tests/hub has one"),
-    (r"tableverse submit ", "needs a Ray cluster; tests/ray has one"),
-    (r"tableverse view ", "serves until it is stopped; tests/viewer does that"),
+    (r".*\bs3://", "needs an object store; tests/integration/s3 has one"),
+    (r".*\b(hf|https?)://|tableverse publish ", "needs a server; tests/delivery has one"),
+    (r"tableverse submit ", "needs a Ray cluster; tests/integration/ray has one"),
+    (r"tableverse view ", "serves until it is stopped; tests/viz does that"),
     (r"xdg-open ", "opens a window"),
     (r".*judge=gemini", "needs a key for a model"),
     (r".*--max-usd", "needs a model that is paid"),
     (r"tableverse (bench|train) ", "takes minutes"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
-    (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluate has some"),
+    (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluation has some"),
     (r"tableverse textures index ", "needs textures that somebody photographed"),
 )
 """What a test cannot run, and why. A `tableverse` command among it is still read by the real command line."""
@@ -41,6 +43,8 @@ PYTHON_CANNOT = (
     (r"\btargets\b", "a fragment: the reader has the targets"),
 )
 """The same for Python."""
+
+OURS = ("tableverse_factory", "workers", "schemas")
 
 TESTED_BY_ITSELF = ("cookbook.md",)
 """Pages whose Python another test runs, on data of its own; their commands are run here."""
@@ -134,6 +138,18 @@ def test_every_command_exists(page: Path) -> None:
 def test_a_command_within_a_sentence_exists(page: Path) -> None:
     for text in mentioned(page):
         check_mention(text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_documented_imports_exist(page: Path) -> None:
+    for block in blocks(page):
+        for node in ast.walk(ast.parse(block.text)) if block.language == "python" else ():
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
+                ("tableverse_factory", "workers", "schemas")
+            ):
+                module = importlib.import_module(str(node.module))
+                missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                assert not missing, f"{page.name}:{block.line}: {node.module} has no {missing}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

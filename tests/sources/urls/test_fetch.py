@@ -385,7 +385,7 @@ def test_a_turned_photo_is_upright_for_all_that_follows(pictures, tmp_path):
     assert np.array_equal(read_image(str(tmp_path / "disk" / "x.png"), BOUNDS), np.asarray(upright))
 
 
-def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
+def test_near_duplicates_blur_and_the_rest_are_filtered_out(pictures, tmp_path):
     large, small = photo(1, (800, 600)), photo(1, (800, 600)).resize((400, 300))
     sent = {
         "small.jpg": small,
@@ -410,7 +410,7 @@ def test_near_duplicates_blur_and_the_rest_are_sifted_out(pictures, tmp_path):
     assert rows[1].scene_id in rows[0].rejected_detail
 
 
-def test_captures_are_never_sifted(tmp_path):
+def test_captures_are_never_filtered(tmp_path):
     write_capture(tmp_path / "c", 1)
     write_picture(tmp_path / "p" / "a.png", 2)
     rows = make_manifest([str(tmp_path)], BOUNDS, criteria=FilterCriteria()).rows
@@ -465,7 +465,7 @@ def test_the_command_says_what_came_and_what_did_not(run, pictures, tmp_path):
         ["--pictures", tmp_path / "p"],
         ["--allow-private"],
         ["--max-mb", "1"],
-        ["--no-sift", "--min-side", "3"],
+        ["--no-filter", "--min-side", "3"],
     ):
         code, _, err = run("manifest", tmp_path, "--out", tmp_path / "n.parquet", *options)
         assert (code, err.count("\n")) == (1, 2)
