@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.stages.observe.depth.from_git import PACKAGES, is_installed
+from tableverse_factory.stages.observe.depth.from_git import PACKAGES
 
 SCRIPT_TIMEOUT_S = 120.0
 MIN_FREE_BYTES = 2 * 1024**3
@@ -182,7 +182,7 @@ def _check_extras() -> Iterator[Check]:
     advice = "" if curobo else "not needed; for the planner curobo, on a GPU (docs/trajectories.md): see its own pages"
     yield Check("cuRobo", False, curobo, "installed" if curobo else "not installed", advice)
     for module, (name, source) in PACKAGES.items():  # in no extra: no index has them
-        there = is_installed(module)
+        there = find_spec(module) is not None
         advice = "" if there else f"not needed; for pictures without depth (docs/models.md): pip install '{source}'"
         yield Check(f"depth model {name}", False, there, "installed" if there else "not installed", advice)
     yield Check("weights", False, True, "none needed: every door has an embedded default (docs/models.md)")

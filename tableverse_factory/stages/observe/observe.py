@@ -35,22 +35,12 @@ class DepthModel(Protocol):
     """Interface of depth models, which give a picture metric depth and a camera."""
 
     def __call__(self, item: ImageRow, config: Config) -> Capture:
-        """Return the picture with its depth.
-
-        Raises:
-            InputError: with a reason, if the model cannot process the row.
-            AnswerInvalidError: if its answer is invalid.
-            ModelAccessError: if it is not installed, or has no weights.
-        """
+        """Return the picture with its depth; `InputError` and `AnswerInvalidError` drop the row."""
         ...
 
 
 def read_sensor_depth(item: ImageRow, config: Config) -> Capture:
-    """Read the sensor depth of a capture.
-
-    Raises:
-        InputError: `no_depth_model` for a bare picture, else as `read_capture`.
-    """
+    """Read the sensor depth of a capture; a bare picture has none."""
     if item.kind is not SceneKind.CAPTURE:
         raise InputError(
             "a picture without depth needs a depth model, and observe.depth is 'sensor', which reads the depth of a "
@@ -72,11 +62,7 @@ DEPTH_MODELS: dict[str, DepthModel] = {
 
 
 def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Observation]:  # noqa: ARG001
-    """Read a capture, or a picture with the depth model; unusable rows are dropped with the reason.
-
-    Raises:
-        ModelAccessError: if the depth model is not installed or its weights are missing.
-    """
+    """Read a capture, or a picture with the depth model; unusable rows are dropped with the reason."""
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
     try:

@@ -16,42 +16,26 @@ from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.pixels import IMAGENET, compute_pixel_values, upload_image
 from tableverse_factory.models.local.weights import load_once, load_pretrained
 from tableverse_factory.sources.capture import Capture
-from tableverse_factory.stages.observe.depth.estimate import (
-    DepthEstimate,
-    build_capture,
-    create_centered_camera,
-    rescale_camera,
-)
+from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, build_capture, create_centered_camera
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
 
 NAME = "depth_anything_2"
-SIDE_PX = 518
+SIDE_PX = 518  # side to which the model's own processor scales
 
 
 def estimate_depth_anything_2(item: ImageRow, config: Config) -> Capture:
-    """Estimate metric depth; the focal length comes from EXIF or `observe.focal_px`.
-
-    Raises:
-        InputError: `no_focal_length`, `depth_all_zero`, or as `read_rgb_image`.
-        ModelAccessError: without torch, transformers or weights, or with weights of a relative model.
-    """
+    """Estimate metric depth; the focal length comes from EXIF or `observe.focal_px`."""
     photo = read_rgb_image(item.uri, config.observe)
     focal = photo.get_focal_px(config.observe.focal_px)
     depth = predict_metric_depth(
         photo.color, config.observe.depth_weights or DEFAULT_WEIGHTS[NAME], select_device(config.models)
     )
-    height, width = photo.color.shape[:2]
-    camera = rescale_camera(create_centered_camera(focal, focal, width, height), depth.shape[1], depth.shape[0])
+    camera = create_centered_camera(focal, photo.color.shape, depth.shape)
     return build_capture(photo.color, DepthEstimate(depth, camera), config.observe)
 
 
 def predict_metric_depth(color: Picture, weights: str, device: Device) -> Float32[np.ndarray, "h w"]:
-    """Predict depth at the model's resolution [m].
-
-    Raises:
-        ModelAccessError: see `estimate_depth_anything_2`.
-        ModelError: if the memory is short.
-    """
+    """Predict depth at the model's resolution [m]."""
     model = load_once((NAME, weights, device), lambda: _load_metric_model(weights, device))
     torch = import_torch()
     size = compute_input_size(color.shape[0], color.shape[1], int(model.config.patch_size))
@@ -67,10 +51,7 @@ def predict_metric_depth(color: Picture, weights: str, device: Device) -> Float3
 
 
 def compute_input_size(height: int, width: int, patch: int) -> tuple[int, int]:
-    """Compute the input size: the side that changes less becomes about `SIDE_PX`, both multiples of the patch.
-
-    As the model's own processor does: 240 x 320 becomes 392 x 518, 1536 x 2048 becomes 518 x 686.
-    """
+    """Compute rows and columns of the input: the side that changes less becomes about `SIDE_PX`, both whole patches."""
     scale = min((SIDE_PX / height, SIDE_PX / width), key=lambda scale: abs(1.0 - scale))
     rows, columns = (max(1, round(side * scale / patch)) * patch for side in (height, width))
     return rows, columns

@@ -1,7 +1,7 @@
 """Depth Anything 3 (Lin et al. 2025): the metric model, and the nested one, which also estimates the camera.
 
-The package is on git alone and could not be run here: its interface follows its pages and code, and the conversion of
-its arrays (`scale_to_metres`, `build_nested_estimate`) is tested by itself.
+The package is on git alone and was never run: its interface follows its pages and code; the conversion of its arrays
+(`scale_to_metres`, `build_nested_estimate`) is tested.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,6 @@ from tableverse_factory.stages.observe.depth.estimate import (
     build_capture,
     create_centered_camera,
     parse_intrinsics,
-    rescale_camera,
 )
 from tableverse_factory.stages.observe.depth.from_git import import_git_package
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
@@ -38,60 +37,34 @@ _Map = Float[np.ndarray, "h w"]
 
 
 def estimate_depth_anything_3(item: ImageRow, config: Config) -> Capture:
-    """Estimate depth with the metric model (Apache-2.0); the focal length comes from EXIF or `observe.focal_px`.
-
-    Raises:
-        InputError: `no_focal_length`, `depth_all_zero`, or as `read_rgb_image`.
-        ModelAccessError: without the package or the weights.
-    """
+    """Estimate depth with the metric model (Apache-2.0); the focal length comes from EXIF or `observe.focal_px`."""
     photo = read_rgb_image(item.uri, config.observe)
     focal = photo.get_focal_px(config.observe.focal_px)
-    prediction = _run_inference(
-        photo.color, config, config.observe.depth_weights or DEFAULT_WEIGHTS["depth_anything_3"]
-    )
-    height, width = photo.color.shape[:2]
-    depth, sky, confidence = _get_map(prediction, "depth"), _get_map(prediction, "sky"), _get_map(prediction, "conf")
+    depth, sky, confidence, _ = _predict_maps(photo.color, config, "depth_anything_3")
     if depth is None:
         raise AnswerInvalidError("Depth Anything 3 gave no depth", "depth_answer_invalid")
-    return build_capture(photo.color, scale_to_metres(depth, sky, confidence, focal, width, height), config.observe)
+    estimate = scale_to_metres(depth, sky, confidence, focal, photo.color.shape)
+    return build_capture(photo.color, estimate, config.observe)
 
 
 def estimate_depth_anything_3_nested(item: ImageRow, config: Config) -> Capture:
-    """Estimate metric depth and the camera with the nested model (CC BY-NC 4.0).
-
-    Raises:
-        InputError: `depth_all_zero`, `bad_intrinsics`, or as `read_rgb_image`.
-        ModelAccessError: without the package or the weights.
-    """
+    """Estimate metric depth and the camera with the nested model (CC BY-NC 4.0)."""
     photo = read_rgb_image(item.uri, config.observe)
-    prediction = _run_inference(
-        photo.color, config, config.observe.depth_weights or DEFAULT_WEIGHTS["depth_anything_3_nested"]
-    )
-    depth, intrinsics = _get_map(prediction, "depth"), _get_map(prediction, "intrinsics")
+    depth, sky, confidence, intrinsics = _predict_maps(photo.color, config, "depth_anything_3_nested")
     if depth is None or intrinsics is None or intrinsics.shape != (3, 3):
         raise AnswerInvalidError("Depth Anything 3 gave no depth or no intrinsics", "depth_answer_invalid")
-    estimate = build_nested_estimate(depth, _get_map(prediction, "sky"), _get_map(prediction, "conf"), intrinsics)
+    estimate = build_nested_estimate(depth, sky, confidence, intrinsics)
     return build_capture(photo.color, estimate, config.observe)
 
 
 def scale_to_metres(
-    output: _Map, sky: _Map | None, confidence: _Map | None, focal_px: float, width: int, height: int
+    output: _Map, sky: _Map | None, confidence: _Map | None, focal_px: float, shape: tuple[int, ...]
 ) -> DepthEstimate:
-    """Scale the metric model's output, the depth for a focal length of 300 px, to metres.
+    """Scale the metric model's output, the depth for a focal length of 300 px at the model's resolution, to metres.
 
-    The focal length is that at the model's resolution: for a picture of 4,000 pixels that is shrunk to 504, a focal
-    length of 3,000 px becomes 378 px. Where shrinking changes the aspect ratio, the mean of both axes is used.
-
-    Args:
-        output: Depth map of the model.
-        sky: Probability or mask of sky; None if unknown.
-        confidence: Confidence without unit; None if unknown.
-        focal_px: Focal length of the picture [px].
-        width: Width of the picture [px].
-        height: Height of the picture [px].
+    `focal_px` is for a picture of `shape`, (h, w, …); where shrinking changes the aspect, the mean of both axes counts.
     """
-    rows, columns = output.shape
-    camera = rescale_camera(create_centered_camera(focal_px, focal_px, width, height), columns, rows)
+    camera = create_centered_camera(focal_px, shape, output.shape)
     metres = output * ((camera.fx + camera.fy) / 2 / CANONICAL_FOCAL_PX)
     return DepthEstimate(mask_unreliable_depth(metres, sky, confidence), camera)
 
@@ -99,20 +72,13 @@ def scale_to_metres(
 def build_nested_estimate(
     depth: _Map, sky: _Map | None, confidence: _Map | None, intrinsics: Float[np.ndarray, "3 3"]
 ) -> DepthEstimate:
-    """Build the estimate of the nested model, depth and camera at its resolution.
-
-    Raises:
-        InputError: `bad_intrinsics` for invalid intrinsics.
-    """
+    """Build the estimate of the nested model, depth and camera at its resolution."""
     rows, columns = depth.shape
     return DepthEstimate(mask_unreliable_depth(depth, sky, confidence), parse_intrinsics(intrinsics, columns, rows))
 
 
 def mask_unreliable_depth(depth: _Map, sky: _Map | None, confidence: _Map | None) -> _Map:
-    """Set depth to 0 for sky and for pixels of low confidence.
-
-    Confidence has no unit, and its range depends on the weights, so it is compared with its median.
-    """
+    """Set depth to 0 for sky and for pixels of low confidence, which has no unit and is compared with its median."""
     is_reliable = np.isfinite(depth) & (depth > 0.0)
     if sky is not None:
         is_reliable &= np.asarray(sky, dtype=np.float32) < SKY
@@ -121,14 +87,14 @@ def mask_unreliable_depth(depth: _Map, sky: _Map | None, confidence: _Map | None
     return np.where(is_reliable, depth, 0.0).astype(np.float32)
 
 
-def _run_inference(color: Picture, config: Config, weights: str) -> Any:
-    """Run the package on one picture, with a fixed seed: it samples pixels of large skies."""
+def _predict_maps(color: Picture, config: Config, name: str) -> list[Any]:
+    """Predict depth, sky, confidence and intrinsics, arrays or None; the seed is fixed, as large skies are sampled."""
     api = import_git_package("depth_anything_3.api")
-    device = select_device(config.models)
-    name, at = resolve_source(weights, KEY)
+    device, weights = select_device(config.models), config.observe.depth_weights or DEFAULT_WEIGHTS[name]
+    source, at = resolve_source(weights, KEY)
 
     def make() -> Any:
-        return api.DepthAnything3.from_pretrained(name, **at).to(device=device.torch_device).eval()
+        return api.DepthAnything3.from_pretrained(source, **at).to(device=device.torch_device).eval()
 
     model = load_once(("depth_anything_3", weights, device), lambda: load_foreign(make, weights, KEY))
 
@@ -137,9 +103,5 @@ def _run_inference(color: Picture, config: Config, weights: str) -> Any:
         return [model.inference([np.ascontiguousarray(picture)]) for picture in pictures]
 
     (prediction,), _ = run_in_batches(run, [color], 1)
-    return prediction
-
-
-def _get_map(prediction: Any, name: str) -> Any:
-    value = getattr(prediction, name, None)
-    return None if value is None else np.asarray(value[0])
+    found = (getattr(prediction, field, None) for field in ("depth", "sky", "conf", "intrinsics"))
+    return [None if value is None else np.asarray(value[0]) for value in found]

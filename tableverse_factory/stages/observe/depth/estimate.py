@@ -16,12 +16,9 @@ _IMPLAUSIBLE_M = 100.0  # A depth map entirely beyond this is probably in anothe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthEstimate(Frozen):
-    """Depth and camera at the resolution of the model.
+    """Depth along the optical axis [m], 0, negative or not finite where unknown, and the camera for its size.
 
-    Attributes:
-        depth: Along the optical axis [m], shape (h, w); 0, negative or not finite where unknown.
-        camera: Intrinsics for the size of `depth`.
-        bend: Share of the distance by which the depth may be bent smoothly; 0 for a sensor.
+    `bend` is the share of the distance by which the depth may be bent smoothly; 0 for a sensor.
     """
 
     depth: DepthImage
@@ -35,22 +32,15 @@ def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5, width, height)
 
 
-def create_centered_camera(focal_x: float, focal_y: float, width: int, height: int) -> Camera:
-    """Create a camera with its principal point in the middle of the picture."""
-    return Camera(focal_x, focal_y, (width - 1) / 2, (height - 1) / 2, width, height)
+def create_centered_camera(focal_px: float, shape: tuple[int, ...], scaled: tuple[int, ...]) -> Camera:
+    """Create the camera of a picture of `shape`, (h, w, …), scaled to another shape; the principal point is central."""
+    height, width = shape[:2]
+    camera = Camera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
+    return rescale_camera(camera, scaled[1], scaled[0])
 
 
 def parse_intrinsics(matrix: np.ndarray, width: int, height: int) -> Camera:
-    """Convert an intrinsic matrix, with the picture's left and upper edge at 0, as networks give it.
-
-    Args:
-        matrix: Shape (3, 3) [px].
-        width: Width of its picture [px].
-        height: Height of its picture [px].
-
-    Raises:
-        InputError: `bad_intrinsics` for values of no camera.
-    """
+    """Convert intrinsics as networks give them: shape (3, 3) [px], the picture's left and upper edge at 0."""
     fx, fy, cx, cy = (float(matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
     inside = 0.0 <= cx <= width and 0.0 <= cy <= height
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0.0 and fy > 0.0 and inside):
@@ -62,16 +52,9 @@ def parse_intrinsics(matrix: np.ndarray, width: int, height: int) -> Camera:
 def build_capture(
     color: Picture, estimate: DepthEstimate, bounds: ObserveConfig, origin: str = "the depth model's answer"
 ) -> Capture:
-    """Build a capture with the estimated depth at the size of the picture.
+    """Build a capture with the estimated depth at the size of the picture, whose aspect ratio is nearly the same.
 
-    Args:
-        color: Shape (h, w, 3).
-        estimate: At any size of nearly the same aspect ratio.
-        bounds: Holds `max_depth_m`; greater depth is ignored.
-        origin: Source of the depth, for messages.
-
-    Raises:
-        InputError: `depth_all_zero` if no depth is left.
+    Depth beyond `observe.max_depth_m` is ignored; `origin` names the source of the depth in messages.
     """
     height, width = color.shape[:2]
     is_valid = np.isfinite(estimate.depth) & (estimate.depth > 0.0) & (estimate.depth <= bounds.max_depth_m)

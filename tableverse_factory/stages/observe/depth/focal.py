@@ -7,12 +7,8 @@ from typing import Any
 
 from PIL import Image
 
-DIAGONAL_35MM = math.hypot(36.0, 24.0)
-"""Diagonal of 35 mm film, to which "35 mm equivalent" refers [mm] (CIPA DCG-001)."""
-
-SHORTEST, LONGEST = 0.2, 50.0
-"""Bounds of a plausible focal length, in longer sides of the picture: fisheyes and telescopes lie outside."""
-
+DIAGONAL_35MM = math.hypot(36.0, 24.0)  # diagonal of the film of "35 mm equivalent" [mm] (CIPA DCG-001)
+SHORTEST, LONGEST = 0.2, 50.0  # plausible focal lengths, in longer sides: fisheyes and telescopes lie outside
 MAX_ASPECT_CHANGE = 0.02
 _EXIF_IFD = 0x8769
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
@@ -22,17 +18,15 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
 def read_exif_focal(image: Image.Image) -> float | None:
-    """Read the focal length from EXIF [px]; None if it is missing or implausible.
-
-    The EXIF of a cropped picture, whose aspect ratio differs from the recorded one, is ignored; that of a resized
-    picture is used.
-    """
+    """Read the focal length from EXIF [px]; None if it is missing, implausible, or of a picture cropped since."""
     tags = _read_tags(image)
     longer, shorter = max(image.size), min(image.size)
     taken = sorted(number for tag in (_WIDTH, _HEIGHT) if (number := _parse_positive(tags.get(tag))) is not None)
     if len(taken) == 2 and abs(taken[0] / taken[1] - shorter / longer) > MAX_ASPECT_CHANGE * shorter / longer:
         return None
-    focal = _compute_from_film(tags, image.size) or _compute_from_sensor(tags, longer, taken)
+    equivalent = _parse_positive(tags.get(_FOCAL_35MM))
+    from_film = None if equivalent is None else equivalent * math.hypot(*image.size) / DIAGONAL_35MM
+    focal = from_film or _compute_from_sensor(tags, longer, taken)
     return focal if focal is not None and SHORTEST * longer <= focal <= LONGEST * longer else None
 
 
@@ -44,11 +38,6 @@ def _read_tags(image: Image.Image) -> dict[int, Any]:
             return dict(image.getexif().get_ifd(_EXIF_IFD))
     except (SyntaxError, ValueError, OverflowError, OSError, struct.error):  # Pillow raises each of them
         return {}
-
-
-def _compute_from_film(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
-    equivalent = _parse_positive(tags.get(_FOCAL_35MM))
-    return None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
 
 
 def _compute_from_sensor(tags: dict[int, Any], longer: int, taken: list[float]) -> float | None:

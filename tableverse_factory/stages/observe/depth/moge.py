@@ -1,7 +1,6 @@
 """MoGe-2 (Wang et al. 2025): metric depth, a mask of valid pixels and the camera, at the picture's size.
 
-The package is on git alone and could not be run here: its interface follows its code, and the conversion of its arrays
-(`build_moge_estimate`) is tested by itself.
+The package is on git alone and was never run: its interface follows its code; `build_moge_estimate` is tested.
 """
 
 from collections.abc import Sequence
@@ -24,17 +23,11 @@ from tableverse_factory.stages.observe.depth.from_git import import_git_package
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
 
 KEY = "observe.depth_weights"
-CHECKPOINT = "model.pt"
+CHECKPOINT = "model.pt"  # in a local folder; names on the hub the package resolves itself
 
 
 def estimate_moge_2(item: ImageRow, config: Config) -> Capture:
-    """Estimate metric depth and the camera.
-
-    Raises:
-        InputError: `depth_all_zero`, `bad_intrinsics`, or as `read_rgb_image`.
-        ModelAccessError: without the package or the weights.
-        ModelError: if the memory is short.
-    """
+    """Estimate metric depth and the camera."""
     photo = read_rgb_image(item.uri, config.observe)
     model_type = import_git_package("moge.model.v2").MoGeModel
     device = select_device(config.models)
@@ -42,7 +35,8 @@ def estimate_moge_2(item: ImageRow, config: Config) -> Capture:
     name, at = resolve_source(weights, KEY)
 
     def make() -> Any:
-        return model_type.from_pretrained(_locate_checkpoint(name), **at).to(device.torch_device).eval()
+        checkpoint = str(Path(name) / CHECKPOINT) if Path(name).is_dir() else name
+        return model_type.from_pretrained(checkpoint, **at).to(device.torch_device).eval()
 
     model = load_once(("moge_2", weights, device), lambda: load_foreign(make, weights, KEY))
 
@@ -59,16 +53,7 @@ def estimate_moge_2(item: ImageRow, config: Config) -> Capture:
 def build_moge_estimate(
     depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], intrinsics: Float[np.ndarray, "3 3"]
 ) -> DepthEstimate:
-    """Build the estimate from MoGe-2's arrays.
-
-    Args:
-        depth: Depth, infinite where unknown [m].
-        mask: Pixels with depth.
-        intrinsics: Intrinsics for a picture of width and height 1.
-
-    Raises:
-        InputError: `bad_intrinsics` for invalid intrinsics.
-    """
+    """Build the estimate from depth [m], the pixels that have any, and intrinsics for a picture of 1 x 1."""
     height, width = depth.shape
     pixels = intrinsics * np.array([[width], [height], [1.0]])
     return DepthEstimate(np.where(mask, depth, 0.0).astype(np.float32), parse_intrinsics(pixels, width, height))
@@ -78,8 +63,3 @@ def _get_arrays(prediction: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, np.
     depth, intrinsics = (prediction[name].detach().float().cpu().numpy() for name in ("depth", "intrinsics"))
     mask = prediction["mask"].detach().cpu().numpy() if "mask" in prediction else np.isfinite(depth)
     return depth, mask.astype(bool), intrinsics
-
-
-def _locate_checkpoint(weights: str) -> str:
-    """Return the checkpoint file of a local folder; the package takes names on the hub as they are."""
-    return str(Path(weights) / CHECKPOINT) if Path(weights).is_dir() else weights

@@ -23,12 +23,7 @@ _MAX_SIDE = 100_000
 
 
 def read_recorded_depth(item: ImageRow, config: Config) -> Capture:
-    """Read the depth in `NAME.depth.npy` and the camera in `NAME.camera.json` of a picture `NAME.jpg`.
-
-    Raises:
-        InputError: `no_recorded_depth`, `unreadable_depth`, `depth_size_differs`, `depth_all_zero`, `bad_intrinsics`,
-            or as `read_rgb_image`.
-    """
+    """Read the depth in `NAME.depth.npy` and the camera in `NAME.camera.json` of a picture `NAME.jpg`."""
     photo = read_rgb_image(item.uri, config.observe)
     there = find_sidecars(item.uri)
     missing = [suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if suffix not in there]
@@ -50,11 +45,7 @@ def read_recorded_depth(item: ImageRow, config: Config) -> Capture:
 
 
 def read_depth_array(uri: str, bounds: ObserveConfig) -> DepthImage:
-    """Read depth from a `.npy` file [m]. Shape (h, w), float32.
-
-    Raises:
-        InputError: `unreadable_depth`, `picture_too_large`, `file_too_large`.
-    """
+    """Read depth from a `.npy` file [m]. Shape (h, w), float32."""
     name, data = _get_file_name(uri), read_bytes(uri, bounds.max_file_bytes, "unreadable_depth")
     try:
         values = np.load(io.BytesIO(data), allow_pickle=False)
@@ -73,11 +64,7 @@ def read_depth_array(uri: str, bounds: ObserveConfig) -> DepthImage:
 
 
 def read_recorded_camera(uri: str) -> tuple[Camera, float]:
-    """Read intrinsics with their picture size, and how far the depth may be bent.
-
-    Raises:
-        InputError: `bad_intrinsics`.
-    """
+    """Read intrinsics with their picture size, and the share by which the depth may be bent."""
     name = _get_file_name(uri)
     value = parse_json(read_bytes(uri, MAX_CAMERA_BYTES, "bad_intrinsics"), name, "bad_intrinsics")
     if not isinstance(value, dict):

@@ -12,35 +12,20 @@ from tableverse_factory.core.storage.untrusted import open_image, read_bytes
 from tableverse_factory.sources.image_file import decode_upright
 from tableverse_factory.stages.observe.depth.focal import read_exif_focal
 
-MAX_SIDE_PX = 2048
-"""Maximum longer side; larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest."""
-
+MAX_SIDE_PX = 2048  # larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest
 MAX_ASPECT = 8.0  # maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbImage(Frozen):
-    """A picture without depth, at most `MAX_SIDE_PX` on its longer side.
-
-    Attributes:
-        color: Shape (h, w, 3) sRGB.
-        exif_px: Focal length from EXIF, for `color` [px]; None if unknown.
-        scale: Size of `color` relative to that of the file.
-    """
+    """An upright picture, its focal length from EXIF [px] or None, and its size relative to the file's."""
 
     color: Picture
     exif_px: float | None
     scale: float
 
     def get_focal_px(self, configured: float | None) -> float:
-        """Return the focal length for `color` [px], from EXIF or else as configured.
-
-        Args:
-            configured: `observe.focal_px`, for the size of the file.
-
-        Raises:
-            InputError: `no_focal_length` if there is neither.
-        """
+        """Return the focal length for `color` [px], from EXIF or else as configured for the size of the file."""
         if self.exif_px is not None:
             return self.exif_px
         if configured is not None:
@@ -54,11 +39,7 @@ class RgbImage(Frozen):
 
 
 def read_rgb_image(uri: str, bounds: ObserveConfig) -> RgbImage:
-    """Read a picture's pixels and EXIF.
-
-    Raises:
-        InputError: `picture_too_narrow`, or as `image_file.decode_upright`.
-    """
+    """Read a picture's pixels and EXIF."""
     name = uri.rsplit("/", 1)[-1]
     data = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
     color = decode_upright(data, name, bounds)

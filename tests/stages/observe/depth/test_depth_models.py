@@ -48,7 +48,7 @@ def test_metres_of_the_metric_model_do_not_depend_on_how_far_it_shrank_the_pictu
     width, height, focal_px = 1000, 750, 800.0
     columns, rows = round(width * shrunk), round(height * shrunk)
     canonical = np.full((rows, columns), 2.0 * 300.0 / (focal_px * shrunk), np.float32)
-    found = scale_to_metres(canonical, None, None, focal_px, width, height)
+    found = scale_to_metres(canonical, None, None, focal_px, (height, width))
     np.testing.assert_allclose(found.depth, 2.0, rtol=1e-6)
     assert found.camera.fx == pytest.approx(focal_px * columns / width)
     assert (found.camera.width, found.camera.height) == (columns, rows)
