@@ -12,7 +12,7 @@ import pytest
 from tests.helpers.model_server import ModelServer, model_server
 from tests.helpers.paths import SHARED
 
-pytest_plugins = ["tests.helpers.browser_harness", "tests.helpers.marks_fixture", "tests.helpers.s3_fixtures"]
+pytest_plugins = ["tests.helpers.browser_harness", "tests.helpers.tiny_pipeline_fixtures", "tests.helpers.s3_fixtures"]
 
 # The same examples on every machine. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)

@@ -16,8 +16,8 @@ from rich.console import Console
 
 from tableverse_factory.cli import progress_bar as counter_module
 from tableverse_factory.cli.progress_bar import count_progress
+from tests.helpers.fake_build_display import STAGES
 from tests.helpers.paths import ROOT
-from tests.helpers.show_a_build import STAGES
 from workers.progress import console as progress_module
 from workers.progress.console import ProgressDisplay, choose_log_interval_s
 from workers.progress.tally import Tally

@@ -9,7 +9,7 @@ import urllib.request
 
 import pytest
 
-from tests.helpers.viewed_dataset import scene_of, write_viewed_dataset
+from tests.helpers.viewer_dataset import scene_of, write_viewed_dataset
 
 COMMAND = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()", "view"]
 

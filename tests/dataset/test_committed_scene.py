@@ -12,7 +12,7 @@ from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.committed_scene import ADDED_BY_COMMIT, load_exported_scene
 from tableverse_factory.dataset.shards import TarShard, check_exported, shard_path
-from tests.helpers.photographed import box_and_ball
+from tests.helpers.photographed_scene import box_and_ball
 
 
 @pytest.fixture(scope="module", params=["photographed", "layout"])

@@ -33,7 +33,7 @@ from tableverse_factory.physics.render.domain_randomization import (
 )
 from tableverse_factory.physics.render.views import RenderQuality, render_pictures
 from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture
-from tests.helpers.photographed import box_and_ball
+from tests.helpers.photographed_scene import box_and_ball
 
 BOX = b'<mujoco><worldbody><body name="table"><geom type="box" size="%s"/></body></worldbody></mujoco>'
 

@@ -1,4 +1,4 @@
-"""Helpers of the build tests: manifests for the tiny line, builds in processes of their own, trees as hashes."""
+"""Helpers of the build tests: manifests for the tiny pipeline, builds in processes of their own, trees as hashes."""
 
 import hashlib
 import os
@@ -47,7 +47,7 @@ def write_manifest(path: Path, names: list[str], root: str = "/data") -> Path:
 def request(manifest: Path, out: Path, **run: object) -> BuildRequest:
     config = Config(run=RunConfig(**{**QUICK, **run}))
     return BuildRequest(
-        manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tests.helpers.tiny_line:PIPELINES"
+        manifest, out, config, cache_dir=manifest.parent / "cache", pipeline="tests.helpers.tiny_pipeline:PIPELINES"
     )
 
 
@@ -56,9 +56,9 @@ def build(manifest: Path, out: Path, **run: object) -> BuildSummary:
 
 
 def compute(row: ImageRow, out: Path) -> SceneResult:
-    """The result of a scene that the tiny line gets done, computed in this process."""
+    """The result of a scene that the tiny pipeline gets done, computed in this process."""
     setup = SandboxSetup(
-        "tests.helpers.tiny_line:PIPELINES",
+        "tests.helpers.tiny_pipeline:PIPELINES",
         Config().model_dump_json(),
         str(out.parent / "cache"),
         1,

@@ -22,7 +22,7 @@ START_S = 120.0
 TINY = f"""#!{sys.executable}
 from functools import partial
 import workers.run
-workers.run.BuildRequest = partial(workers.run.BuildRequest, pipeline="tests.helpers.tiny_line:PIPELINES")
+workers.run.BuildRequest = partial(workers.run.BuildRequest, pipeline="tests.helpers.tiny_pipeline:PIPELINES")
 from tableverse_factory.cli.main import main
 main()
 """
@@ -39,14 +39,14 @@ class Head:
 
 
 def write_seen_manifest(path: Path, names: list[str]) -> Path:
-    """A manifest for the tiny line whose inputs are there: a cluster refuses one whose inputs it cannot see."""
+    """A manifest for the tiny pipeline whose inputs are there: a cluster refuses one whose inputs it cannot see."""
     for i in range(len(names)):
         (path.parent / "in" / str(i)).mkdir(parents=True)
     return write_manifest(path, names, str(path.parent / "in"))
 
 
 def tiny_tableverse(folder: Path) -> Path:
-    """A folder with a command `tableverse` that runs the tiny line; all else of the command line is the real one."""
+    """A folder with a command `tableverse` that runs the tiny pipeline; the rest of the command line is real."""
     folder.mkdir(exist_ok=True)
     (folder / "tableverse").write_text(TINY)
     (folder / "tableverse").chmod(0o700)

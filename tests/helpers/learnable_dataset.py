@@ -24,7 +24,7 @@ from tableverse_factory.robotics.execution.goal import load_goal
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tableverse_factory.stages.export.export import export
-from tests.helpers.picking import BASE, BLOCK, REFERENCE, STEP_S, pick_and_place
+from tests.helpers.pick_recording import BASE, BLOCK, REFERENCE, STEP_S, pick_and_place
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
 LABELS = ("wooden block", "bowl", "tea box")

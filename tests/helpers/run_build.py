@@ -1,4 +1,4 @@
-"""A build of the tiny line, or of another, in a process of its own, so that tests can stop and kill it."""
+"""A build of the tiny pipeline, or of another, in a process of its own, so that tests can stop and kill it."""
 
 import os
 import sys
@@ -22,7 +22,7 @@ def main() -> None:
         cache_dir=Path(manifest).parent / "cache",
         executor="ray" if executor == "ray" else "local",
         workers=int(workers) if executor == "ray" else None,
-        pipeline=os.environ.get("PIPELINES_OF_TEST", "tests.helpers.tiny_line:PIPELINES"),
+        pipeline=os.environ.get("PIPELINES_OF_TEST", "tests.helpers.tiny_pipeline:PIPELINES"),
     )
     with ProgressDisplay(Console(stderr=True)) as progress:
         summary = run_build(request, progress, StopSignals())

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.heavy
 @pytest.fixture
 def tiny(monkeypatch, tmp_path):
     """A manifest for the tiny pipeline, which takes the place of the usual one."""
-    monkeypatch.setattr("workers.api.PIPELINE", "tests.helpers.tiny_line:PIPELINES")
+    monkeypatch.setattr("workers.api.PIPELINE", "tests.helpers.tiny_pipeline:PIPELINES")
     monkeypatch.setenv("TABLEVERSE_CACHE", str(tmp_path / "cache"))
     return write_manifest(tmp_path / "m.parquet", ["fine", "empty", "sad", "fine"])
 

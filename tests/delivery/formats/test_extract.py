@@ -17,7 +17,7 @@ from tableverse_factory.evaluation.methods.sources import find_scenes
 from tableverse_factory.evaluation.scene_audit import audit_scene
 from tableverse_factory.geometry.math.transforms import pose_from_matrix, rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import place_mesh
-from tests.helpers.exported import HOSTILE, exported
+from tests.helpers.exported_scenes import HOSTILE, exported
 
 TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 

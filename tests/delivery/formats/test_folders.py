@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from tableverse_factory.cli.main import app
 from tableverse_factory.delivery.formats.extract import extract_scene
 from tableverse_factory.delivery.formats.folders import find_scene_file, list_scene_folders
-from tests.helpers.exported import exported
+from tests.helpers.exported_scenes import exported
 
 CUBE = (
     '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body name="cube" pos="0 0 {z}"><freejoint/>'

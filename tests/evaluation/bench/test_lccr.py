@@ -30,7 +30,7 @@ from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 from tableverse_factory.physics.render.views import RenderQuality
 from tableverse_factory.sources.synthetic import vessels
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
-from tests.helpers.layouts import box
+from tests.helpers.convex_layouts import box
 
 Boxes = dict[str, tuple[float, float, float]]
 

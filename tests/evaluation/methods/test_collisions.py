@@ -14,7 +14,7 @@ from tableverse_factory.cli.main import app
 from tableverse_factory.evaluation.bench.lccr import bench_lccr
 from tableverse_factory.evaluation.methods.collisions import compute_wilson_interval, measure_method
 from tableverse_factory.evaluation.methods.sources import find_scenes
-from tests.helpers.planted import DEPTHS_MM, INNER, ORDER, WRITERS, glb_scene, write_glbs, write_layouts
+from tests.helpers.known_penetrations import DEPTHS_MM, INNER, ORDER, WRITERS, glb_scene, write_glbs, write_layouts
 
 
 @pytest.mark.parametrize("kind", WRITERS)

@@ -29,7 +29,7 @@ from tableverse_factory.evaluation.methods.sources import find_scenes
 from tableverse_factory.evaluation.methods.vlm_vote import Marks, Vote, make_questions
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
-from tests.helpers.planted import write_glbs
+from tests.helpers.known_penetrations import write_glbs
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
 
 pytestmark = pytest.mark.heavy

@@ -61,7 +61,7 @@ def asking(server, tmp_path, monkeypatch):
             tmp_path / out,
             config,
             tmp_path / "cache",
-            pipeline="tests.helpers.asking_line:PIPELINES",
+            pipeline="tests.helpers.model_query_pipeline:PIPELINES",
             limits=limits,
         )
 
@@ -144,7 +144,7 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
 @pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", 3)])
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
     request = replace(
-        asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.dying_line:PIPELINES"
+        asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.crashing_pipeline:PIPELINES"
     )
     assert run_build(request, Silent()).over_budget is None
     assert sum_costs(request.out).calls == calls

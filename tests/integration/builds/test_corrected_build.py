@@ -24,7 +24,7 @@ def test_a_model_that_is_not_there_is_corrected_with_from(tmp_path):
             tmp_path / "out",
             asking(server.url, "wrong"),
             tmp_path / "cache",
-            pipeline="tests.helpers.asking_line:PIPELINES",
+            pipeline="tests.helpers.model_query_pipeline:PIPELINES",
         )
         with pytest.raises(BuildError, match=r"run the same command to go on; .* correct it and add --from perceive$"):
             run_build(wrong, Silent())

@@ -25,7 +25,7 @@ def log(tmp_path, monkeypatch):
     """What mesh processes were asked, each with the process's id."""
     path = tmp_path / "log"
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("PIPELINES_OF_TEST", "tests.helpers.mesh_line:PIPELINES")
+    monkeypatch.setenv("PIPELINES_OF_TEST", "tests.helpers.mesh_pipeline:PIPELINES")
     return lambda: [line.rsplit(" ", 1) for line in path.read_text().splitlines()] if path.exists() else []
 
 

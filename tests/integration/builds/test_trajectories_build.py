@@ -36,12 +36,12 @@ _SETS = [w for key, value in PATIENT.items() for w in ("--set", f"run.{key}={val
 
 def short(folder: Path, out: str, **changes: object) -> BuildRequest:
     return replace(
-        request(folder / "m.parquet", folder / out, **PATIENT), pipeline="tests.helpers.longer_line:SHORT", **changes
+        request(folder / "m.parquet", folder / out, **PATIENT), pipeline="tests.helpers.long_pipeline:SHORT", **changes
     )
 
 
 def long(folder: Path, out: str, **changes: object) -> BuildRequest:
-    return replace(short(folder, out), pipeline="tests.helpers.longer_line:LONG", **changes)
+    return replace(short(folder, out), pipeline="tests.helpers.long_pipeline:LONG", **changes)
 
 
 def afterwards(folder: Path, out: str, *overrides: str, **changes: object) -> BuildRequest:
@@ -258,7 +258,7 @@ def test_rows_and_files_of_a_scene(made):
     assert not second.success
     assert scene.files()["trajectories/task_000.npz"] == first._data
     with pytest.raises(InputError, match="no arrays of tableverse-trajectory-1"):
-        first.recording()  # the tiny line writes noise
+        first.recording()  # the tiny pipeline writes noise
     with pytest.raises(InputError, match="task_001 has no motion: no_grasp"):
         scene.trajectory("task_001").recording()
     with pytest.raises(InputError, match="no trajectory of 'task_009'; tried were: task_000, task_001"):

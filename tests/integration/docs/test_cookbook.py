@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import tableverse_factory
-from tests.helpers.documented import Block, blocks
+from tests.helpers.docs_pages import Block, blocks
 from tests.helpers.learnable_dataset import write_learnable_dataset
 from tests.helpers.paths import ROOT
 

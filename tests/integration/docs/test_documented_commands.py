@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from tests.helpers.command_lines import check_command, check_mention
-from tests.helpers.documented import PAGES, SHELL, Block, Command, blocks, commands, mentioned
+from tests.helpers.docs_pages import PAGES, SHELL, Block, Command, blocks, commands, mentioned
+from tests.helpers.docs_workspace import Room, prepare
 from tests.helpers.paths import ROOT
-from tests.helpers.reading_room import Room, prepare
 
 CANNOT = (
     (r"make |git |pip |source ", "sets up the environment that this test runs in"),

@@ -12,7 +12,7 @@ from pathlib import Path
 import griffe
 import pytest
 
-from tests.helpers.documented import PAGES
+from tests.helpers.docs_pages import PAGES
 from tests.helpers.loopback import serving
 from tests.helpers.paths import ROOT
 

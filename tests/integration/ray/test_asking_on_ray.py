@@ -46,7 +46,7 @@ def test_several_actors_keep_to_one_budget_and_one_pace(server, tmp_path, monkey
         executor="ray",
         workers=2,
         limits=SpendingLimits(calls=7),
-        pipeline="tests.helpers.asking_line:PIPELINES",
+        pipeline="tests.helpers.model_query_pipeline:PIPELINES",
     )
     summary = run_build(request, Silent())
     assert len(server.asked) == summary.over_budget.calls == 7

@@ -41,7 +41,7 @@ def test_two_models_share_a_gpu_and_one_actor_dies(tmp_path, monkeypatch):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine"] * 120)
     asked = replace(
         request(manifest, tmp_path / "whole", deadline_s=120.0, memory_mb=16_000),
-        pipeline="tests.helpers.gpu_line:PIPELINES",
+        pipeline="tests.helpers.gpu_pipeline:PIPELINES",
         executor="ray",
         pools=HALVES,
     )

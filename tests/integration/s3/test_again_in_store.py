@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from tableverse_factory.core.storage.files import list_names
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
-from tests.helpers.store_bytes import digests_in
+from tests.helpers.store_contents import digests_in
 from workers.plan.rerun import MARKER
 from workers.run import run_build
 from workers.state.checkpoint_store import CHECKPOINTS

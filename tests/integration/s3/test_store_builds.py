@@ -23,7 +23,7 @@ from tests.helpers.builds import (
     wait_until,
     write_manifest,
 )
-from tests.helpers.store_bytes import digests_in
+from tests.helpers.store_contents import digests_in
 from workers.plan.invalidate import reopen_scenes
 from workers.plan.read_manifest import read_manifest
 from workers.progress.build_state import read_build_state

@@ -105,7 +105,7 @@ def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(stor
     proxy.fault = lambda method, path: "denied"
     records = str(tmp_path / "records")
     setup = SandboxSetup(
-        "tests.helpers.tiny_line:PIPELINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records
+        "tests.helpers.tiny_pipeline:PIPELINES", Config().model_dump_json(), str(tmp_path), 1, 2000, records
     )
     executor = RayExecutor(setup, Pools(), ClusterSpec(None, 1, [], tmp_path))
     try:

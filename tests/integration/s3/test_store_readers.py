@@ -15,7 +15,7 @@ from tableverse_factory.sources.manifest import make_manifest
 from tests.helpers.builds import Silent, digests, request, write_manifest
 from tests.helpers.captures_on_disk import write_capture, write_layout, write_picture
 from tests.helpers.small_dataset import scene_files, write_small_dataset
-from tests.helpers.store_bytes import digests_in
+from tests.helpers.store_contents import digests_in
 from workers.run import run_build
 
 

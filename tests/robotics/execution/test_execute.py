@@ -23,7 +23,7 @@ from tableverse_factory.robotics.execution.rollout import Rollout, build_command
 from tableverse_factory.robotics.robots.panda import GRIP_FORCE_N
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
-from tests.helpers.picking import (
+from tests.helpers.pick_recording import (
     BASE,
     BESIDE,
     BLOCK,

@@ -26,7 +26,7 @@ from tableverse_factory.robotics.execution.replay import (
 )
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
-from tests.helpers.picking import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scene_files, station
+from tests.helpers.pick_recording import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scene_files, station
 
 pytestmark = pytest.mark.heavy
 

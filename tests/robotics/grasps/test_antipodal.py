@@ -10,7 +10,7 @@ from tableverse_factory.geometry.mesh.meshes import from_trimesh, read_mesh
 from tableverse_factory.geometry.relations.antipodal import FRICTION, sample_inward_normals
 from tableverse_factory.robotics.grasps.antipodal import OPENING_MARGIN_M, sample_antipodal_grasps
 from tableverse_factory.robotics.grasps.clearance import find_clear_grasps
-from tests.helpers.bodies import box, cup, middle, standing
+from tests.helpers.simple_bodies import box, cup, middle, standing
 
 CONFIG = TrajectoriesConfig()
 

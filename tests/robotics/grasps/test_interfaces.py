@@ -8,8 +8,8 @@ from schemas.geometry import Pose
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.mjcf.scene_objects import SceneObject, make_scene_object
 from tableverse_factory.robotics.grasps.interfaces import GRASP_MODELS, propose_grasps
-from tests.helpers.bodies import box, middle
 from tests.helpers.model_server import Scripted
+from tests.helpers.simple_bodies import box, middle
 
 CONFIG = TrajectoriesConfig()
 

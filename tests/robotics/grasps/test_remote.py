@@ -17,9 +17,9 @@ from tableverse_factory.models.remote.endpoint import MAX_BODY_BYTES
 from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.grasps.closing import close_grasps
 from tableverse_factory.robotics.grasps.remote import COUNT, FORMAT, MAX_COUNT, POINTS, request_grasps
-from tests.helpers.bodies import box
 from tests.helpers.model_server import Scripted
 from tests.helpers.paths import ROOT
+from tests.helpers.simple_bodies import box
 
 BODY = place_mesh(box(0.05, 0.03, 0.12), Pose(np.array([0.2, -0.1, 0.0]), quaternion_about_z(0.4)))
 DEPTH_M = 0.1034

@@ -23,8 +23,8 @@ from tableverse_factory.robotics.motion.interfaces import PLANNERS
 from tableverse_factory.robotics.motion.obstacles import build_obstacle, list_obstacles, merge_object_pieces
 from tableverse_factory.robotics.motion.world import CollisionWorld
 from tableverse_factory.robotics.robots.station import Station
-from tests.helpers.cells import BLOCK, HOME, block, down, station_of
 from tests.helpers.simple_scenes import Solid, box
+from tests.helpers.work_cells import BLOCK, HOME, block, down, station_of
 
 TURNED = (0.9, 0.1, -0.3, 0.2)
 

@@ -15,7 +15,7 @@ from tableverse_factory.robotics.motion.kinematics import (
     follow_poses,
     solve_ik,
 )
-from tests.helpers.cells import HOME, alone, down
+from tests.helpers.work_cells import HOME, alone, down
 
 SEEDS = st.integers(0, 2**32 - 1)
 

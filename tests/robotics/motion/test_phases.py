@@ -15,7 +15,8 @@ from tableverse_factory.robotics.motion.rrt import RrtConnect
 from tableverse_factory.robotics.motion.segments import PathSegment, time_segments
 from tableverse_factory.robotics.motion.validate import validate_motion
 from tableverse_factory.robotics.motion.world import CollisionWorld
-from tests.helpers.cells import (
+from tests.helpers.simple_scenes import Solid, box
+from tests.helpers.work_cells import (
     BLOCK,
     CONFIG,
     GRASP_M,
@@ -30,7 +31,6 @@ from tests.helpers.cells import (
     open_box,
     station_of,
 )
-from tests.helpers.simple_scenes import Solid, box
 
 PHASES = list(Phase)
 GRASP = down(0.0, 0.0, GRASP_M)

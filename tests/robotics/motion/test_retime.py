@@ -12,8 +12,8 @@ from tableverse_factory.robotics.motion.dynamics import ArmDynamics, CarriedObje
 from tableverse_factory.robotics.motion.retime import TORQUE_SHARE, retime_curve
 from tableverse_factory.robotics.motion.segments import blend_path
 from tableverse_factory.robotics.robots.panda import build_panda
-from tests.helpers.cells import BLOCK, HOME, alone, down, held_pose, station_of
 from tests.helpers.simple_scenes import Solid, box
+from tests.helpers.work_cells import BLOCK, HOME, alone, down, held_pose, station_of
 
 SPEED, STEP_S = 0.5, 0.02
 

@@ -8,8 +8,8 @@ import pytest
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.rrt import EDGE_STEP_RAD, RrtConnect, shorten_path
 from tableverse_factory.robotics.motion.world import CollisionWorld
-from tests.helpers.cells import BLOCK, HOME, clutter, deepest, down, object_geoms, station_of
 from tests.helpers.simple_scenes import Solid, box
+from tests.helpers.work_cells import BLOCK, HOME, clutter, deepest, down, object_geoms, station_of
 
 MARGIN_M = 0.005
 

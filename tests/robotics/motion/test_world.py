@@ -9,7 +9,8 @@ from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.pick_place import PickPlace
 from tableverse_factory.robotics.motion.world import CollisionWorld, _order_coarse_to_fine
-from tests.helpers.cells import (
+from tests.helpers.simple_scenes import Solid, box
+from tests.helpers.work_cells import (
     BLOCK,
     GRASP_M,
     HOME,
@@ -23,7 +24,6 @@ from tests.helpers.cells import (
     object_geoms,
     station_of,
 )
-from tests.helpers.simple_scenes import Solid, box
 
 
 def near_the_table(count: int) -> np.ndarray:

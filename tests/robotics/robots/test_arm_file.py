@@ -16,7 +16,7 @@ from tableverse_factory.robotics.robots.panda import build_panda
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.blocks_on_table import WIDE_TABLE, Mover, block_files
-from tests.helpers.six_axes import HOME, six_axes
+from tests.helpers.six_axis_arm import HOME, six_axes
 
 BLOCKS = [((0.03, 0.03, 0.05), (0.0, 0.0))]
 

@@ -14,7 +14,7 @@ from tableverse_factory.geometry.relations.antipodal import sample_inward_normal
 from tableverse_factory.robotics.grasps.antipodal import sample_antipodal_grasps
 from tableverse_factory.robotics.grasps.clearance import TABLE_CLEARANCE_M, find_clear_grasps
 from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, compute_approach_openings
-from tests.helpers.bodies import box, cup, middle, standing
+from tests.helpers.simple_bodies import box, cup, middle, standing
 
 FAR = np.array([[10.0, 10.0, 10.0]])
 """Points of a body that is not there."""

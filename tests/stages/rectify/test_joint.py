@@ -31,7 +31,7 @@ from tableverse_factory.stages.rectify.quarter_turn_symmetry import count_quarte
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import read_support
-from tests.helpers.layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
+from tests.helpers.convex_layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
 CONFIG = RectifyConfig(method="joint")
 LAWS = settings(max_examples=15, deadline=None)

@@ -12,7 +12,7 @@ from schemas.objects import PlacedObject
 from tableverse_factory.stages.rectify.joint import rectify_jointly
 from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_lccr
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
-from tests.helpers.layouts import (
+from tests.helpers.convex_layouts import (
     FAULTLESS,
     MILLIMETRES,
     ball,

@@ -15,7 +15,7 @@ from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_
 from tableverse_factory.stages.rectify.radial import compute_azimuths, list_members, order_radially, spread_groups
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_center
 from tableverse_factory.stages.rectify.vertical import disentangle
-from tests.helpers.layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
+from tests.helpers.convex_layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig()
 LAWS = settings(max_examples=40, deadline=None)

@@ -19,7 +19,7 @@ from tableverse_factory.geometry.collision.penetration import measure_mesh_penet
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.rectify.rectify import rectify
-from tests.helpers.layouts import ball, box, placed
+from tests.helpers.convex_layouts import ball, box, placed
 
 TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
 LINE = TriangleMesh(np.diag([0.1, 0.0, 0.0]), np.array([[0, 1, 2]], dtype=np.int32))

@@ -17,7 +17,7 @@ from tableverse_factory.stages.rectify import relaxation
 from tableverse_factory.stages.rectify.joint import order_upward, rectify_jointly
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.support import SupportRelation
-from tests.helpers.layouts import box, offsets, part, placed, smallest_gap
+from tests.helpers.convex_layouts import box, offsets, part, placed, smallest_gap
 
 CONFIG = RectifyConfig(method="joint")
 

@@ -5,7 +5,7 @@ import pytest
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.viz.viewer.scene_cache import SceneCache
 from tableverse_factory.viz.viewer.server import Viewer
-from tests.helpers.viewed_dataset import write_viewed_dataset
+from tests.helpers.viewer_dataset import write_viewed_dataset
 
 
 @pytest.fixture(scope="module")

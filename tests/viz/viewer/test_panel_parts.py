@@ -23,7 +23,7 @@ from tableverse_factory.viz.viewer.scene_cache import MAX_SCENES, SceneCache
 from tableverse_factory.viz.viewer.scene_index import SceneIndex
 from tableverse_factory.viz.viewer.simulation import Simulation
 from tests.helpers.recorded_dataset import CAMERA, EYE, X_ID, Y_ID, recording
-from tests.helpers.viewed_dataset import ABOVE_M, ASIDE_M, HOSTILE, many_scenes, members, opened, scene_of
+from tests.helpers.viewer_dataset import ABOVE_M, ASIDE_M, HOSTILE, many_scenes, members, opened, scene_of
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.viz.viewer.scene_cache import SceneCache
 from tableverse_factory.viz.viewer.server import Viewer
 from tableverse_factory.viz.viewer.session import Session
-from tests.helpers.viewed_dataset import write_viewed_dataset
 from tests.helpers.viewer_client import Looker, until
+from tests.helpers.viewer_dataset import write_viewed_dataset
 
 pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 

@@ -11,7 +11,7 @@ import pytest
 from schemas.config import Config, ExportConfig, RectifyConfig, RunConfig, SettleConfig
 from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.dataset.shard_plan import check_shards, parse_shards
-from tests.helpers import tiny_line
+from tests.helpers import tiny_pipeline
 from tests.helpers.builds import (
     QUICK,
     Silent,
@@ -156,7 +156,7 @@ def test_a_limit_and_a_choice_of_shards_leave_the_rest_for_later(built, tmp_path
 
 def test_a_stage_is_found_by_its_own_name_and_by_its_section():
     for name in ("rectify", "cut"):
-        assert find_restart_points(tiny_line.PIPELINES, {"layout"}, name) == {"layout": 1}
+        assert find_restart_points(tiny_pipeline.PIPELINES, {"layout"}, name) == {"layout": 1}
 
 
 def test_a_list_of_shards():

@@ -14,7 +14,7 @@ from tests.helpers.terminal import PLAIN, ROOT, watch
 
 pytestmark = pytest.mark.heavy
 
-PRETEND = [sys.executable, str(HELPERS / "show_a_build.py")]
+PRETEND = [sys.executable, str(HELPERS / "fake_build_display.py")]
 TABLEVERSE = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 
 

@@ -35,7 +35,7 @@ def sandbox(tmp_path):
 
 def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
     given = {
-        "pipeline": "tests.helpers.tiny_line:PIPELINES",
+        "pipeline": "tests.helpers.tiny_pipeline:PIPELINES",
         "config_json": Config().model_dump_json(),
         "cache_dir": str(tmp_path),
         "attempts": 2,
@@ -53,7 +53,7 @@ def _run_line(sandbox: Sandbox, name: str):
 
 
 def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> StageChain:
-    """These stages of the tiny line on scene `a`; what they give is kept."""
+    """These stages of the tiny pipeline on scene `a`; what they give is kept."""
     calls = tuple(StageCall("a", "capture", position, deadline_s) for position in positions)
     return StageChain(calls, "", tuple(f"shard-00000/a.{position}.0" for position in positions))
 
@@ -193,7 +193,7 @@ def test_the_trace_of_a_crash_is_found_behind_whatever_was_printed_before(sandbo
     assert isinstance(report.outcome, Failed)
     assert report.outcome.error_kind == "crash"
     assert report.trace.startswith("Fatal Python error: Segmentation fault")
-    assert "tiny_line" in report.trace
+    assert "tiny_pipeline" in report.trace
 
 
 def test_a_crash_in_the_middle_repeats_that_stage_alone(sandbox, tmp_path, monkeypatch):

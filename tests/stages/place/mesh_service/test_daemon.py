@@ -21,7 +21,7 @@ from tableverse_factory.models.local.wire import send_arrays
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.client import MeshClient
 from tableverse_factory.stages.place.mesh_service.daemon import MeshDaemon, decode_json, encode_json
-from tests.helpers.mesh_asker import hashes
+from tests.helpers.mesh_client import hashes
 from tests.helpers.mesh_daemons import daemons_inside
 from tests.helpers.paths import HELPERS, ROOT
 
@@ -56,7 +56,7 @@ class Worker:
     """A process of its own that asks when it is told to."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        line = [sys.executable, str(HELPERS / "mesh_asker.py"), json.dumps(command_of(folder, "gate"))]
+        line = [sys.executable, str(HELPERS / "mesh_client.py"), json.dumps(command_of(folder, "gate"))]
         paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
         self.process = subprocess.Popen(
             [*line, str(folder / "cache"), name],

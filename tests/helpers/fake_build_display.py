@@ -1,0 +1,38 @@
+"""A build that only pretends, for the tests of the display: a second of counting, then the end that was asked for."""
+
+import sys
+import time
+
+from rich.console import Console
+
+from workers.progress.console import ProgressDisplay
+from workers.progress.tally import Actors, Tally
+
+STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "curate", "export")
+
+
+def main() -> None:
+    wait_s, end = float(sys.argv[1]), sys.argv[2]
+    tally = Tally(STAGES, total=400, before=0, shards=4)
+    with ProgressDisplay(Console(stderr=True)) as progress:
+        progress.note("starting Ray on this machine …")
+        time.sleep(wait_s)
+        tally.actors = {"perception": Actors(1, 2), "physics": Actors(2, 2)}
+        tally.running["observe"] = 2
+        for step in range(200):
+            for stage in STAGES[1:]:
+                tally.record_call(stage, 0.02, 0.05)
+                tally.passed[stage] += stage != "export"
+            tally.ended["export", "done"] += 1
+            tally.ended["settle", "dropped"] += step % 10 == 0
+            if step % 5 == 0:
+                progress.note(f"scene_{step}: settle failed: \x1b[31mTypeError: {'x' * 300}")
+            progress.show(tally)
+            if step == 150 and end == "error":
+                raise ValueError("the disk is full")
+            time.sleep(0.005)
+    sys.stdout.write("out\n")
+
+
+if __name__ == "__main__":
+    main()
