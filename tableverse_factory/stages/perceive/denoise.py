@@ -15,15 +15,12 @@ MIN_IN_RADIUS = 6
 def find_inlier_points(points: Points) -> Bool[np.ndarray, " n"]:
     """Find points whose mean distance to their neighbours is usual and whose surroundings are not empty.
 
-    The radius that must hold `MIN_IN_RADIUS` others follows the density of the points, so that near and far objects
-    are treated alike.
+    The radius that must hold `MIN_IN_RADIUS` others follows the points' density: near and far objects count alike.
     """
-    keep = np.zeros(len(points), dtype=bool)
     if len(points) <= NEIGHBOURS:
-        return keep
+        return np.zeros(len(points), dtype=bool)
     distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
     mean = distances[:, 1:].mean(axis=1)
     usual = mean <= mean.mean() + DEVIATIONS * mean.std()
     crowd = distances[:, MIN_IN_RADIUS]
-    crowded = crowd <= max(RADIUS_OF_MEDIAN * float(np.median(crowd)), 1e-6)
-    return usual & crowded
+    return usual & (crowd <= max(RADIUS_OF_MEDIAN * float(np.median(crowd)), 1e-6))

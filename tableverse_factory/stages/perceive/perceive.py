@@ -11,7 +11,7 @@ from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, BoxPrompts, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.denoise import find_inlier_points
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
@@ -28,24 +28,21 @@ MAX_POINTS = 12_000
 
 
 def perceive(
-    item: Observation,
-    config: Config,
-    rng: np.random.Generator,
-    services: Services,
+    item: Observation, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[PerceivedObjects]:
     """Find the table and the objects on it; their points are denoised, in the camera frame."""
     view = find_table(item, rng)
     if isinstance(view, Dropped):
         return view
     name = choose_detector(item, config.perceive)
-    found = DETECTORS[name](view, config.perceive, rng, services)
+    found = DETECTORS[name](view, config.perceive, services)
     if isinstance(found, Dropped):
         return found
     if found.table_box is not None:
         view = refit_table_to_box(view, found.table_box, rng)
     candidates, ids = found.candidates, found.ids
     if ids is None:
-        ids = segment_boxes(view, found, config, rng, services)
+        ids = segment_boxes(view, found, config)
         candidates = tuple(replace(candidate, instance=k) for k, candidate in enumerate(candidates, start=1))
         view = refit_table_to_mask(view, ids == TABLE_ID, rng)
     objects, left_out = _build_objects(view, candidates, ids, config.perceive)
@@ -69,28 +66,17 @@ def choose_detector(item: Observation, config: PerceiveConfig) -> str:
     return "geometric" if item.recorded_detections is None else "replay"
 
 
-def segment_boxes(
-    view: TableView, found: DetectionResult, config: Config, rng: np.random.Generator, services: Services
-) -> IdImage:
-    """Segment the detector's boxes with the configured segmenter; the k-th has the id `k + 1`.
-
-    Raises:
-        ModelError: if the segmenter is out of reach.
-    """
+def segment_boxes(view: TableView, found: DetectionResult, config: Config) -> IdImage:
+    """Segment the detector's boxes with the configured segmenter; the k-th has the id `k + 1`."""
     if not found.candidates:
         return np.zeros(view.valid.shape, dtype=np.int32)
-    holders = tuple(candidate.container for candidate in found.candidates)
-    boxes = BoxPrompts(tuple(candidate.box for candidate in found.candidates), holders, found.table_box)
-    return BOX_SEGMENTERS[config.perceive.segmenter](view, boxes, config, rng, services)
+    return BOX_SEGMENTERS[config.perceive.segmenter](view, found, config)
 
 
 def _build_objects(
     view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, config: PerceiveConfig
 ) -> tuple[tuple[PerceivedObject, ...], tuple[tuple[str, str], ...]]:
-    """Build the objects with enough clean points, in the detector's order, and the reasons against the others.
-
-    Object ids count all candidates from 0, instance ids from 1.
-    """
+    """Build the objects with enough clean points, and the reasons against the others; ids count all candidates."""
     kept: dict[int, PerceivedObject] = {}
     left_out: list[tuple[str, str]] = []
     for index, candidate in enumerate(candidates):

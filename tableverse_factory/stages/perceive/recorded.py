@@ -9,11 +9,7 @@ from tableverse_factory.stages.perceive.vlm.prompt import choose_box_order, hash
 
 
 def record_detector(config: Config, _before: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Record the prompt of a detector that asks a model, or the weights of a learned one.
-
-    Raises:
-        ConfigError: if the weights are missing.
-    """
+    """Record the prompt of a detector that asks a model, or the weights of a learned one."""
     if config.perceive.protocol:
         return {"prompt_sha256": hash_detection_prompt(choose_box_order(config.perceive))}
     if config.perceive.detector == "learned":

@@ -1,10 +1,12 @@
 """Tables of detectors and box segmenters by the names in `perceive.detector` and `perceive.segmenter`."""
 
+from functools import partial
+
 from tableverse_factory.stages.perceive.base.interfaces import BoxSegmenter, Detector
 from tableverse_factory.stages.perceive.base.replay import replay_detections
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth, segment_boxes_from_depth
 from tableverse_factory.stages.perceive.learned.detector import detect_with_network
-from tableverse_factory.stages.perceive.sam.segmenter import make_sam_segmenter
+from tableverse_factory.stages.perceive.sam.segmenter import segment_with_sam
 from tableverse_factory.stages.perceive.vlm.detector import detect_with_vlm
 
 DETECTORS: dict[str, Detector] = {
@@ -16,6 +18,6 @@ DETECTORS: dict[str, Detector] = {
 }
 BOX_SEGMENTERS: dict[str, BoxSegmenter] = {
     "geometric": segment_boxes_from_depth,
-    "sam2": make_sam_segmenter("sam2"),
-    "sam3": make_sam_segmenter("sam3"),
+    "sam2": partial(segment_with_sam, "sam2"),
+    "sam3": partial(segment_with_sam, "sam3"),
 }

@@ -37,8 +37,7 @@ LOWEST_TABLE_OVER_FLOOR_M = 0.25
 MIN_RAISED_AREA_M2 = 0.08
 PARALLEL_COS = 0.996
 BENT_PARALLEL_COS = 0.98
-BENDS = 2.0
-"""Tolerance of the fit to a plane, in bends of a depth model."""
+BENDS = 2.0  # tolerance of the fit to a plane, in bends of a depth model
 DEGREE, BENT_DEGREE = 2, 4
 RAISED_BENDS = 0.75
 MIN_SOLIDITY = 0.3
@@ -75,28 +74,16 @@ class _PlaneCandidate:
 def find_table(
     observation: Observation, rng: np.random.Generator, table_top: Mask | None = None
 ) -> TableView | Dropped:
-    """Find the table plane of a picture, or the reason why there is none.
-
-    Args:
-        observation: The picture with its depth.
-        rng: Generator of the planes tried.
-        table_top: Pixels among which to look for the plane; None for all.
-    """
+    """Find the table plane among the pixels `table_top`, None for all, or the reason why there is none."""
     depth = fill_depth_gaps(observation.depth)
     points, valid = backproject(depth, observation.camera), depth > 0
     index = _sample_grid(valid if table_top is None else valid & table_top)
     sample = points[index]
     tolerance = np.maximum(0.006, 2.5 * compute_depth_noise(depth[index]))
-    refused: list[str] = []
-    candidates: list[_PlaneCandidate] = []
-    least = int(MIN_PLANE_SHARE * len(sample))
-    for plane, inliers in find_dominant_planes(sample, tolerance, rng, MAX_PLANES, least):
-        candidate = _rate_plane(plane.facing(np.zeros(3)), sample, inliers)
-        reason = _explain_rejection(candidate)
-        if reason:
-            refused.append(reason)
-        else:
-            candidates.append(candidate)
+    planes = find_dominant_planes(sample, tolerance, rng, MAX_PLANES, int(MIN_PLANE_SHARE * len(sample)))
+    rated = [_rate_plane(plane.facing(np.zeros(3)), sample, inliers) for plane, inliers in planes]
+    refused = [_explain_rejection(candidate) for candidate in rated]
+    candidates = [candidate for candidate, reason in zip(rated, refused, strict=True) if not reason]
     if not candidates:
         why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
         return Dropped("no_table_plane", why)
@@ -128,13 +115,9 @@ def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator)
     if share >= MIN_BOX_SHARE or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
         return view
     found = find_table(view.observation, rng, inside)
-    if (
-        isinstance(found, Dropped)
-        or found.plane.offset <= view.plane.offset
-        or _measure_table_share(found, inside) <= share
-    ):
+    if isinstance(found, Dropped) or found.plane.offset <= view.plane.offset:
         return view
-    return found
+    return found if _measure_table_share(found, inside) > share else view
 
 
 def _measure_table_share(view: TableView, inside: Mask) -> float:
@@ -188,13 +171,11 @@ def _find_main_region(xy: Points2) -> tuple[Points2, float]:
 
 
 def _explain_rejection(candidate: _PlaneCandidate) -> str:
-    nx, ny, nz = candidate.plane.normal
+    (nx, ny, nz), share = candidate.plane.normal, candidate.share
     if ny > MAX_DOWNWARD or abs(nx) > MAX_SIDEWAYS:
-        return (
-            f"plane of {candidate.share:.0%} faces ({nx:.2f}, {ny:.2f}, {nz:.2f}) in the camera frame: a wall or side"
-        )
+        return f"plane of {share:.0%} faces ({nx:.2f}, {ny:.2f}, {nz:.2f}) in the camera frame: a wall or side"
     if candidate.area_m2 < MIN_PLANE_AREA_M2:
-        return f"plane of {candidate.share:.0%} covers {candidate.area_m2:.4f} m², under {MIN_PLANE_AREA_M2} m²"
+        return f"plane of {share:.0%} covers {candidate.area_m2:.4f} m², under {MIN_PLANE_AREA_M2} m²"
     return ""
 
 
@@ -226,12 +207,10 @@ def _build_view(
     xy = points @ axes[:2].T
     flat = valid & (np.abs(heights) <= tolerance)
     wide = _remove_strips(flat, float(np.median(tolerance[flat] / points[flat, 2])) * observation.camera.fx)
-    if int(wide.sum()) < MIN_WIDE_SHARE * int(flat.sum()):
-        return Dropped(
-            "no_table_plane", f"of {int(flat.sum())} readings in one plane only {int(wide.sum())} lie together"
-        )
-    thinned = xy[wide][:: max(1, int(wide.sum()) // 20000)]
-    kept, _ = _find_main_region(thinned)
+    n_flat, n_wide = int(flat.sum()), int(wide.sum())
+    if n_wide < MIN_WIDE_SHARE * n_flat:
+        return Dropped("no_table_plane", f"of {n_flat} readings in one plane only {n_wide} lie together")
+    kept, _ = _find_main_region(xy[wide][:: max(1, n_wide // 20000)])
     outline = compute_convex_outline(kept)
     depth_over = measure_depth_inside(outline, xy)
     over = valid & (depth_over >= -OUTLINE_MARGIN_M)
@@ -249,8 +228,7 @@ def _build_view(
 def _level_plane(plane: Plane, others: list[Plane], points: Points, tolerance: Float64[np.ndarray, " n"]) -> Plane:
     """Turn the plane about its middle to the normal that it shares with the floor, shelves and other parallel planes.
 
-    A depth model's error grows with depth over large patches, so a wide floor tells more about gravity than a small
-    table. Points are weighted by angle, not by metres, because far ones are bent by more.
+    Points are weighted by angle, not by metres: a depth model bends far ones by more.
     """
     step = max(1, len(points) // SAMPLES)
     points, tolerance = points[::step], tolerance[::step]

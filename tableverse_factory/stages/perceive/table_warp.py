@@ -12,14 +12,9 @@ SAMPLES = 9000
 def fit_warp(
     xy: Float64[np.ndarray, "h w 2"], heights: Float64[np.ndarray, "h w"], flat: Mask, most: float, degree: int
 ) -> Float64[np.ndarray, "h w"]:
-    """Fit a polynomial through the readings close to the plane, without the objects on it [m]. Shape (h, w).
+    """Fit a polynomial in coordinates along the table to the heights of the flat pixels, without objects on them [m].
 
-    Args:
-        xy: Coordinates along the table [m].
-        heights: Heights above the plane [m].
-        flat: Pixels close to the plane.
-        most: Bound of the result [m]: polynomials run away beyond their support.
-        degree: Degree of the polynomial.
+    The result is at most `most` [m] either way: polynomials run away beyond their support.
     """
     if int(flat.sum()) < MIN_PIXELS:
         return np.zeros(heights.shape)
@@ -39,12 +34,7 @@ def _evaluate_polynomial(
 ) -> Float64[np.ndarray, "*shape"]:
     """Evaluate `_build_monomials(xy, degree) @ weights` by Horner's rule, without an array for each term."""
     x, y = np.ascontiguousarray(xy[..., 0]), np.ascontiguousarray(xy[..., 1])
-    of_term = {
-        (total - k, k): weight
-        for (total, k), weight in zip(
-            ((total, k) for total in range(degree + 1) for k in range(total + 1)), weights.tolist(), strict=True
-        )
-    }
+    of_term = dict(zip(_list_powers(degree), weights.tolist(), strict=True))
     result: Float64[np.ndarray, "*shape"] = np.zeros(x.shape)
     for power in range(degree, -1, -1):  # of y; its factor is a polynomial in x
         factor = np.full(x.shape, of_term[degree - power, power])
@@ -58,4 +48,8 @@ def _evaluate_polynomial(
 
 def _build_monomials(xy: Float64[np.ndarray, "*shape 2"], degree: int) -> Float64[np.ndarray, "*shape k"]:
     x, y = xy[..., 0], xy[..., 1]
-    return np.stack([x ** (total - k) * y**k for total in range(degree + 1) for k in range(total + 1)], axis=-1)
+    return np.stack([x**i * y**j for i, j in _list_powers(degree)], axis=-1)
+
+
+def _list_powers(degree: int) -> list[tuple[int, int]]:
+    return [(total - k, k) for total in range(degree + 1) for k in range(total + 1)]

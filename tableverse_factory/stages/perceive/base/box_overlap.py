@@ -4,7 +4,7 @@ Box4 = tuple[float, float, float, float]
 
 
 def compute_area(box: Box4) -> float:
-    """Compute the area."""
+    """Compute the area of a box."""
     return (box[2] - box[0]) * (box[3] - box[1])
 
 

@@ -15,12 +15,7 @@ from tableverse_factory.stages.perceive.base.table_view import TableView
 TABLE_LABELS = ("table", "desk", "countertop", "work surface")
 
 
-def replay_detections(
-    view: TableView,
-    config: PerceiveConfig,  # noqa: ARG001
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
-) -> DetectionResult | Dropped:
+def replay_detections(view: TableView, _config: PerceiveConfig, _services: Services) -> DetectionResult | Dropped:
     """Return the recorded detections; with `masks.png` their masks, else boxes only."""
     recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
     if recorded is None:
@@ -30,8 +25,9 @@ def replay_detections(
 
 def to_detection_result(recorded: Detections, ids: IdImage | None, shape: tuple[int, ...]) -> DetectionResult:
     """Convert detections to candidates: single objects, then each container followed by its contents."""
-    height, width = shape[0], shape[1]
-    boxes = {} if ids is None else _find_id_boxes(ids)
+    height, width = shape
+    windows = enumerate([] if ids is None else ndimage.find_objects(np.maximum(ids, 0)), start=1)
+    boxes = {k: (w[1].start, w[0].start, w[1].stop, w[0].stop) for k, w in windows if w is not None}
 
     def candidate(
         label: str, score: float, box: Box, instance: int | None, container: int | None = None, count: int = 1
@@ -44,11 +40,8 @@ def to_detection_result(recorded: Detections, ids: IdImage | None, shape: tuple[
         return Candidate(label, score, pixels, max(instance, 0), container, count)
 
     tables = [d.bbox_xyxy for d in recorded.detections if d.label.lower() in TABLE_LABELS]
-    found = [
-        candidate(d.label, d.score, d.bbox_xyxy, d.instance_id)
-        for d in recorded.detections
-        if d.label.lower() not in TABLE_LABELS
-    ]
+    singles = (d for d in recorded.detections if d.label.lower() not in TABLE_LABELS)
+    found = [candidate(d.label, d.score, d.bbox_xyxy, d.instance_id) for d in singles]
     for composite in recorded.composites:
         index, holder = len(found), composite.container
         found.append(candidate(holder.label, 1.0, holder.bbox, holder.instance_id))
@@ -60,9 +53,3 @@ def _to_pixels(box: Box, width: int, height: int) -> PixelBox:
     x0, x1 = sorted((box[0] * width / 1000, box[2] * width / 1000))
     y0, y1 = sorted((box[1] * height / 1000, box[3] * height / 1000))
     return x0, y0, x1, y1
-
-
-def _find_id_boxes(ids: IdImage) -> dict[int, PixelBox]:
-    """Find the box of each positive id in the image [px]."""
-    windows = enumerate(ndimage.find_objects(np.maximum(ids, 0)), start=1)
-    return {k: (w[1].start, w[0].start, w[1].stop, w[0].stop) for k, w in windows if w is not None}

@@ -28,9 +28,8 @@ def fill_depth_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
     for _ in range(FILL_ROUNDS):
         rows, columns = np.nonzero(filled == 0)
         padded = np.pad(filled, 1)
-        around = np.stack(
-            [padded[rows + y, columns + x] for y in range(3) for x in range(3) if (y, x) != (1, 1)], axis=1
-        )
+        steps = ((y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1))
+        around = np.stack([padded[rows + y, columns + x] for y, x in steps], axis=1)
         around = np.sort(np.where(around > 0, around, np.inf), axis=1)
         count = np.isfinite(around).sum(axis=1)
         enough = count >= MIN_NEIGHBOURS
@@ -44,13 +43,12 @@ class TableView(Frozen):
     """The picture, its points, and the table below them.
 
     Attributes:
-        points_camera: Points, the origin where there is no reading [m]. Shape (h, w, 3).
+        points_camera: Points, the origin where there is no reading [m].
         valid: Pixels with a reading or a filled gap.
         plane: Table plane in the camera frame, its normal upwards.
         axes: The table frame's x, y and z as camera directions, one per row.
         outline_xy: Convex outline of the visible table-top, counter-clockwise, see `xy` [m].
-        heights: Heights above the plane, 0 where there is no reading [m]. Shape (h, w).
-        on_plane: Pixels of the table-top itself.
+        heights: Heights above the plane, 0 where there is no reading [m].
         raised: Pixels clearly above the table-top or a little beside it.
     """
 
@@ -87,42 +85,30 @@ class ImageWindow:
     @property
     def slices(self) -> tuple[slice, slice]:
         """Rows and columns of the picture."""
-        return (
-            slice(self.top, self.top + self.height * self.stride, self.stride),
-            slice(self.left, self.left + self.width * self.stride, self.stride),
-        )
+        bottom, right = self.top + self.height * self.stride, self.left + self.width * self.stride
+        return slice(self.top, bottom, self.stride), slice(self.left, right, self.stride)
 
 
 def find_working_window(mask: Mask, max_pixels: int, margin: int) -> ImageWindow:
     """Find a window around the mask, thinned so that the whole picture would have at most `max_pixels`."""
     stride = max(1, int(np.ceil(np.sqrt(mask.size / max_pixels))))
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    top, left = max(int(rows[0]) - margin * stride, 0), max(int(columns[0]) - margin * stride, 0)
-    bottom = min(int(rows[-1]) + margin * stride + 1, mask.shape[0])
-    right = min(int(columns[-1]) + margin * stride + 1, mask.shape[1])
-    return ImageWindow(top, left, -(-(bottom - top) // stride), -(-(right - left) // stride), stride)
+    rows, columns = expand_window(mask, margin * stride)
+    height, width = min(rows.stop, mask.shape[0]) - rows.start, min(columns.stop, mask.shape[1]) - columns.start
+    return ImageWindow(rows.start, columns.start, -(-height // stride), -(-width // stride), stride)
 
 
 def expand_window(mask: Mask, margin: int) -> tuple[slice, slice]:
     """Find the rows and columns of a mask that is not empty, with a margin on either side [px]."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
-    )
+    first_row, first_column = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
+    return slice(first_row, int(rows[-1]) + margin + 1), slice(first_column, int(columns[-1]) + margin + 1)
 
 
 def crop_view(view: TableView, window: ImageWindow) -> TableView:
     """Crop and thin the view to a window."""
-    part, full = window.slices, view.observation
-    camera = Camera(
-        full.camera.fx / window.stride,
-        full.camera.fy / window.stride,
-        (full.camera.cx - window.left) / window.stride,
-        (full.camera.cy - window.top) / window.stride,
-        window.width,
-        window.height,
-    )
+    part, stride, full = window.slices, window.stride, view.observation
+    cx, cy = (full.camera.cx - window.left) / stride, (full.camera.cy - window.top) / stride
+    camera = Camera(full.camera.fx / stride, full.camera.fy / stride, cx, cy, window.width, window.height)
     return replace(
         view,
         observation=Observation(full.scene_id, full.color[part], full.depth[part], camera),

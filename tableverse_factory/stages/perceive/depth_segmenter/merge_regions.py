@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from skimage.draw import line
 
 from schemas.geometry import IdImage, Points
@@ -52,11 +54,10 @@ class MergedRegion:
 
     Attributes:
         size: Number of its pixels.
-        pixels: Row and column of a regular sample of its pixels. Shape (n, 2).
-        points: Points of the sample, camera frame [m].
-        normals: Normals of the sample.
+        pixels: Row and column of a regular sample of its pixels, of which are also `points`, `normals` and `xy`.
+        points: Camera frame [m].
         footprint: Convex outline over the table [m].
-        xy: Sample over the table [m].
+        xy: Along the table [m].
         near: 5th percentile of the distance along the table, away from the camera [m].
         rim: 98th percentile of the height [m].
     """
@@ -77,23 +78,14 @@ def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[Me
     found = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         rows, columns = np.nonzero(ids == k)
-        size = len(rows)
-        step = max(1, size // SAMPLES)
         rim = float(np.percentile(heights[rows, columns], 98))
         footprint = compute_convex_outline(xy[rows, columns])
-        rows, columns = rows[::step], columns[::step]
-        found.append(
-            MergedRegion(
-                size,
-                np.stack([rows, columns], axis=1).astype(np.float64),
-                surface.points[rows, columns],
-                surface.normals[rows, columns],
-                footprint,
-                xy[rows, columns],
-                float(np.percentile(xy[rows, columns, 1], 5)),
-                rim,
-            )
-        )
+        step = max(1, len(rows) // SAMPLES)
+        at = rows[::step], columns[::step]
+        pixels = np.stack(at, axis=1).astype(np.float64)
+        near = float(np.percentile(xy[at][:, 1], 5))
+        sample = (surface.points[at], surface.normals[at], footprint, xy[at])
+        found.append(MergedRegion(len(rows), pixels, *sample, near, rim))
     return found
 
 
@@ -104,17 +96,20 @@ def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdI
     Then the floors of vessels join the walls around them.
     """
     regions = describe_regions(ids, surface, view)
-    into = list(range(len(regions) + 1))
     nearer = measure_occlusion(ids, surface)
+    pairs: list[tuple[int, int]] = []
     for b in range(len(regions)):
         a = _find_other_part(regions, b, surface)
         if a is None:
             a = _find_vessel(regions, b, nearer)
         if a is not None:
-            _unite(into, a + 1, b + 1)
-    ids = _add_floors(ids, regions, into, view)
-    roots = np.array([_find_root(into, k) for k in range(len(into))])
-    values, numbered = np.unique(roots[ids], return_inverse=True)
+            pairs.append((a + 1, b + 1))
+    ids = _add_floors(ids, regions, pairs, view)
+    links = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    count = len(regions) + 1
+    graph = coo_array((np.ones(len(pairs)), (links[0], links[1])), shape=(count, count))
+    _, objects = connected_components(graph, directed=False)  # numbered in the order of their first regions
+    values, numbered = np.unique(objects[ids], return_inverse=True)
     return numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
 
 
@@ -136,16 +131,15 @@ def _find_vessel(regions: list[MergedRegion], b: int, nearer: Float64[np.ndarray
     shape = measure_bulge(regions[b])
     if shape > FLAT_BULGE:
         return None
-    holders = [
-        a
-        for a in range(len(regions))
-        if a != b and is_hollow_of(regions[a], regions[b], shape, nearer[a + 1, b + 1], nearer[b + 1, a + 1])
-    ]
+    others = (a for a in range(len(regions)) if a != b)
+    holders = (
+        a for a in others if is_hollow_of(regions[a], regions[b], shape, nearer[a + 1, b + 1], nearer[b + 1, a + 1])
+    )
     return min(holders, key=lambda a: regions[a].near, default=None)
 
 
-def _add_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view: TableView) -> IdImage:
-    """Add the floors of vessels to the walls around them, which are united in `into`."""
+def _add_floors(ids: IdImage, regions: list[MergedRegion], pairs: list[tuple[int, int]], view: TableView) -> IdImage:
+    """Add the floors of vessels to the walls around them, and to `pairs` the walls of each."""
     proposals = find_floors(view)
     xy = view.xy(view.points_camera)
     result = ids.copy()
@@ -164,28 +158,13 @@ def _add_floors(ids: IdImage, regions: list[MergedRegion], into: list[int], view
         ]
         if not walls or not surrounds(np.vstack([regions[a - 1].xy for a in walls]), xy[floor].mean(axis=0)):
             continue
-        for a in walls:
-            _unite(into, walls[0], a)
+        pairs += [(walls[0], a) for a in walls]
         result[floor] = walls[0]
     return result
 
 
-def _unite(into: list[int], a: int, b: int) -> None:
-    low, high = sorted((_find_root(into, a), _find_root(into, b)))
-    into[high] = low
-
-
-def _find_root(into: list[int], k: int) -> int:
-    while into[k] != k:
-        k = into[k]
-    return k
-
-
 def measure_occlusion(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k k"]:
-    """Measure, as entry (a, b), the border along which region a is nearer to the camera than b beside it [px].
-
-    The diagonal is not used; entry (a, b) + (b, a) is at most the length of their border.
-    """
+    """Measure, as entry (a, b), the border along which region a is nearer to the camera than b beside it [px]."""
     count = int(ids.max(initial=0)) + 1
     depth = surface.points[..., 2]
     lengths = np.zeros((count, count))
@@ -201,7 +180,7 @@ def measure_occlusion(ids: IdImage, surface: Surface) -> Float64[np.ndarray, "k 
 def is_hollow_of(
     holder: MergedRegion, inner: MergedRegion, own_shape: float, holder_nearer: float, inner_nearer: float
 ) -> bool:
-    """Whether `inner`, whose `bulge` is `own_shape`, is the inside of `holder`, as of a bowl or a mug.
+    """Whether `inner`, whose bulge is `own_shape`, is the inside of `holder`, as of a bowl or a mug.
 
     It does not bulge, as contents do, and the holder reaches as near to the camera. Three more signs count, each
     sufficient with some of the others: it lies over the holder's footprint and not above its rim; it is seen over

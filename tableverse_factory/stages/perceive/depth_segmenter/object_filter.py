@@ -41,7 +41,7 @@ def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) 
     for k in range(1, int(ids.max(initial=0)) + 1):
         mask = (ids == k) & view.valid
         least = MIN_CONTENT_AREA_M2 if k in contents else MIN_AREA_M2
-        if is_large_enough(mask, view, least) and is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
+        if _is_large_enough(mask, view, least) and _is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
             kept.append(k)
     return renumber_regions(ids, kept)
 
@@ -53,18 +53,18 @@ def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:
     return number[ids]
 
 
-def measure_area(mask: Mask, view: TableView) -> float:
+def _measure_area(mask: Mask, view: TableView) -> float:
     """Measure the region's area across the line of sight at its distance [m²]."""
     camera = view.observation.camera
     return float(np.sum(view.depth[mask] ** 2)) / (camera.fx * camera.fy)
 
 
-def is_large_enough(mask: Mask, view: TableView, least_m2: float = MIN_AREA_M2) -> bool:
+def _is_large_enough(mask: Mask, view: TableView, least_m2: float) -> bool:
     """Whether the region is larger than what noise alone raises at its distance."""
     if not mask.any():
         return False
     noise = float(compute_depth_noise(np.median(view.depth[mask])))
-    return measure_area(mask, view) >= least_m2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
+    return _measure_area(mask, view) >= least_m2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
 
 
 def _find_feet_below_image(view: TableView) -> Mask:
@@ -74,11 +74,10 @@ def _find_feet_below_image(view: TableView) -> Mask:
     return np.nan_to_num(rows, nan=np.inf) > view.valid.shape[0] - 1
 
 
-def is_carried(mask: Mask, view: TableView) -> bool:
-    """Whether the region has a visible or possibly hidden support.
+def _is_carried(mask: Mask, view: TableView) -> bool:
+    """Whether the region is near the table or has a visible or hidden support.
 
-    A region near the table passes. Below the lower contour of a higher one there must be the table, a surface that it
-    touches, or something nearer to the camera that may hide its support.
+    Below its lower contour are the table, a surface that it touches, or something nearer that may hide its support.
     """
     if float(np.percentile(view.heights[mask], 2)) < HANGING_M:
         return True
@@ -97,4 +96,4 @@ def is_carried(mask: Mask, view: TableView) -> bool:
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:
     """Whether the region is a small flat piece at the table's edge, where sensors bend the plane."""
     flat = float(np.percentile(view.heights[mask], 95)) < FLAT_M
-    return flat and measure_area(mask, view) < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5
+    return flat and _measure_area(mask, view) < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5

@@ -20,8 +20,7 @@ MAX_JUMP_M = 0.02
 SHORT_BORDER = 2.0
 MAX_GAP_PX = 4
 
-Links = dict[int, dict[int, tuple[float, int]]]
-"""Neighbours of each patch, with the sum of the border's strength and its length [px]."""
+Links = dict[int, dict[int, tuple[float, int]]]  # neighbours of each patch: sum of the border's strength, length [px]
 
 
 def oversegment(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
@@ -39,19 +38,14 @@ def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
     """Merge patches, the weakest border first, until every border is strong along its whole length.
 
     The strength of a border is its mean over all pixels along which the two regions touch, so that a short gap in a
-    crease does not join two objects that have grown on either side of it; where large regions touch in a few pixels
-    only, it counts for more (`_compute_strength`).
+    crease does not join two objects that have grown on either side of it.
     """
     links = _build_links(ids, surface)
     sizes = np.bincount(ids.ravel()).tolist()
     into = list(range(len(sizes)))
     version = [0] * len(into)
-    heap = [
-        (_compute_strength(link, sizes[a], sizes[b]), a, b, 0, 0)
-        for a in links
-        for b, link in links[a].items()
-        if a < b
-    ]
+    pairs = ((a, b, link) for a in links for b, link in links[a].items() if a < b)
+    heap = [(_compute_strength(link, sizes[a], sizes[b]), a, b, 0, 0) for a, b, link in pairs]
     heapq.heapify(heap)
     while heap:
         strength, a, b, version_a, version_b = heapq.heappop(heap)
@@ -124,21 +118,18 @@ def _find_gap_links(
 
 def _merge_links(links: Links, a: int, b: int) -> None:
     """Hand the neighbours of `b` to `a`."""
+    del links[a][b], links[b][a]
     for c, (total, length) in links.pop(b).items():
-        if c == a:
-            continue
         del links[c][b]
         known_total, known_length = links[a].get(c, (0.0, 0))
         links[a][c] = links[c][a] = (known_total + total, known_length + length)
-    del links[a][b]
 
 
 def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:
     """Keep regions of at least `least_pixels`, numbered from 1, and attach every other pixel of `mask` to one of them.
 
-    The pixels along borders are too few to be an object. Each goes where the path over neighbouring pixels has the
-    smallest jump in depth (a minimum spanning forest); unreachable ones form a region of their own if it is large
-    enough, else they are dropped. Shape (h, w), 0 elsewhere.
+    Each goes where the path over neighbouring pixels has the smallest jump in depth (a minimum spanning forest);
+    unreachable ones form a region of their own if it is large enough, else they are dropped.
     """
     large = _keep_large(ids, least_pixels)
     cores, n_large = large * mask, int(large.max(initial=0))
@@ -146,13 +137,9 @@ def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixel
     a, b, jump = _build_pixel_graph(nodes, mask, surface)
     count = int(nodes.max(initial=0)) + 1
     roots = np.arange(1, n_large + 1)
-    graph = coo_array(
-        (
-            np.concatenate([jump, np.full(len(roots), 1e-12)]),
-            (np.concatenate([a, np.zeros(len(roots), dtype=np.int64)]), np.concatenate([b, roots])),
-        ),
-        shape=(count, count),
-    )
+    weights = np.concatenate([jump, np.full(len(roots), 1e-12)])
+    ends = np.concatenate([a, np.zeros(len(roots), dtype=np.int64)]), np.concatenate([b, roots])
+    graph = coo_array((weights, ends), shape=(count, count))
     forest = minimum_spanning_tree(graph.tocsr()).tocoo()
     inner = (forest.row > 0) & (forest.col > 0)
     split = coo_array((forest.data[inner], (forest.row[inner], forest.col[inner])), shape=(count, count))

@@ -36,17 +36,16 @@ BESIDE_PX = 2
 BESIDE_M = 0.025
 REFINEMENTS = 3
 
+Circle = tuple[float, float, float, float]  # x, y, radius and height [m]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim(Frozen):
-    """A level circle over the table, in the coordinates of `TableView.xy`.
+    """A level circle over the table, in the coordinates of `TableView.xy`: centre, radius and height [m].
 
     Attributes:
-        center: Centre [m].
-        radius: Radius [m].
-        height: Height above the table [m].
         floor: 5th percentile of the heights inside [m].
-        sectors: Number of the 36 directions in which it is visible.
+        sectors: Number of the `SECTORS` directions in which it is visible.
         within: Pixels seen through its disc, below its height.
         window: Rows and columns with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around.
     """
@@ -87,10 +86,6 @@ def find_rims(ids: IdImage, view: TableView) -> list[Rim]:
         if rim is not None:
             found.append(rim)
     return _drop_duplicates(found)
-
-
-Circle = tuple[float, float, float, float]
-"""x, y, radius and height [m]."""
 
 
 def _find_upper_contour(ids: IdImage, valid: Mask) -> Mask:
@@ -203,9 +198,7 @@ def _drop_duplicates(found: list[Rim]) -> list[Rim]:
     """Keep the most complete rims, without those whose centre lies within a kept one at about its height."""
     kept: list[Rim] = []
     for rim in sorted(found, key=lambda r: (-r.sectors, -r.radius)):
-        if not any(
-            float(other.distance(rim.center)) < other.radius and abs(other.height - rim.height) < other.radius
-            for other in kept
-        ):
+        near = (other for other in kept if abs(other.height - rim.height) < other.radius)
+        if not any(float(other.distance(rim.center)) < other.radius for other in near):
             kept.append(rim)
     return kept

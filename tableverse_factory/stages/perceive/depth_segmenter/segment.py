@@ -3,19 +3,14 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Int64
 from scipy import ndimage
 
 from schemas.config import Config, PerceiveConfig
 from schemas.geometry import IdImage
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import BoxPrompts, Candidate, DetectionResult, PixelBox
-from tableverse_factory.stages.perceive.base.table_view import (
-    TableView,
-    crop_view,
-    find_working_window,
-    uncrop_ids,
-)
+from tableverse_factory.stages.perceive.base.box_overlap import compute_area
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult, PixelBox
+from tableverse_factory.stages.perceive.base.table_view import TableView, crop_view, find_working_window, uncrop_ids
 from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import merge_occluded_parts
 from tableverse_factory.stages.perceive.depth_segmenter.object_filter import (
     keep_objects,
@@ -44,32 +39,22 @@ MOSTLY_INSIDE = 0.6
 MAX_HOLE_PX = 60
 
 
-def detect_from_depth(
-    view: TableView,
-    config: PerceiveConfig,  # noqa: ARG001
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
-) -> DetectionResult:
+def detect_from_depth(view: TableView, _config: PerceiveConfig, _services: Services) -> DetectionResult:
     """Detect every region of `segment_depth` as an unnamed candidate, the largest in the picture first."""
     return to_detections(*segment_depth(view))
 
 
-def segment_boxes_from_depth(
-    view: TableView,
-    boxes: BoxPrompts,
-    config: Config,  # noqa: ARG001
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
-) -> IdImage:
+def segment_boxes_from_depth(view: TableView, found: DetectionResult, _config: Config) -> IdImage:
     """Assign to each box the regions mostly in it and in no smaller box; else its part of the one it overlaps most.
 
     Of two boxes with the same pixel the smaller one has it: contents lie in the box of their container.
     """
     regions, _ = segment_depth(view)
     sizes = np.bincount(regions.ravel())
-    counts = np.array([_count_pixels(regions, box, len(sizes)) for box in boxes.objects])
+    parts = [_slice_box(candidate.box, regions.shape) for candidate in found.candidates]
+    counts = np.array([np.bincount(regions[part].ravel(), minlength=len(sizes)) for part in parts])
     counts[:, 0] = 0
-    areas = np.array([(box[2] - box[0]) * (box[3] - box[1]) for box in boxes.objects])
+    areas = np.array([compute_area(candidate.box) for candidate in found.candidates])
     owner = np.where(counts / np.maximum(sizes, 1) >= MOSTLY_INSIDE, areas[:, None], np.inf)
     wanted = (owner == owner.min(axis=0)) & np.isfinite(owner)
     owner_of = np.where(wanted.any(axis=0), wanted.argmax(axis=0) + 1, 0).astype(np.int32)
@@ -77,18 +62,12 @@ def segment_boxes_from_depth(
     for k in np.argsort(-areas, kind="stable"):
         if not wanted[k].any():
             wanted[k, counts[k].argmax()] = counts[k].any()
-        part = _slice_box(boxes.objects[k], regions.shape)
-        ids[part][wanted[k][regions[part]]] = k + 1
+        ids[parts[k]][wanted[k][regions[parts[k]]]] = k + 1
     return ids
 
 
 def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
-    """Segment the objects on the table, and find which contains which.
-
-    Returns:
-        Ids numbered from 1, the largest first, shape (h, w), 0 elsewhere; and for each id that lies in another's
-        hollow that other.
-    """
+    """Segment the objects on the table, ids from 1, the largest first; and find the container of each that has one."""
     if not view.raised.any():
         return np.zeros(view.valid.shape, dtype=np.int32), {}
     window = find_working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
@@ -97,9 +76,8 @@ def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
     pitch = typical / part.observation.camera.fx
     surface = compute_surface(part.depth, part.observation.camera, typical)
     least = max(MIN_PIXELS, round(MIN_CORE_M2 / pitch**2))
-    regions = attach_border_pixels(
-        merge_patches(oversegment(surface, part.raised, pitch), surface), surface, part.raised, least
-    )
+    patches = merge_patches(oversegment(surface, part.raised, pitch), surface)
+    regions = attach_border_pixels(patches, surface, part.raised, least)
     regions = keep_regions_over_table(regions, part)
     regions = merge_occluded_parts(regions, surface, part)
     openings = find_rims(regions, part)
@@ -130,7 +108,7 @@ def fill_holes(ids: IdImage) -> IdImage:
 
 
 def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
-    """Turn the result of `segment` into candidates without names, in the order of their ids."""
+    """Turn the result of `segment_depth` into candidates without names, in the order of their ids."""
     things = [
         Candidate("object", 1.0, _to_box(window), k, holders[k] - 1 if k in holders else None)
         for k, window in enumerate(ndimage.find_objects(ids), start=1)
@@ -140,16 +118,10 @@ def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
 
 def _to_box(window: tuple[slice, slice] | None) -> PixelBox:
     """Convert a window to a box; all zero for an id without pixels."""
-    if window is None:
-        return 0.0, 0.0, 0.0, 0.0
-    rows, columns = window
+    rows, columns = window or (slice(0, 0), slice(0, 0))
     return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)
 
 
 def _slice_box(box: PixelBox, shape: tuple[int, ...]) -> tuple[slice, slice]:
     x0, y0, x1, y1 = (max(round(v), 0) for v in box)
     return slice(min(y0, shape[0]), min(y1, shape[0])), slice(min(x0, shape[1]), min(x1, shape[1]))
-
-
-def _count_pixels(regions: IdImage, box: PixelBox, count: int) -> Int64[np.ndarray, " k"]:
-    return np.bincount(regions[_slice_box(box, regions.shape)].ravel(), minlength=count)

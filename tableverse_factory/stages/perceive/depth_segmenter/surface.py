@@ -5,12 +5,13 @@ no border (Stein et al. 2014, "Object partitioning using local convexity").
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float64
 from scipy import ndimage
 
-from schemas.geometry import Camera, DepthImage, Frozen, Mask
+from schemas.geometry import Camera, DepthImage, Frozen
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.stages.perceive.base.table_view import compute_depth_noise
 
@@ -20,9 +21,7 @@ STEP_OF_BORDER = 4.0
 MIN_STEP_M = 0.006
 STRONGEST = 2.0
 
-Pixels = tuple[np.ndarray, np.ndarray]
-"""Rows and columns."""
-
+Pixels = tuple[np.ndarray, np.ndarray]  # rows and columns
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
@@ -31,9 +30,9 @@ class Surface(Frozen):
     """The smoothed surface of a depth image.
 
     Attributes:
-        points: Points, camera frame [m]. Shape (h, w, 3).
-        normals: Unit vectors towards the camera, zero where there are too few readings. Shape (h, w, 3).
-        borders: Strength of the border between objects at each pixel: 0 for none, 1 or more for certain. Shape (h, w).
+        points: Camera frame [m].
+        normals: Unit vectors towards the camera, zero where there are too few readings.
+        borders: Strength of the border between objects at each pixel: 0 for none, 1 or more for certain.
     """
 
     points: Float64[np.ndarray, "h w 3"]
@@ -50,9 +49,7 @@ def compute_surface(depth: DepthImage, camera: Camera, typical_depth_m: float) -
     points = backproject(smooth, camera)
     reach = np.maximum(0.008, 3 * noise) + 0.5 * radius * pitch
     normals = fit_normals(smooth, camera, radius, reach)
-    bend = np.maximum(
-        _measure_concavity(points, normals, max(1, round(0.6 * radius))), _measure_concavity(points, normals, radius)
-    )
+    bend = np.maximum(*(_measure_concavity(points, normals, r) for r in (max(1, round(0.6 * radius)), radius)))
     step = _measure_steps(points, normals) / np.maximum(MIN_STEP_M, STEP_OF_BORDER * noise)
     borders = np.minimum(np.maximum(bend / CONCAVITY_OF_BORDER, step), STRONGEST)
     return Surface(points, normals, ndimage.gaussian_filter(borders, 0.7))
@@ -86,12 +83,11 @@ def _smooth_depth(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, 
     """Average twice over 3 x 3 pixels, without those on another surface."""
     for _ in range(2):
         total, count = np.zeros_like(depth), np.zeros_like(depth)
-        for rows in (-1, 0, 1):
-            for columns in (-1, 0, 1):
-                other = shift_image(depth, rows, columns)
-                near = (other > 0) & (np.abs(other - depth) < 4 * noise)
-                total += np.where(near, other, 0.0)
-                count += near
+        for rows, columns in product((-1, 0, 1), repeat=2):
+            other = shift_image(depth, rows, columns)
+            near = (other > 0) & (np.abs(other - depth) < 4 * noise)
+            total += np.where(near, other, 0.0)
+            count += near
         depth = np.where(depth > 0, total / np.maximum(count, 1), 0.0)
     return depth
 
@@ -101,14 +97,8 @@ def fit_normals(
 ) -> Float64[np.ndarray, "h w 3"]:
     """Fit normals by regression over a disc of pixels: a plane's inverse depth is linear in the pixel coordinates.
 
-    Args:
-        depth: Depth [m], 0 where there is none. Shape (h, w).
-        camera: Intrinsics of the image.
-        radius: Of the disc [px].
-        reach: Readings further in depth than this belong to another surface [m]. Shape (h, w).
-
-    Returns:
-        Unit vectors towards the camera; zero where fewer than five readings support one. Shape (h, w, 3).
+    Readings further in depth than `reach` [m] belong to another surface; `radius` is in pixels. Returns unit vectors
+    towards the camera, zero where fewer than five readings support one.
     """
     valid = depth > 0
     near_depth, limit = depth.astype(np.float32), reach.astype(np.float32)
@@ -116,7 +106,7 @@ def fit_normals(
     count, u, v, d, uu, uv, vv, ud, vd = np.zeros((9, *depth.shape), dtype=np.float32)
     step = max(1, -(-radius // 4))
     span = range(-(radius // step) * step, radius + 1, step)
-    for rows, columns in ((r, c) for r in span for c in span if r * r + c * c <= radius * radius + 1):
+    for rows, columns in ((r, c) for r, c in product(span, repeat=2) if r * r + c * c <= radius * radius + 1):
         other = shift_image(near_depth, rows, columns)
         near = ((other > 0) & (np.abs(other - near_depth) < limit)).astype(np.float32)
         rise = (shift_image(inverse, rows, columns) - inverse) * near
@@ -143,10 +133,6 @@ def fit_normals(
     return np.where(usable[..., None], normals / np.maximum(lengths, 1e-9), 0.0).astype(np.float64)
 
 
-def _has_normal(normals: Float64[np.ndarray, "h w 3"]) -> Mask:
-    return normals[..., 2] < 0
-
-
 def _measure_concavity(
     points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"], radius: int
 ) -> Float64[np.ndarray, "h w"]:
@@ -154,7 +140,7 @@ def _measure_concavity(
 
     For a right-angled concave crease it is the square root of 2; beyond a step nothing is compared.
     """
-    known = _has_normal(normals)
+    known = normals[..., 2] < 0
     most = np.zeros(known.shape)
     for direction in DIRECTIONS:
         reach = radius if 0 in direction else round(0.7 * radius)
@@ -173,7 +159,7 @@ def _measure_steps(
     points: Float64[np.ndarray, "h w 3"], normals: Float64[np.ndarray, "h w 3"]
 ) -> Float64[np.ndarray, "h w"]:
     """Measure the jump at a pixel [m]: the distance of the points on either side from each other's tangent plane."""
-    known = _has_normal(normals)
+    known = normals[..., 2] < 0
     most = np.zeros(known.shape)
     for rows, columns in DIRECTIONS:
         across = shift_image(points, rows, columns) - shift_image(points, -rows, -columns)

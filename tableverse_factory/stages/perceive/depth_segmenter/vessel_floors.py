@@ -59,9 +59,8 @@ def _find_inside_outlines(view: TableView) -> Mask:
         mask = parts[window] == k
         if int(mask.sum()) < MIN_FLOOR_PIXELS:
             continue
-        inside[window] |= view.on_plane[window] & is_inside_outline(
-            compute_convex_outline(xy[window][mask]), xy[window]
-        )
+        outline = compute_convex_outline(xy[window][mask])
+        inside[window] |= view.on_plane[window] & is_inside_outline(outline, xy[window])
     return inside
 
 

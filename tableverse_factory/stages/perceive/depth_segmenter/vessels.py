@@ -32,8 +32,7 @@ LONG = 3.0
 UPRIGHT = 0.4
 HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3
 
-Distances = Float64[np.ndarray, "h w"]
-"""A distance for each pixel of a rim's window [m]."""
+Distances = Float64[np.ndarray, "h w"]  # of the pixels of a rim's window [m]
 
 
 def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: TableView, least: int) -> IdImage:
@@ -41,13 +40,6 @@ def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: T
 
     A vessel is round about the axis of its rim, so the place of a pixel tells the vessel's from its contents'
     (`_find_own_pixels`). A region is the vessel's if most of its pixels are and some are at the rim.
-
-    Args:
-        ids: The regions.
-        found: Their rims.
-        surface: Surface of the same view.
-        view: The view of the regions.
-        least: Least pixels of a region.
     """
     if not found:
         return ids
@@ -69,11 +61,7 @@ def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: T
 def _find_own_pixels(rim: Rim, off: Distances, level: Mask, view: TableView) -> Mask:
     """Find the vessel's pixels in the rim's window by their place: outside within its circle, inside its lining.
 
-    Args:
-        rim: The vessel's rim.
-        off: Distance of the window's pixels from its axis [m].
-        level: Pixels of the window whose surface is level.
-        view: The whole picture.
+    `off` is the distance of the window's pixels from the rim's axis [m], `level` where their surface is level.
     """
     within, heights = rim.within[rim.window], view.heights[rim.window]
     beside = view.valid[rim.window] & (off < rim.radius + WALL_M) & (heights < rim.height + WALL_M)
@@ -96,22 +84,15 @@ def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> M
 
 
 def _split_contents(ids: IdImage, near: tuple[slice, slice], own: Mask, over: Mask, least: int) -> None:
-    """Split large enough contents off regions that are also the vessel's, in place.
-
-    `own` and `over` are masks of the window `near`.
-    """
+    """Split large enough contents off regions that are also the vessel's, in place; masks are of the window `near`."""
     part_ids, largest = ids[near], int(ids.max(initial=0))
     vessel, content = (np.bincount(part_ids[mask], minlength=largest + 1) for mask in (own, ~own & over))
-    for k in np.flatnonzero((vessel >= least) & (content >= least)):
-        if k == 0:
-            continue
+    for k in np.flatnonzero((vessel[1:] >= least) & (content[1:] >= least)) + 1:
         mask = (part_ids == k) & ~own
-        parts, count = ndimage.label(ndimage.binary_opening(mask & over, np.ones((3, 3)), iterations=2))
-        sizes = np.bincount(parts.ravel())
-        for part in range(1, count + 1):
-            if sizes[part] >= least:
-                largest += 1
-                part_ids[ndimage.binary_dilation(parts == part, iterations=2) & mask] = largest
+        parts, _ = ndimage.label(ndimage.binary_opening(mask & over, np.ones((3, 3)), iterations=2))
+        for part in np.flatnonzero(np.bincount(parts.ravel())[1:] >= least) + 1:
+            largest += 1
+            part_ids[ndimage.binary_dilation(parts == part, iterations=2) & mask] = largest
 
 
 def _find_walls(ids: IdImage, rim: Rim, off: Distances, own: Mask, view: TableView) -> list[int]:
@@ -137,18 +118,16 @@ def find_containers(ids: IdImage, found: list[Rim], view: TableView) -> dict[int
 
     No two regions contain each other: a vessel with a rim lies in none, and of two others the larger is the container.
     """
-    round_ones = find_vessels(ids, found, view)
-    by_outline = {
-        k: a for k, a in find_containers_by_outline(ids, view).items() if k not in round_ones and a not in round_ones
-    }
-    return by_outline | find_rim_contents(ids, found, round_ones, view)
+    round_ones = _find_vessels(ids, found, view)
+    by_outline = find_containers_by_outline(ids, view).items()
+    holders = {k: a for k, a in by_outline if k not in round_ones and a not in round_ones}
+    return holders | _find_rim_contents(ids, found, round_ones, view)
 
 
-def find_rim_contents(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
-    """Find the vessel, of `find_vessels`, of each region that stands in one or rises out of one.
+def _find_rim_contents(ids: IdImage, found: list[Rim], vessels: list[int], view: TableView) -> dict[int, int]:
+    """Find the vessel, of `_find_vessels`, of each region but vessels that stands in one or rises out of one.
 
-    The lowest visible part decides: it stands over the inside of the rim. An object behind the vessel begins beyond
-    the circle. A vessel itself lies in none.
+    The lowest visible part decides: it is over the inside of the rim. Behind the vessel it is beyond the circle.
     """
     xy, holders = view.xy(view.points_camera), dict[int, int]()
     others = [k for k in range(1, int(ids.max(initial=0)) + 1) if k not in vessels]
@@ -164,14 +143,14 @@ def find_rim_contents(ids: IdImage, found: list[Rim], vessels: list[int], view: 
 
 def find_rising_contents(ids: IdImage, found: list[Rim], view: TableView) -> set[int]:
     """Find the regions that stand in a vessel and reach well above its rim, as no wall does."""
-    vessels = find_vessels(ids, found, view)
+    vessels = _find_vessels(ids, found, view)
     rim_heights = {vessel: rim.height for rim, vessel in zip(found, vessels, strict=True)}
-    holders = find_rim_contents(ids, found, vessels, view)
+    holders = _find_rim_contents(ids, found, vessels, view)
     tops = {k: float(np.percentile(view.heights[(ids == k) & view.valid], TOP_PERCENT)) for k in holders}
     return {k for k, vessel in holders.items() if tops[k] > rim_heights[vessel] + RISES_M}
 
 
-def find_vessels(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
+def _find_vessels(ids: IdImage, found: list[Rim], view: TableView) -> list[int]:
     """Find the id of each rim's vessel; 0 for none."""
     xy = view.xy(view.points_camera)
     return [_find_vessel(ids, rim, xy, view) for rim in found]

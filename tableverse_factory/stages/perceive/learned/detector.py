@@ -5,7 +5,6 @@ Mousavian and Fox, 2021); network, training and clustering differ.
 """
 
 import numpy as np
-from jaxtyping import Float32
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -38,28 +37,13 @@ REACH_M = 0.02
 LEAST_HEIGHT_M = 0.003
 
 
-def detect_with_network(
-    view: TableView,
-    config: PerceiveConfig,
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,  # noqa: ARG001
-) -> DetectionResult:
-    """Detect every object that the network's votes agree on as an unnamed candidate, the largest first.
-
-    Raises:
-        ModelAccessError: if there is no network.
-        ModelError: if its output is invalid.
-    """
+def detect_with_network(view: TableView, config: PerceiveConfig, _services: Services) -> DetectionResult:
+    """Detect every object that the network's votes agree on as an unnamed candidate, the largest first."""
     return to_detections(*segment_with_network(view, load_net(config.detector_weights)))
 
 
 def segment_with_network(view: TableView, net: SegmentationNet) -> tuple[IdImage, dict[int, int]]:
-    """Segment the objects on the table, and find which contains which.
-
-    Returns:
-        Ids numbered from 1, the largest first, shape (h, w), 0 elsewhere; and for each id that lies in another's
-        hollow that other.
-    """
+    """Segment the objects on the table, ids from 1, the largest first; and find the container of each that has one."""
     if not view.raised.any():
         return np.zeros(view.valid.shape, dtype=np.int32), {}
     height, width = view.valid.shape
@@ -75,9 +59,11 @@ def segment_with_network(view: TableView, net: SegmentationNet) -> tuple[IdImage
 
 def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
     """Compute the points of the network's output with a reading, and the object of each from 1, 0 for none."""
-    table = compute_table_points(view)
+    table = _compute_table_points(view)
     center = np.median(table[view.raised][:, :2], axis=0) if view.raised.any() else np.zeros(2)
-    output = _run_network(net, compute_features(table, view.valid, center))
+    inputs = compute_features(table, view.valid, center)
+    rows, columns = (-size % MULTIPLE for size in view.valid.shape)
+    output = net(np.pad(inputs, ((0, 0), (0, rows), (0, columns))))
     thin = np.s_[::THINNING, ::THINNING]
     table, valid = table[thin], view.valid[thin]
     output = output[:, : valid.shape[0], : valid.shape[1]]
@@ -88,14 +74,9 @@ def _vote(view: TableView, net: SegmentationNet) -> tuple[Points, IdImage]:
     return table[valid], _remove_crumbs(image)[valid]
 
 
-def compute_table_points(view: TableView) -> Points:
+def _compute_table_points(view: TableView) -> Points:
     """Compute the picture's points, x and y along the table, z above its plane [m]. Shape (h, w, 3)."""
     return np.concatenate([view.xy(view.points_camera), view.heights[..., None]], axis=-1)
-
-
-def _run_network(net: SegmentationNet, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
-    rows, columns = (-size % MULTIPLE for size in inputs.shape[1:])
-    return net(np.pad(inputs, ((0, 0), (0, rows), (0, columns))))
 
 
 def _remove_crumbs(ids: IdImage) -> IdImage:
@@ -116,7 +97,7 @@ def _spread_ids(view: TableView, points: Points, ids: IdImage) -> IdImage:
     result = np.zeros(view.valid.shape, dtype=np.int32)
     if not len(points):
         return result
-    distances, nearest = cKDTree(points).query(compute_table_points(view)[wanted], distance_upper_bound=REACH_M)
+    distances, nearest = cKDTree(points).query(_compute_table_points(view)[wanted], distance_upper_bound=REACH_M)
     near = np.isfinite(distances)
     result[wanted] = np.where(near, ids[np.where(near, nearest, 0)], 0)
     return result

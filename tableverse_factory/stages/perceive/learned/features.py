@@ -8,17 +8,12 @@ from scipy import ndimage
 
 from schemas.geometry import Mask
 
-FORMAT: Final = "tableverse-segmenter-1"
-"""Format in the metadata of the ONNX file; changes with the meaning of its input or output."""
+FORMAT: Final = "tableverse-segmenter-1"  # in the ONNX file's metadata; changes with the meaning of its input or output
 CHANNELS: Final = 7
-OUTPUTS: Final = 4
-"""Logit of being an object, then the offset to the object's centre in the table frame in units of `OFFSET_UNIT_M`."""
-MULTIPLE: Final = 16
-"""Height and width of the input are multiples of it."""
-THINNING: Final = 2
-"""Rows and columns of the input per row and column of the output, whose pixel k is the input's pixel 2k."""
-PIXELS: Final = 80_000
-"""Approximate size of the training pictures; larger ones are thinned to it."""
+OUTPUTS: Final = 4  # logit of being an object, then the offset to its centre in the table frame in `OFFSET_UNIT_M`
+MULTIPLE: Final = 16  # height and width of the input are multiples of it
+THINNING: Final = 2  # rows and columns of the input per one of the output, whose pixel k is the input's pixel 2k
+PIXELS: Final = 80_000  # approximate size of the training pictures; larger ones are thinned to it
 ALONG_UNIT_M: Final = 0.3
 HEIGHT_UNIT_M: Final = 0.15
 OFFSET_UNIT_M: Final = 0.1
@@ -30,10 +25,7 @@ def compute_features(
 ) -> Float32[np.ndarray, "7 h w"]:
     """Compute position along the table, height, normal and validity; 0 where there is no reading.
 
-    Args:
-        points_table: Points in axes whose z is the height above the table plane [m].
-        valid: Pixels with a reading.
-        center_xy: Origin of positions, amid the objects on the table [m].
+    The points' z is the height above the table plane; `center_xy`, amid the objects, is the origin of positions [m].
     """
     result = np.zeros((CHANNELS, *valid.shape), dtype=np.float32)
     points = points_table.astype(np.float32)

@@ -13,13 +13,9 @@ ROUNDS = 12
 
 
 def cluster_votes(votes: Points, least: int) -> Int64[np.ndarray, " n"]:
-    """Cluster the votes: the cluster of each from 0, -1 for those whose peak has too few.
+    """Cluster the votes in the table frame [m]: the cluster of each from 0, -1 for those whose peak has too few.
 
     The same votes in any order give the same clusters, numbered by falling size.
-
-    Args:
-        votes: Centre that each pixel votes for, in the table frame [m].
-        least: Least votes of a cluster.
     """
     if not len(votes):
         return np.zeros(0, dtype=np.int64)

@@ -20,11 +20,6 @@ class SegmentationNet:
     """A session of onnxruntime with one input and one output as `compute_features` describes them."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file.
-
-        Raises:
-            ModelAccessError: without onnxruntime, or if the file is missing or no network of `train segmenter`.
-        """
         self._path = path
         self._session = _open_session(path)
         file_format = self._session.get_modelmeta().custom_metadata_map.get("format", "")
@@ -34,11 +29,7 @@ class SegmentationNet:
         self._input = inputs[0].name
 
     def __call__(self, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
-        """Run the network.
-
-        Raises:
-            ModelError: if it cannot be run, or its output has another shape or is not finite.
-        """
+        """Run the network; another shape of output or one that is not finite is a `ModelError`."""
         try:
             output = self._session.run(None, {self._input: inputs[None]})[0]
         except Exception as error:  # onnxruntime's errors have no common base
@@ -51,11 +42,7 @@ class SegmentationNet:
 
 @cache
 def load_net(weights: str) -> SegmentationNet:
-    """Load the network in this file, once per process.
-
-    Raises:
-        ModelAccessError: see `SegmentationNet`.
-    """
+    """Load the network in this file, once per process."""
     return SegmentationNet(Path(weights))
 
 

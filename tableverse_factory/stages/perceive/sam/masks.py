@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from schemas.geometry import Frozen, IdImage, Picture
+from schemas.geometry import Frozen, Picture
 from tableverse_factory.models.local.device import Tensor, import_torch
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID
 
@@ -19,13 +19,7 @@ MAX_SCORES = 64_000_000  # maximum number of scores at the size of the picture h
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxQuestion(Frozen):
-    """A picture and the boxes to segment.
-
-    Attributes:
-        color: Shape (h, w, 3).
-        boxes: xmin, ymin, xmax, ymax of each object [px]; the table's box last, if there is one.
-        holders: Index of the container of each object, -1 for none.
-    """
+    """A picture, boxes as xmin, ymin, xmax, ymax [px], the table's last, and each object's container, -1 for none."""
 
     color: Picture
     boxes: Float64[np.ndarray, "k 4"]
@@ -45,17 +39,10 @@ def clip_boxes(boxes: Float64[np.ndarray, "k 4"], height: int, width: int) -> Fl
 
 
 def compute_id_image(scores: Tensor, question: BoxQuestion) -> Tensor:
-    """Compute the id image: `k + 1` for the k-th object, `TABLE_ID` for the table, 0 for neither.
+    """Compute the id image of a `BoxSegmenter` as int16 from each box's scores over the picture, shape (k, s, s).
 
     Scores are upsampled bilinearly; a mask is where its score is above 0. Contents stay near their container and cover
     it; between others the higher score wins; the table is what no object covers (paper, appendix A, on seeds).
-
-    Args:
-        scores: Scores of each box for the whole picture at the model's resolution, shape (k, s, s).
-        question: Picture and boxes.
-
-    Returns:
-        Shape (h, w), int16.
     """
     torch = import_torch()
     height, width = question.color.shape[:2]
@@ -85,10 +72,7 @@ def group_by_depth(holders: Int64[np.ndarray, " n"]) -> list[list[int]]:
 
 
 def _limit_to_containers(scores: Tensor, cut: Float64[np.ndarray, "k 4"], question: BoxQuestion) -> Tensor:
-    """Clamp scores of contents below zero beyond `REACH` of their container.
-
-    If the container's mask is far smaller than its box, the box is used.
-    """
+    """Clamp scores of contents below zero beyond `REACH` of their container's mask, or of its box if far larger."""
     torch = import_torch()
     height, width = question.color.shape[:2]
     side = scores.shape[-1]
@@ -96,8 +80,7 @@ def _limit_to_containers(scores: Tensor, cut: Float64[np.ndarray, "k 4"], questi
     for k, holder in enumerate(question.holders.tolist()):
         if not 0 <= holder < len(question.holders):
             continue
-        box = cut[holder]
-        x0, y0, x1, y1 = (box / [width, height, width, height] * side).tolist()
+        x0, y0, x1, y1 = (cut[holder] / [width, height, width, height] * side).tolist()
         rows, columns = slice(math.floor(y0), math.ceil(y1)), slice(math.floor(x0), math.ceil(x1))
         boxed = torch.full_like(scores[holder], OUTSIDE)
         boxed[rows, columns] = -OUTSIDE
@@ -132,15 +115,9 @@ def _assign_pixels(scores: Tensor, members: list[int], height: int, width: int) 
 
 
 def _resize_scores(scores: Tensor, height: int, width: int) -> Tensor:
-    """Upsample scores to the size of the picture, shape (k, h, w)."""
     interpolate = import_torch().nn.functional.interpolate
     return interpolate(scores[:, None], (height, width), mode="bilinear", align_corners=False)[:, 0]
 
 
 def _to_tensor(values: Any, like: Tensor) -> Any:
     return import_torch().from_numpy(np.ascontiguousarray(values)).to(like.device, non_blocking=True)
-
-
-def to_id_image(ids: np.ndarray) -> IdImage:
-    """Convert an array of ids to an id image."""
-    return ids.astype(np.int32)

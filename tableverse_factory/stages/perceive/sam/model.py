@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,51 +13,16 @@ from tableverse_factory.models.local.device import Device, Tensor, import_torch
 from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.pixels import HALF, IMAGENET, Normalization, compute_pixel_values, upload_image
 from tableverse_factory.models.local.weights import load_pretrained
-from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, clip_boxes, compute_id_image, to_id_image
+from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, clip_boxes, compute_id_image
 
 BOXES = 5  # number of boxes of a picture that are decoded at a time; the last batch is padded
+# Modules that encode coordinates: in bfloat16 they would be off by up to four pixels
 FLOAT32_PARTS = ("prompt_encoder", "shared_image_embedding")
-"""Modules that encode coordinates: in bfloat16 they would be off by up to four pixels."""
-
-
-@dataclass(frozen=True, slots=True)
-class Family:
-    """Differences between the models.
-
-    Attributes:
-        architecture: Class in transformers.
-        kinds: Accepted values of `model_type`.
-        normal: Normalization of images.
-    """
-
-    architecture: str
-    kinds: tuple[str, ...]
-    normal: Normalization
-
-
-FAMILIES = {
-    "sam2": Family("Sam2Model", ("sam2", "sam2_video"), IMAGENET),
-    "sam3": Family("Sam3TrackerModel", ("sam3_tracker", "sam3_tracker_video", "sam3_video"), HALF),
+# Class in transformers, accepted values of `model_type`, and normalization of images
+FAMILIES: dict[str, tuple[str, tuple[str, ...], Normalization]] = {
+    "sam2": ("Sam2Model", ("sam2", "sam2_video"), IMAGENET),
+    "sam3": ("Sam3TrackerModel", ("sam3_tracker", "sam3_tracker_video", "sam3_video"), HALF),
 }
-
-
-@dataclass(frozen=True, slots=True)
-class PendingIds:
-    """Id image that is being copied from the device.
-
-    Attributes:
-        ids: Target of the copy, shape (h, w), int16.
-        arrived: Event at the end of the copy; None if it is complete.
-    """
-
-    ids: Tensor
-    arrived: Any
-
-    def result(self) -> IdImage:
-        """Wait for the copy and return the id image."""
-        if self.arrived is not None:
-            self.arrived.synchronize()
-        return to_id_image(self.ids.numpy())
 
 
 class Sam:
@@ -68,28 +32,24 @@ class Sam:
         self._model, self._normal, self._device = model, normal, device
         self._side = int(model.config.prompt_encoder_config.image_size)
         self._fitting_size, self._size = sys.maxsize, 0
-        self._run_encoder, self._run_decoder = (
-            CudaGraphRunner(self._encode_images, device),
-            CudaGraphRunner(self._decode, device),
-        )
+        self._run_encoder = CudaGraphRunner(self._encode_images, device)
+        self._run_decoder = CudaGraphRunner(self._decode, device)
 
     def segment(self, questions: Sequence[BoxQuestion], size: int) -> list[IdImage]:
-        """Segment pictures (`compute_id_image`), `size` of them in one forward pass.
-
-        Raises:
-            ModelError: if one picture alone does not fit into the memory.
-        """
-        return [pending.result() for pending in self.start(questions, size)]
-
-    def start(self, questions: Sequence[BoxQuestion], size: int) -> list[PendingIds]:
-        """Segment without waiting, so that the GPU works while the next pictures are prepared."""
+        """Segment pictures, `size` in one forward pass; the GPU works while the next are prepared."""
         size = min(size, self._fitting_size)
-        pending, fitted = run_in_batches(self._forward, questions, size)
+        copies, fitted = run_in_batches(self._forward, questions, size)
         if fitted < size:
             self._fitting_size = fitted
-        return pending
+        found: list[IdImage] = []
+        for ids, arrived in copies:
+            if arrived is not None:
+                arrived.synchronize()
+            found.append(ids.numpy().astype(np.int32))
+        return found
 
-    def _forward(self, questions: Sequence[BoxQuestion], size: int) -> list[PendingIds]:
+    def _forward(self, questions: Sequence[BoxQuestion], size: int) -> list[tuple[Tensor, Any]]:
+        """Segment pictures; returns targets of copies from the device, int16, with the event at their end or None."""
         torch = import_torch()
         if size != self._size:  # graphs of another size hold the memory that this one needs
             self._size = size
@@ -102,13 +62,12 @@ class Sam:
             scores = self.scores(filled, [self._boxes(question) for question in questions])
             found = [compute_id_image(mine[: len(q.boxes)], q) for mine, q in zip(scores, questions, strict=False)]
             if self._device.kind == "cpu":
-                return [PendingIds(ids, None) for ids in found]
-            copies = [
-                torch.empty(ids.shape, dtype=ids.dtype, pin_memory=True).copy_(ids, non_blocking=True) for ids in found
-            ]
+                return [(ids, None) for ids in found]
+            targets = (torch.empty(ids.shape, dtype=ids.dtype, pin_memory=True) for ids in found)
+            copies = [target.copy_(ids, non_blocking=True) for target, ids in zip(targets, found, strict=True)]
             arrived = torch.cuda.Event()
             arrived.record()
-            return [PendingIds(ids, arrived) for ids in copies]
+            return [(ids, arrived) for ids in copies]
 
     def _boxes(self, question: BoxQuestion) -> np.ndarray:
         """Scale boxes to the model's square input, shape (k, 4)."""
@@ -119,12 +78,8 @@ class Sam:
     def scores(self, pixels: Tensor, boxes: Sequence[np.ndarray]) -> Tensor:
         """Compute a low-resolution score image for each box, in float32; above 0 is inside.
 
-        Args:
-            pixels: Shape (n, 3, side, side).
-            boxes: Boxes of each picture in the model's square, shape (k, 4) each, any k; none for padding.
-
-        Returns:
-            Shape (n, m, s, s), m a multiple of `BOXES`; undefined beyond a picture's own boxes.
+        Pixels have shape (n, 3, side, side), boxes (k, 4) in that square, any k; padding has none. Returns shape
+        (n, m, s, s), m a multiple of `BOXES`; undefined beyond a picture's own boxes.
         """
         torch = import_torch()
         rounds = max(1, -(-max(len(own) for own in boxes) // BOXES))
@@ -137,19 +92,17 @@ class Sam:
         return torch.cat(scores, dim=1)
 
     def _encode_images(self, pixels: Tensor) -> tuple[Tensor, ...]:
-        """Compute the feature maps of pictures, the finest first."""
-        return tuple(self._model.get_image_embeddings(pixels))
+        return tuple(self._model.get_image_embeddings(pixels))  # feature maps, the finest first
 
     def _decode(self, boxes: Tensor, *features: Tensor) -> tuple[Tensor, ...]:
         """Compute the score images of `BOXES` boxes of each picture, shape (n, `BOXES`, s, s), in float32."""
         model, dtype = self._model, self._device.dtype
         *fine, coarse = features
         sparse, dense = model.get_prompt_embeddings(input_boxes=boxes)
+        positions = model.get_image_wide_positional_embeddings().to(dtype).repeat(len(boxes), 1, 1, 1)
         masks, *_ = model.mask_decoder(
             image_embeddings=coarse,
-            image_positional_embeddings=model.get_image_wide_positional_embeddings()
-            .to(dtype)
-            .repeat(len(boxes), 1, 1, 1),
+            image_positional_embeddings=positions,
             sparse_prompt_embeddings=sparse.to(dtype),
             dense_prompt_embeddings=dense.to(dtype),
             multimask_output=False,
@@ -159,14 +112,7 @@ class Sam:
 
 
 def load_sam(name: str, weights: str, device: Device) -> Sam:
-    """Load a model, with the default weights if none are named.
-
-    Raises:
-        ModelAccessError: if a person must act on the weights or the machine.
-    """
-    family = FAMILIES[name]
-    key = "perceive.segmenter_weights"
-    model = load_pretrained(
-        family.architecture, weights or DEFAULT_WEIGHTS[name], device, key, family.kinds, FLOAT32_PARTS
-    )
-    return Sam(model, family.normal, device)
+    """Load a model, with the default weights if none are named."""
+    architecture, kinds, normal = FAMILIES[name]
+    key, source = "perceive.segmenter_weights", weights or DEFAULT_WEIGHTS[name]
+    return Sam(load_pretrained(architecture, source, device, key, kinds, FLOAT32_PARTS), normal, device)

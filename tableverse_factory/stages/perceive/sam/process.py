@@ -1,7 +1,6 @@
 """Daemon that holds SAM for all workers of a GPU: `python -m tableverse_factory.stages.perceive.sam.process`."""
 
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -10,17 +9,12 @@ from tableverse_factory.models.local.batch_server import Arrays, BatchModel, Hea
 from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.local.model_daemon import Spec, ask_daemon, run_daemon
 from tableverse_factory.models.local.weights import make_absolute
-from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, to_id_image
+from tableverse_factory.stages.perceive.sam.masks import BoxQuestion
 from tableverse_factory.stages.perceive.sam.model import load_sam
 
 
 def segment_in_daemon(name: str, weights: str, device: Device, batch: int, question: BoxQuestion) -> IdImage:
-    """Segment a picture in the daemon, in one batch with those of other workers.
-
-    Raises:
-        ModelAccessError: if a person must act on the weights or the machine.
-        ModelError: if one picture does not fit into the memory, or the daemon dies.
-    """
+    """Segment a picture in the daemon, in one batch with those of other workers."""
     spec: Spec = {
         "name": name,
         "weights": make_absolute(weights),
@@ -29,12 +23,13 @@ def segment_in_daemon(name: str, weights: str, device: Device, batch: int, quest
         "batch": batch,
     }
     (ids,) = ask_daemon(__name__, spec, (question.color, question.boxes, question.holders))
-    return to_id_image(ids)
+    return ids.astype(np.int32)
 
 
 def configure_sam_daemon(spec: Spec) -> tuple[int, Callable[[Heartbeat], BatchModel]]:
     """Return the batch size, and a function that makes the model of a description."""
-    device = Device("cuda" if spec["device"] == "cuda" else "cpu", _parse_precision(str(spec["precision"])))
+    kind, precision = spec["device"], spec["precision"]
+    device = Device("cuda" if kind == "cuda" else "cpu", "bfloat16" if precision == "bfloat16" else "float32")
     batch = int(spec["batch"])
 
     def make(_: Heartbeat) -> BatchModel:
@@ -47,10 +42,6 @@ def configure_sam_daemon(spec: Spec) -> tuple[int, Callable[[Heartbeat], BatchMo
         return answer
 
     return batch, make
-
-
-def _parse_precision(name: str) -> Literal["float32", "bfloat16"]:
-    return "bfloat16" if name == "bfloat16" else "float32"
 
 
 if __name__ == "__main__":

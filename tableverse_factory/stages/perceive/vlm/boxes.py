@@ -10,12 +10,11 @@ from schemas.detection import Box
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.stages.perceive.vlm.prompt import BoxOrder
 
+# Keys that models use for a box, whatever they were asked; the first two tell their order
 KEYS = ("bbox_xyxy", "bbox_yxyx", "bbox", "box_2d", "bbox_2d", "box")
-"""Keys that models use for a box, whatever they were asked; the first two tell their order."""
 
 FULL = 1000.0
-SLACK = 30.0
-"""How far a box may reach out of the picture and is clipped; beyond, it is rejected."""
+SLACK = 30.0  # how far a box may reach out of the picture and is clipped; beyond, it is rejected
 MAX_FRACTION = 1.05
 MIN_SIDE_PX = 3.0
 MIN_IN_PIXELS = 2
@@ -25,10 +24,8 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
 _MAX_CHARS = 200
 _MAX_MAGNITUDE = 1e6
 
-Corners = tuple[float, float, float, float]
-"""xmin, ymin, xmax, ymax in the model's own unit."""
-ImageSize = tuple[int, int]
-"""Width and height of the picture sent [px]."""
+Corners = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax in the model's own unit
+ImageSize = tuple[int, int]  # width and height of the picture sent [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +98,6 @@ def infer_scale(boxes: Sequence[Corners], sent: ImageSize) -> BoxScale:
 
     Fractions: nothing reaches beyond 1, which in thousandths would put the table and everything on it into one corner.
     Pixels: several boxes reach beyond 1000, and all lie within the picture sent.
-
-    Raises:
-        AnswerInvalidError: if most boxes lie far beyond 1000 and outside the picture.
     """
     if not boxes:
         return THOUSANDTHS

@@ -19,7 +19,7 @@ from tableverse_factory.stages.perceive.base.replay import to_detection_result
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.vlm.boxes import ImageSize
 from tableverse_factory.stages.perceive.vlm.parse_answer import parse_detections
-from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, PostprocessedAnswer, apply_rules
+from tableverse_factory.stages.perceive.vlm.postprocess import NO_TABLE, AnswerByRules, apply_rules
 from tableverse_factory.stages.perceive.vlm.prompt import (
     build_detection_prompt,
     build_detection_schema,
@@ -27,26 +27,16 @@ from tableverse_factory.stages.perceive.vlm.prompt import (
     hash_detection_prompt,
 )
 
+# Bounds of the longer side of the picture sent: above 1000, boxes in pixels differ from normalised ones
 MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
-"""Bounds of the longer side of the picture sent [px]. Above 1000, boxes in pixels differ from normalised ones."""
-
 _JPEG_QUALITY = 92
 
 
-def detect_with_vlm(
-    view: TableView,
-    config: PerceiveConfig,
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,
-) -> DetectionResult | Dropped:
+def detect_with_vlm(view: TableView, config: PerceiveConfig, services: Services) -> DetectionResult | Dropped:
     """Detect objects with the model, by the rules of the paper's appendix A; boxes without masks.
 
     Drops: `detector_answer_invalid` (no usable answer, also after a round of repair), `detector_answer_refused` (the
     model refuses this picture), `no_table_detected`.
-
-    Raises:
-        ModelAccessError: if key, permission or credit is missing.
-        ModelError: if the server does not answer.
     """
     try:
         record = request_detections(view.observation.color, config, services)
@@ -54,27 +44,24 @@ def detect_with_vlm(
         return Dropped(NO_TABLE if error.reason == NO_TABLE else f"detector_{error.reason}", str(error))
     found = to_detection_result(record.answer, None, view.valid.shape)
     if found.table_box is None:
-        return Dropped(NO_TABLE, f"{config.model} sees no table-top" + _explain_missing_table(record))
+        lost = [remark.detail for remark in record.remarks if remark.rule == "behind_person"]
+        return Dropped(NO_TABLE, f"{config.model} sees no table-top" + (f": {lost[-1]}" if lost else ""))
     return DetectionResult(found.candidates, found.table_box, record)
 
 
 def request_detections(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
-    """Request the model's answer for a picture and apply the rules; without a table it is unusable.
-
-    Raises:
-        AnswerInvalidError: if the answer is unusable, also after a round of repair, or the model refuses.
-        ModelAccessError, ModelError: see `detect_with_vlm`.
-    """
+    """Request the model's answer for a picture and apply the rules; without a table it is unusable."""
     order = choose_box_order(config)
     picture, sent = encode_image(color)
 
-    def read(text: str) -> PostprocessedAnswer:
+    def read(text: str) -> AnswerByRules:
         return apply_rules(parse_detections(text, order, sent))
 
     client = ModelClient(read_endpoint(config), services)
     reply = client.ask_for(read, build_detection_prompt(order), [picture], build_detection_schema(order))
     origin = AnswerOrigin(model=config.model, prompt_sha256=hash_detection_prompt(order), rounds=reply.rounds)
-    return DetectionRecord(origin=origin, answer=reply.value.answer, remarks=reply.value.remarks)
+    answer, remarks = reply.value
+    return DetectionRecord(origin=origin, answer=answer, remarks=remarks)
 
 
 def encode_image(color: Picture) -> tuple[bytes, ImageSize]:
@@ -88,9 +75,3 @@ def encode_image(color: Picture) -> tuple[bytes, ImageSize]:
     data = io.BytesIO()
     picture.save(data, "JPEG", quality=_JPEG_QUALITY)
     return data.getvalue(), picture.size
-
-
-def _explain_missing_table(record: DetectionRecord) -> str:
-    """Explain why a table in the answer was dropped; empty if there was none."""
-    lost = [remark for remark in record.remarks if remark.rule == "behind_person"]
-    return f": {lost[-1].detail}" if lost else ""

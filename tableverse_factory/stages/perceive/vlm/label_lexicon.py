@@ -20,21 +20,19 @@ def split_words(words: str) -> frozenset[str]:
     return frozenset(words.split())
 
 
-_IRREGULAR = dict(
-    pair.split(":", 1)
-    for pair in split_words(
-        "people:person men:man women:woman children:child feet:foot gentlemen:gentleman knives:knife loaves:loaf "
-        "halves:half shelves:shelf leaves:leaf mice:mouse glasses:glasses scissors:scissors"
-    )
+_IRREGULAR_PLURALS = (
+    "people:person men:man women:woman children:child feet:foot gentlemen:gentleman knives:knife loaves:loaf "
+    "halves:half shelves:shelf leaves:leaf mice:mouse glasses:glasses scissors:scissors"
 )
+_IRREGULAR = dict(pair.split(":") for pair in _IRREGULAR_PLURALS.split())
 _ENDS_PHRASE = split_words(
     "with in on at near by from for to under over behind beside inside holding wearing containing full filled that"
 )
+# Of people and hands: "hand cutting bread" is a hand, though "wooden cutting board" is a board
 _ACTIONS = split_words(
     "reaching touching using gripping grabbing grasping pouring cutting chopping slicing peeling stirring picking "
     "placing pointing resting pressing typing eating drinking standing sitting smiling leaning looking"
 )
-"""Actions of people and hands: "hand cutting bread" is a hand, though "wooden cutting board" is a board."""
 _TRAILING = split_words("left right visible partial partially only held")
 _DETERMINERS = split_words("a an the some one two three both its his her their my your")
 
@@ -44,8 +42,7 @@ _PERSON = split_words(
 )
 _LIMB = split_words("hand arm forearm elbow wrist finger fingertip fingernail thumb fist knuckle shoulder torso")
 _BODY = split_words("head face leg foot neck hair body skin lap knee thigh ear eye nose mouth toe ankle chin beard")
-_AMBIGUOUS_PARTS = split_words("palm chest")
-"""Parts of people only where an owner is named."""
+_AMBIGUOUS_PARTS = split_words("palm chest")  # parts of people only where an owner is named
 _OWNER = _PERSON | split_words(
     "someone somebody user worker operator cook baker customer mother father student surgeon nurse"
 )
@@ -59,19 +56,18 @@ _OF_A_LIMB = split_words(
     "gloved skinned tattooed hairy sleeved outstretched extended raised clenched closed bent pointing reaching holding "
     "blurred pale wrinkled wet dirty young old elderly long short small large first index middle ring little pinky"
 )
-_COVERED = split_words("gloved sleeved skinned")
-"""Words beside which any colour may stand: "blue gloved hand"."""
+_COVERED = split_words("gloved sleeved skinned")  # beside which any colour may stand: "blue gloved hand"
+# Adjectives of living people; a "foosball man" is none
 _PERSON_ADJECTIVES = split_words(
     "young old elderly tall short bearded bald blond blonde black white brown asian african indian smiling laughing "
     "standing sitting seated kneeling walking masked blurred background business police"
 )
-"""Adjectives of living people; a "foosball man" is none."""
 _ARTIFICIAL = split_words(
     "robot robotic gripper effector manipulator mannequin doll statue figurine skeleton prosthetic toy"
 )
 _NO_LIMB = {("lady", "finger")}
+# Parts and amounts of what "of" names: "pair of hands"
 _PARTITIVES = split_words("part pair group couple back tip side portion section piece top close palm bunch")
-"""Parts and amounts of what "of" names: "pair of hands"."""
 
 _TABLE = split_words("table desk countertop counter tabletop worktop workbench surface")
 _TABLE_PLACES = split_words(
@@ -80,12 +76,12 @@ _TABLE_PLACES = split_words(
     "main bedside marble granite quartz stone concrete tile tiled laminate stainless steel wood wooden oak pine "
     "walnut bamboo"
 )
+# Adjectives of tables, though not of counters: a "red counter" is a piece of a game
 _TABLE_ADJECTIVES = split_words(
     "white black gray grey brown beige tan blue green red yellow light dark colored round square rectangular circular "
     "oval flat long short small large big low high standing folding glass metal plastic polished shiny clean empty "
     "cluttered visible outdoor textured smooth"
 )
-"""Adjectives of tables, though not of counters: a "red counter" is a piece of a game."""
 _NOT_TABLES = split_words(
     "toy doll dollhouse miniature model tally step coin geiger click person hand bead lap periodic frequency"
 )
@@ -164,9 +160,8 @@ def names_table(label: str) -> bool:
     phrase = _parse_table_phrase(label)
     if phrase is None or (phrase.head == "surface" and not phrase.before):
         return False
-    return set(phrase.before) <= _DETERMINERS | _TABLE_PLACES | (
-        _TABLE_ADJECTIVES if phrase.head != "counter" else frozenset()
-    )
+    adjectives = frozenset() if phrase.head == "counter" else _TABLE_ADJECTIVES
+    return set(phrase.before) <= _DETERMINERS | _TABLE_PLACES | adjectives
 
 
 def may_name_table(label: str) -> bool:
@@ -201,8 +196,7 @@ def parse_label(label: str, ends: frozenset[str] = _ENDS_PHRASE) -> LabelPhrase:
     text = unicodedata.normalize("NFKC", label[:_MAX_CHARS]).casefold().replace("'s", "").replace("’s", "")
     cut = _CUT.split(text.lstrip(" ([{,;:/|"))[0]
     words = [_to_singular(word) for word in _WORD.findall(cut)]
-    end = next((k for k, word in enumerate(words) if k > 0 and word in ends), len(words))
-    words = words[:end]
+    words = words[: next((k for k, word in enumerate(words) if k > 0 and word in ends), None)]
     of = words.index("of") if "of" in words[1:] else len(words)
     noun, after = words[:of], words[of + 1 :]
     while len(noun) > 1 and noun[-1] in _TRAILING:

@@ -27,16 +27,16 @@ _COSMETIC = split_words("hand face body sun shaving eye foot skin baby")
 _LOOSENED = split_words(
     "liquid melted ground powdered grated shredded mashed whipped granulated foamy scrambled minced"
 )
+# Nouns that `_LOOSENED` makes non-solid: a "powdered doughnut" stays solid
 _LOOSENABLE = split_words(
     "potato cheese egg butter chocolate wax soap detergent meat beef pork chicken garlic onion ginger carrot cabbage "
     "lettuce coconut chili nut almond peanut avocado banana"
 )
-"""Nouns that `_LOOSENED` makes non-solid: a "powdered doughnut" stays solid."""
+# Before a non-solid noun, these name its package
 _PACKED = split_words(
     "canned tinned bottled boxed bagged packed packaged wrapped sealed instant cup pot can tin bottle jar box carton "
     "bag packet pouch sachet tube"
 )
-"""Before a non-solid noun, these name its package."""
 
 _VESSEL = split_words(
     "cup mug teacup tumbler beaker glass goblet stein bowl basin ramekin pot saucepan pan skillet wok casserole jar "

@@ -28,14 +28,9 @@ _TAG = re.compile(r'(")?<bbox>([-+\d.eE, ]{7,100})</bbox>(?(1)")')
 
 @dataclass(frozen=True, slots=True)
 class ParsedDetection:
-    """One entry of an answer.
+    """One entry of an answer, `where` such as `composites[0].contents[1]`, its box in thousandths of the picture.
 
-    Attributes:
-        where: Its place in the answer, such as `composites[0].contents[1]`.
-        label: Cleaned, but still untrusted.
-        box: Box within the picture, in thousandths.
-        held: Whether a person holds the object.
-        count: Number of such objects.
+    The label is cleaned, but still untrusted; `held` means in a person's hand.
     """
 
     where: str
@@ -58,11 +53,9 @@ class ParsedComposite:
 
 @dataclass(frozen=True, slots=True)
 class ParsedAnswer:
-    """A parsed answer.
+    """A parsed answer with boxes of persons seen with head and torso, None where it has no such list.
 
-    Attributes:
-        people: Boxes of persons seen with head and torso; None where the answer has no such list.
-        remarks: Entries that were unreadable or had to be corrected.
+    Remarks are on entries that were unreadable or had to be corrected.
     """
 
     detections: tuple[ParsedDetection, ...]
@@ -74,14 +67,8 @@ class ParsedAnswer:
 def parse_detections(text: str, order: BoxOrder, sent: ImageSize) -> ParsedAnswer:
     """Parse a model's text; unreadable entries are left out one by one, with a remark.
 
-    Args:
-        text: The model's answer.
-        order: Order of a box's numbers that the prompt asked for.
-        sent: Width and height of the picture sent [px].
-
-    Raises:
-        AnswerInvalidError: if there is no JSON object or none of the two lists, the unit of the boxes is unclear,
-            there are too many entries, or most are unreadable.
+    `AnswerInvalidError` says what a model may repair: no JSON object, neither list, an unclear unit of the boxes, too
+    many entries, or most of them unreadable.
     """
     answer = _extract_object(text)
     detections, composites = _read_list(answer, "detections"), _read_list(answer, "composites")
@@ -183,7 +170,7 @@ class _EntryReader:
             return None
         if detail:
             self.remark(where, name, "box", detail)
-        score, count = self._read_score(where, name, entry.get("score")), self._read_count(where, name, entry)
+        score, count = self._read_score(where, name, entry), self._read_count(where, name, entry)
         if count == 0:
             self.remark(where, name, "unreadable", "there are none of it")
             return None
@@ -197,17 +184,15 @@ class _EntryReader:
             return None, "it has no box of four numbers"
         return normalise_box(corners, self._scale, self._sent)
 
-    def _read_score(self, where: str, label: str, value: Any) -> float:
-        score = 1.0 if value is None else read_number(value)
+    def _read_score(self, where: str, label: str, entry: Mapping[str, Any]) -> float:
+        score = 1.0 if entry.get("score") is None else read_number(entry["score"])
         if 0.0 <= score <= 1.0:
             return score
         self.remark(where, label, "score", "it is no number from 0 to 1")
         return 1.0
 
     def _read_count(self, where: str, label: str, entry: Mapping[str, Any]) -> int:
-        """Read the count, 0 to `MAX_COUNT`; 1 where there is none."""
-        value = entry.get("count")
-        number = 1.0 if value is None else read_number(value)
+        number = 1.0 if entry.get("count") is None else read_number(entry["count"])
         if 0 <= number <= MAX_COUNT and number == int(number):
             return int(number)
         count = MAX_COUNT if number > MAX_COUNT else 1
@@ -216,10 +201,8 @@ class _EntryReader:
 
 
 def _read_text(value: Any) -> str:
-    """Clean a description to one bounded line."""
     if not isinstance(value, str):
         return ""
-    printable = "".join(
-        c if c.isprintable() else " " for c in replace_lone_surrogates(value[: 4 * MAX_DESCRIPTION_CHARS])
-    )
+    text = replace_lone_surrogates(value[: 4 * MAX_DESCRIPTION_CHARS])
+    printable = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(printable.split())[:MAX_DESCRIPTION_CHARS]

@@ -1,7 +1,7 @@
 """Rules of the paper's appendix A, applied to a parsed answer: every object once, no people, one table."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from schemas.detection import Box, Composite, Container, Content, Detection, DetectionRemark, Detections
 from tableverse_factory.core.errors import AnswerInvalidError
@@ -23,36 +23,16 @@ from tableverse_factory.stages.perceive.vlm.non_solid_labels import fills, names
 from tableverse_factory.stages.perceive.vlm.parse_answer import ParsedAnswer, ParsedComposite, ParsedDetection
 
 NO_TABLE = "no_table_detected"
-MAX_BEHIND = 0.5
-"""Share of its box within a person's beyond which an object that is not held counts as behind the person."""
-SAME_BOX = 0.85
-"""Intersection over union from which two boxes with the same name are one object."""
-INSIDE = 0.8
-"""Share of its box within another's from which an object lies in it."""
-GROUP_SHARE = 0.6
-"""Share of the container's box from which the box of counted contents is that of all of them."""
+MAX_BEHIND = 0.5  # share of its box in a person's beyond which an object that is not held is behind the person
+SAME_BOX = 0.85  # intersection over union from which two boxes with the same name are one object
+INSIDE = 0.8  # share of its box within another's from which an object lies in it
+GROUP_SHARE = 0.6  # share of the container's box from which the box of counted contents is that of all of them
+
+AnswerByRules = tuple[Detections, tuple[DetectionRemark, ...]]  # and remarks on what was left out or changed
 
 
-@dataclass(frozen=True, slots=True)
-class PostprocessedAnswer:
-    """An answer that follows the rules.
-
-    Attributes:
-        table: Whether it has a table.
-        remarks: What was left out or changed, in the order of the rules.
-    """
-
-    answer: Detections
-    table: bool
-    remarks: tuple[DetectionRemark, ...]
-
-
-def apply_rules(parsed: ParsedAnswer) -> PostprocessedAnswer:
-    """Apply every rule to a parsed answer.
-
-    Raises:
-        AnswerInvalidError: `no_table_detected` if objects are listed but no table: asked again, a model may find it.
-    """
+def apply_rules(parsed: ParsedAnswer) -> AnswerByRules:
+    """Apply every rule; `no_table_detected` where objects are listed but no table: asked again, a model may find it."""
     rules = _RuleSet(parsed)
     rules.drop_people()
     rules.choose_table()
@@ -61,7 +41,7 @@ def apply_rules(parsed: ParsedAnswer) -> PostprocessedAnswer:
     rules.drop_fillings()
     rules.drop_duplicates()
     rules.split_groups()
-    return PostprocessedAnswer(rules.detections(), rules.table is not None, tuple(rules.remarks))
+    return rules.detections(), tuple(rules.remarks)
 
 
 class _RuleSet:
@@ -102,7 +82,7 @@ class _RuleSet:
         """
         entries = [*self.singles, *(composite.container for composite in self.composites)]
         is_table = names_table if any(names_table(entry.label) for entry in entries) else may_name_table
-        for composite in [composite for composite in self.composites if is_table(composite.container.label)]:
+        for composite in [it for it in self.composites if is_table(it.container.label)]:
             self._remark(composite.container, "table_as_container", "what stands on a table is not in it")
             self.composites.remove(composite)
             self.singles += (composite.container, *composite.contents)
@@ -139,9 +119,8 @@ class _RuleSet:
         """Make a container with non-solid contents one object; drop contents that lie apart from it."""
         for k, composite in enumerate(self.composites):
             holder = composite.container
-            matter = next(
-                (it for it in composite.contents if fills(it.label, holder.label, is_listed_in_it=True)), None
-            )
+            filling = (it for it in composite.contents if fills(it.label, holder.label, is_listed_in_it=True))
+            matter = next(filling, None)
             apart = [entry for entry in composite.contents if intersect_boxes(entry.box, holder.box) <= 0]
             if matter is not None:
                 self._remark(holder, "not_solid", f"one entry with {matter.label!r} in it")
@@ -158,10 +137,8 @@ class _RuleSet:
 
     def drop_fillings(self) -> None:
         """Drop a non-solid object in the box of a container that it fills; else it names its own container."""
-        others = [
-            *self.singles,
-            *(entry for composite in self.composites for entry in (composite.container, *composite.contents)),
-        ]
+        listed = (entry for composite in self.composites for entry in (composite.container, *composite.contents))
+        others = [*self.singles, *listed]
         kept = []
         for entry in self.singles:
             if holder := next((it for it in others if _is_filled_with(it, entry)), None):
@@ -259,9 +236,8 @@ def _to_detection(entry: ParsedDetection) -> Detection:
 
 
 def _to_composite(composite: ParsedComposite) -> Composite:
-    holder = Container(
-        label=composite.container.label, bbox=composite.container.box, description=composite.container.description
-    )
+    whole = composite.container
+    holder = Container(label=whole.label, bbox=whole.box, description=whole.description)
     contents = tuple(
         Content(label=entry.label, bbox=entry.box, count=entry.count, description=entry.description)
         for entry in composite.contents

@@ -1,7 +1,6 @@
 """Prompt and answer schema of the vision-language detectors: the rules of the paper's appendix A.
 
-Beside the paper's schema stand `people`, boxes of persons visible with head and torso, and `held`; an answer may lack
-them, but without them the rule on objects behind a person cannot be checked.
+Beside the paper's schema stand `people` and `held`, without which the rule on objects behind a person is not checked.
 """
 
 from typing import Literal
@@ -62,17 +61,16 @@ supposes nothing; containers, contents and composites must have one.
 Answer with one JSON object of this shape, without code fences and without a word around it:
 """
 
+# In the prompt too: a server may neither enforce the schema nor show it to its model
 SHAPE = """\
 {{"people": [{corners}],
  "detections": [{{"label": string, "{single}": {corners}, "score": number, "held": boolean, "description": string}}],
  "composites": [{{"type": "container_fill", "description": string,
    "container": {{"label": string, "{part}": {corners}, "held": boolean, "description": string}},
    "contents": [{{"label": string, "{part}": {corners}, "count": integer, "description": string}}]}}]}}"""
-"""Repeated in the prompt: a server may neither enforce the schema nor show it to its model."""
-
 CORNERS = {"xyxy": "[xmin, ymin, xmax, ymax]", "yxyx": "[ymin, xmin, ymax, xmax]"}
+# Key of a box in `detections` and in `composites`: as in the paper; as Gemini's models have learned it
 BOX_KEYS: dict[BoxOrder, tuple[str, str]] = {"xyxy": ("bbox_xyxy", "bbox"), "yxyx": ("box_2d", "box_2d")}
-"""Key of a box in `detections` and in `composites`: as in the paper; as Gemini's models have learned it."""
 
 
 def choose_box_order(config: PerceiveConfig) -> BoxOrder:

@@ -15,7 +15,7 @@ from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import Device, import_torch
 from tableverse_factory.models.local.model_daemon import close_connections
 from tableverse_factory.models.local.pixels import compute_pixel_values, upload_image
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, BoxPrompts, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.perceive import segment_boxes
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, compute_id_image, group_by_depth
 from tableverse_factory.stages.perceive.sam.model import load_sam
@@ -203,16 +203,17 @@ def test_a_scene_goes_through_the_door(folders):
     view = find_table(look([Box(0.0, 0.0, (0.1, 0.08, 0.12))])[0], np.random.default_rng(0))
     perceive = {"detector": "replay", "segmenter": "sam2", "segmenter_weights": str(folders["sam2"][0])}
     config = Config.model_validate({"models": {"device": "cpu"}, "perceive": perceive})
-    asked = build_question(view, BoxPrompts(((10.0, 10.0, 60.0, 60.0),), (None,), (0.0, 0.0, 300.0, 200.0)))
+    box = Candidate("box", 1.0, (10.0, 10.0, 60.0, 60.0))
+    asked = build_question(view, DetectionResult((box,), (0.0, 0.0, 300.0, 200.0)))
     assert (asked.has_table, asked.boxes.shape, asked.holders.tolist()) == (True, (2, 4), [-1])
     bowl = Candidate("bowl", 1.0, (100.0, 60.0, 220.0, 180.0))
     apple = Candidate("apple", 1.0, (120.0, 80.0, 180.0, 140.0), container=0)
     found = DetectionResult((bowl, apple), (0.0, 0.0, 300.0, 200.0))
-    ids = segment_boxes(view, found, config, np.random.default_rng(0), None)
+    ids = segment_boxes(view, found, config)
     assert ids.shape == view.valid.shape
     assert set(np.unique(ids)) <= {TABLE_ID, 0, 1, 2}
-    assert np.array_equal(ids, segment_boxes(view, found, config, np.random.default_rng(1), None))
-    nothing = segment_boxes(view, DetectionResult((), (0.0, 0.0, 300.0, 200.0)), config, np.random.default_rng(0), None)
+    assert np.array_equal(ids, segment_boxes(view, found, config))
+    nothing = segment_boxes(view, DetectionResult((), (0.0, 0.0, 300.0, 200.0)), config)
     assert not nothing.any()
 
 

@@ -146,6 +146,6 @@ def test_no_answer_breaks_the_reading_or_the_rules(label, box, people, count):
     composites = [filled, filled, people, {"container": {"label": "bowl", "bbox": [1, 2, 99, 99]}, "contents": box}]
     text = json.dumps({"detections": [table, entry, count], "composites": composites, "people": people})
     with suppress(AnswerInvalidError):
-        found = apply_rules(parse_detections(text, "xyxy", SENT)).answer
+        found = apply_rules(parse_detections(text, "xyxy", SENT))[0]
         assert all(len(item.label) <= 120 for item in found.detections)
         assert Detections.model_validate_json(found.model_dump_json()) == found
