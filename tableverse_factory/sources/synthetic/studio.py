@@ -13,7 +13,7 @@ from tableverse_factory.sources.synthetic.settle import TABLE_THICKNESS_M
 from tableverse_factory.sources.synthetic.solids import make_block
 from tableverse_factory.sources.synthetic.textures import fill_color, tile_picture
 from tableverse_factory.sources.textures.catalogue import (
-    FAMILIES,
+    MEMBERS,
     TEXTURE_COUNT,
     TILE_M,
     make_texture,
@@ -48,7 +48,7 @@ def make_table(rng: np.random.Generator, half_xy: tuple[float, float]) -> Studio
 def make_room(rng: np.random.Generator, view_azimuth: float) -> list[StudioSurface]:
     """Make the floor, and often a wall behind the table as the camera sees it."""
     family = FLOORS[int(rng.integers(len(FLOORS)))]
-    ground = parse_texture_seed(f"{family}-{int(rng.integers(TEXTURE_COUNT // len(FAMILIES)))}")
+    ground = parse_texture_seed(f"{family}-{int(rng.integers(MEMBERS))}")
     floor = _make_quad(np.array([[x, y, FLOOR_M] for x, y in ((-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0))]))
     surfaces = [StudioSurface(floor, tile_picture(make_texture(ground, TILE_PX), FLOOR_TILE_M))]
     if rng.random() < 0.65:

@@ -1,4 +1,4 @@
-"""Layouts of boards, bricks and tiles on the square: straight, staggered, in baskets or as herringbone."""
+"""Layouts of boards and tiles on the square: in rows, or as herringbone."""
 
 from dataclasses import dataclass
 
@@ -31,21 +31,6 @@ def lay_rows(size: int, down: int, right: int, offsets: np.ndarray) -> BoardLayo
     ids = row * right + column.astype(np.int32) % right
     edge = np.minimum(np.minimum(along, 1 - along) / right, np.minimum(across, 1 - across) / down)
     return BoardLayout(ids, down * right, along, across, edge, np.zeros((size, size), dtype=bool))
-
-
-def lay_baskets(size: int, blocks: int, strips: int) -> BoardLayout:
-    """Lay squares of parallel strips, every other square turned; `blocks` is even."""
-    u, v = pixel_grid(size)
-    x, y = u * blocks, v * blocks
-    column, row = (np.minimum(t.astype(np.int32), blocks - 1) for t in (x, y))
-    upright = (column + row) % 2 == 1
-    inside_x, inside_y = x - column, y - row
-    along = np.where(upright, inside_y, inside_x)
-    place = np.where(upright, inside_x, inside_y) * strips
-    strip = np.minimum(place.astype(np.int32), strips - 1)
-    across = place - strip
-    edge = np.minimum(np.minimum(along, 1 - along), np.minimum(across, 1 - across) / strips) / blocks
-    return BoardLayout((row * blocks + column) * strips + strip, blocks * blocks * strips, along, across, edge, upright)
 
 
 def lay_herringbone(size: int, repeats: int, length: int) -> BoardLayout:

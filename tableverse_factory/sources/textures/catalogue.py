@@ -14,80 +14,63 @@ from tableverse_factory.sources.textures import cloth, sheets, stone, tiles, woo
 from tableverse_factory.sources.textures.draw import TextureSampler
 from tableverse_factory.sources.textures.fields import Raster
 
-TEXTURE_COUNT = 1728  # Textures that are tested to be distinct; seeds beyond make more of the same families
+MEMBERS = 72  # of each family that are tested to be distinct; larger seeds make more of the same families
 TILE_M = 0.6  # Length of table that a texture covers before it repeats [m]
 MIN_SIZE, MAX_SIZE = 16, 4096
 
 Family = Callable[[TextureSampler], Raster]
 
-FAMILIES: dict[str, Family] = {
-    "planks": partial(
-        wood.draw_boards_in_rows, downs=(4, 5, 6, 8, 10), rights=(1, 2), seam=0.0016, tones=0.14, rings=4.5
+# The key of a family's random numbers, and how it is drawn.
+_FAMILIES: dict[str, tuple[int, Family]] = {
+    "planks": (
+        0,
+        partial(wood.draw_boards_in_rows, downs=(4, 5, 6, 8, 10), rights=(1, 2), seam=0.0016, tones=0.14, rings=4.5),
     ),
-    "marble": stone.draw_marble,
-    "linen": cloth.draw_linen,
-    "square_tiles": partial(tiles.draw_glazed_tiles, layouts=((4, 4), (6, 6), (8, 8), (10, 10), (12, 12))),
-    "brushed_metal": sheets.draw_brushed_metal,
-    "terrazzo": stone.draw_terrazzo,
-    "butcher_block": partial(
-        wood.draw_boards_in_rows, downs=(12, 16, 20, 24), rights=(2, 4), seam=0.0005, tones=0.3, rings=3.0
+    "marble": (1, stone.draw_marble),
+    "linen": (2, cloth.draw_linen),
+    "square_tiles": (3, tiles.draw_glazed_tiles),
+    "brushed_metal": (4, sheets.draw_brushed_metal),
+    "terrazzo": (5, stone.draw_terrazzo),
+    "butcher_block": (
+        6,
+        partial(wood.draw_boards_in_rows, downs=(12, 16, 20, 24), rights=(2, 4), seam=0.0005, tones=0.3, rings=3.0),
     ),
-    "gingham": cloth.draw_gingham,
-    "concrete": stone.draw_concrete,
-    "leather": sheets.draw_leather,
-    "parquet": wood.draw_parquet,
-    "hexagons": tiles.draw_hexagons,
-    "laminate": sheets.draw_laminate,
-    "tartan": cloth.draw_tartan,
-    "granite": stone.draw_granite,
-    "veneer": wood.draw_veneer,
-    "cork": sheets.draw_cork,
-    "mosaic": tiles.draw_mosaic,
-    "stripes": cloth.draw_stripes,
-    "painted_wood": wood.draw_painted_wood,
-    "lacquer": sheets.draw_lacquer,
-    "travertine": stone.draw_travertine,
-    "herringbone_parquet": wood.draw_herringbone_parquet,
-    "twill": cloth.draw_twill,
-    "checkers": tiles.draw_checkers,
-    "hammered_metal": sheets.draw_hammered_metal,
-    "onyx": stone.draw_onyx,
-    "plywood": wood.draw_plywood,
-    "houndstooth": cloth.draw_houndstooth,
-    "bricks": partial(
-        tiles.draw_glazed_tiles, layouts=((8, 4), (12, 4), (12, 6), (16, 8), (20, 6)), steps=(0.5, 1 / 3)
-    ),
-    "plaster": sheets.draw_plaster,
-    "strand_board": wood.draw_strand_board,
-    "slate": stone.draw_slate,
-    "felt": cloth.draw_felt,
-    "cement_tiles": tiles.draw_cement_tiles,
-    "galvanised": sheets.draw_galvanised,
-    "bamboo": wood.draw_bamboo,
-    "windowpane": cloth.draw_windowpane,
-    "sandstone": stone.draw_sandstone,
-    "rubber": sheets.draw_rubber,
-    "dots": cloth.draw_dots,
-    "stone_slabs": tiles.draw_stone_slabs,
-    "patina": sheets.draw_patina,
-    "tweed": cloth.draw_tweed,
-    "chipboard": sheets.draw_chipboard,
-    "wicker": cloth.draw_wicker,
-    "broken_mosaic": tiles.draw_broken_mosaic,
-    "tread_plate": sheets.draw_tread_plate,
+    "gingham": (7, cloth.draw_gingham),
+    "concrete": (8, stone.draw_concrete),
+    "leather": (9, sheets.draw_leather),
+    "laminate": (12, sheets.draw_laminate),
+    "tartan": (13, cloth.draw_tartan),
+    "granite": (14, stone.draw_granite),
+    "veneer": (15, wood.draw_veneer),
+    "mosaic": (17, tiles.draw_mosaic),
+    "stripes": (18, cloth.draw_stripes),
+    "painted_wood": (19, wood.draw_painted_wood),
+    "lacquer": (20, sheets.draw_lacquer),
+    "travertine": (21, stone.draw_travertine),
+    "herringbone_parquet": (22, wood.draw_herringbone_parquet),
+    "plywood": (27, wood.draw_plywood),
+    "plaster": (30, sheets.draw_plaster),
+    "felt": (33, cloth.draw_felt),
+    "stone_slabs": (41, tiles.draw_stone_slabs),
 }
-"""In the order of the seeds, which go round: seed 0 is planks, seed 1 marble, seed 48 planks again."""
-
+FAMILIES = tuple(_FAMILIES)  # in the order of the seeds, which go round: 0 is planks, 1 marble, 24 planks again
+TEXTURE_COUNT = MEMBERS * len(FAMILIES)  # 1,728
 
 _SUBSTITUTES = {
-    36: (657, 795, 806, 884, 968, 981, 1008, 1187, 1264, 1289, 1417, 1566, 1567, 1616, 1654, 1668),
-    37: (646, 728, 752, 947, 1374, 1467, 1504),
-    39: (755, 1323),
-    40: (1043,),
-}  # fmt: skip
-"""Members that replace those which look too much like another texture: number in the family, and seeds replaced."""
-
-_NUMBERS = {seed: number for number, seeds in _SUBSTITUTES.items() for seed in seeds}
+    "planks": {21: 36, 36: 72, 59: 73, 71: 74},
+    "marble": {68: 72},
+    "linen": {55: 72, 70: 73},
+    "concrete": {15: 37, 20: 36, 36: 72, 37: 73, 67: 74},
+    "veneer": {46: 72, 47: 73, 53: 74, 65: 75, 67: 76},
+    "lacquer": {18: 36, 36: 72},
+    "travertine": {20: 36, 36: 72, 59: 73},
+    "herringbone_parquet": {13: 37, 34: 36, 36: 72, 37: 73},
+    "plywood": {16: 36, 27: 39, 30: 37, 36: 72, 37: 74, 38: 75, 39: 77, 40: 78, 58: 79, 64: 80, 66: 81},
+    "plaster": {28: 37, 32: 36, 36: 72, 37: 73, 68: 74},
+    "felt": {13: 36, 36: 72},
+    "stone_slabs": {26: 36, 36: 72},
+}
+"""Members that would look too much like another texture, and the number that is drawn in their place."""
 
 
 def make_texture(seed: int, size: int = 512) -> Picture:
@@ -95,10 +78,11 @@ def make_texture(seed: int, size: int = 512) -> Picture:
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise InputError(f"a texture of {size} px: give {MIN_SIZE} to {MAX_SIZE}")
     family, number = _split_seed(seed)
-    index, number = int(seed) % len(FAMILIES), _NUMBERS.get(int(seed), number)
-    rng = np.random.default_rng(np.random.SeedSequence([index, number]))
-    draw = TextureSampler(rng, number, size, start=0.618034 * index)
-    return np.rint(np.clip(FAMILIES[family](draw), 0, 255)).astype(np.uint8)
+    number = _SUBSTITUTES.get(family, {}).get(number, number)
+    key, draw_family = _FAMILIES[family]
+    rng = np.random.default_rng(np.random.SeedSequence([key, number]))
+    raster = draw_family(TextureSampler(rng, number, size, start=0.618034 * key))
+    return np.rint(np.clip(raster, 0, 255)).astype(np.uint8)
 
 
 def name_texture(seed: int) -> str:
@@ -116,7 +100,7 @@ def parse_texture_seed(name: int | str) -> int:
         raise InputError(
             f"no texture {text[:60]!r}: give a seed, or family and number as marble-12; {_suggest_family(text)}"
         )
-    return int(number) * len(FAMILIES) + list(FAMILIES).index(family) if family else int(number)
+    return int(number) * len(FAMILIES) + FAMILIES.index(family) if family else int(number)
 
 
 def _suggest_family(text: str) -> str:
@@ -130,4 +114,4 @@ def _split_seed(seed: Any) -> tuple[str, int]:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
         raise InputError(f"texture seed {seed!r:.60}: give a whole number from 0 on")
     number, family = divmod(int(seed), len(FAMILIES))
-    return list(FAMILIES)[family], number
+    return FAMILIES[family], number

@@ -1,4 +1,4 @@
-"""Stone: marble, granite, terrazzo, travertine, slate, onyx, sandstone, concrete."""
+"""Stone: marble, granite, terrazzo, travertine, concrete."""
 
 from collections.abc import Sequence
 
@@ -13,10 +13,8 @@ from tableverse_factory.sources.textures.fields import (
     brighten,
     map_colors,
     paint,
-    pixel_grid,
     shade_relief,
     smoothstep,
-    wave,
 )
 
 MARBLES: tuple[tuple[str, str, str], ...] = (
@@ -49,21 +47,6 @@ def draw_marble(draw: TextureSampler) -> Raster:
         thin = width * draw.between(0.5, 1.5)
         raster = paint(raster, vein, strength * fade * (0.75 * bell(path, thin) + 0.25 * bell(path, 5 * thin)))
     return brighten(raster, 0.01 * draw.noise((90, 90), 2))
-
-
-def draw_onyx(draw: TextureSampler) -> Raster:
-    """Draw bands of translucent colour, folded."""
-    hue, chroma = draw.spread(0), 0.03 + 0.1 * draw.spread(3)
-    bright = 0.45 + 0.4 * draw.spread(1)
-    fold = draw.noise((2, 2), 5, 0.5)
-    u, v = pixel_grid(draw.size)
-    turns = v * draw.whole(1, 3) + u * draw.whole(0, 2) + draw.between(0.3, 0.7) * fold
-    bands = 0.5 + 0.3 * wave(turns) + 0.14 * wave(3 * turns + 0.3 * fold) + 0.09 * wave(9 * turns + fold)
-    stops = [
-        oklch(min(0.97, bright + shift), chroma * share, hue + turn)
-        for shift, share, turn in ((-0.2, 1.2, 0.04), (0.0, 1.0, 0.0), (0.16, 0.6, -0.03), (0.3, 0.3, -0.05))
-    ]
-    return brighten(map_colors(bands, stops), 0.015 * draw.noise((60, 60), 2))
 
 
 def draw_granite(draw: TextureSampler) -> Raster:
@@ -119,28 +102,6 @@ def draw_travertine(draw: TextureSampler) -> Raster:
     pits = draw.noise((48, 110), 2, 0.6) + 0.8 * draw.noise((2, 14), 2)
     deep = smoothstep(pits, draw.between(1.8, 2.4), 2.8)
     return brighten(paint(raster, scale_color(base, 0.5), 0.8 * deep), shade_relief(-deep, 0.25))
-
-
-def draw_sandstone(draw: TextureSampler) -> Raster:
-    """Draw grains of sand in faint, wavy beds."""
-    base = draw.color((0.5, 0.4), (0.03, 0.07), (0.04, 0.22))
-    _, v = pixel_grid(draw.size)
-    bend = draw.noise((2, 2), 3)
-    beds = wave(v * draw.choose((4, 7, 11)) + 0.35 * bend) + 0.5 * draw.noise((1, 24), 3)
-    sand = draw.noise((120, 120), 2, 0.9)
-    weight = 0.5 + draw.between(0.08, 0.2) * beds + 0.11 * sand
-    return map_shades(weight, base, 0.72, 1.12)
-
-
-def draw_slate(draw: TextureSampler) -> Raster:
-    """Draw split stone: steps, fine ridges, a dull sheen."""
-    base = draw.color((0.24, 0.3), (0.0, 0.045))
-    coarse = draw.choose((2, 3, 5))
-    height = draw.noise((coarse, 2 * coarse), 6, 0.62)
-    steps = height + 0.25 * np.floor(1.5 * height)
-    rust = smoothstep(draw.noise((3, 3), 4), 0.9, 2.2) * (0.5 if draw.chance(0.4) else 0.0)
-    raster = map_shades(0.5 + 0.16 * height, base, 0.8, 1.25)
-    return brighten(paint(raster, parse_hex("8a5f3c"), rust), shade_relief(steps, draw.between(0.5, 1.1)))
 
 
 def draw_concrete(draw: TextureSampler) -> Raster:

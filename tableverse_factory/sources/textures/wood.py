@@ -1,11 +1,11 @@
-"""Wood: boards, parquet, butcher block, bamboo, veneer, plywood, painted and worn, strand board."""
+"""Wood: planks, butcher block, herringbone parquet, veneer, plywood, painted and worn boards."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from tableverse_factory.sources.textures.boards import BoardLayout, lay_baskets, lay_herringbone, lay_rows
-from tableverse_factory.sources.textures.draw import TextureSampler, map_shades, parse_hex, scale_color
+from tableverse_factory.sources.textures.boards import BoardLayout, lay_herringbone, lay_rows
+from tableverse_factory.sources.textures.draw import TextureSampler, parse_hex, scale_color
 from tableverse_factory.sources.textures.fields import (
     Color,
     Field,
@@ -52,12 +52,6 @@ def draw_boards_in_rows(
     return _draw_boards(draw, lay_rows(draw.size, down, right, draw.rng.random(down)), seam, tones, rings)
 
 
-def draw_parquet(draw: TextureSampler) -> Raster:
-    """Draw squares of strips, every other one turned."""
-    blocks, strips = draw.choose((4, 6, 8)), draw.whole(3, 6)
-    return _draw_boards(draw, lay_baskets(draw.size, blocks, strips), seam=0.0012, tones=0.24, rings=3.0)
-
-
 def draw_herringbone_parquet(draw: TextureSampler) -> Raster:
     """Draw boards that meet at right angles."""
     repeats, length = draw.choose(((1, 4), (2, 3), (1, 5), (2, 4), (1, 6)))
@@ -85,19 +79,6 @@ def draw_plywood(draw: TextureSampler) -> Raster:
     return raster
 
 
-def draw_bamboo(draw: TextureSampler) -> Raster:
-    """Draw narrow slats with their knots."""
-    down, right = draw.choose((24, 32, 40)), draw.whole(2, 3)
-    boards = lay_rows(draw.size, down, right, draw.rng.random(down))
-    light = draw.color((0.62, 0.26), (0.06, 0.05), (0.17, 0.07))
-    tone = draw.each(boards.count, 0.18)[boards.ids]
-    grain = draw.noise((3, 160), 2)
-    knot = bell(boards.along - 0.5, 0.02 * right / 2)
-    weight = 0.35 + tone + 0.12 * grain + 0.45 * knot
-    raster = map_shades(weight, light, 1.12, 0.62)
-    return brighten(raster, -0.35 * bell(boards.edge, 0.0009))
-
-
 def draw_painted_wood(draw: TextureSampler) -> Raster:
     """Draw boards under paint, rubbed through to the wood here and there."""
     down = draw.choose((4, 5, 6, 8))
@@ -110,30 +91,6 @@ def draw_painted_wood(draw: TextureSampler) -> Raster:
     tone = draw.each(boards.count, 0.07)[boards.ids]
     coated = paint(wood, coat, 0.96 * cover)
     return brighten(coated, 0.035 * strokes * cover + tone - 0.45 * bell(boards.edge, 0.0014))
-
-
-def draw_strand_board(draw: TextureSampler) -> Raster:
-    """Draw pressed flakes of wood (OSB): layers of long cells at several angles, of which the nearest one shows."""
-    light, dark = _draw_species(draw, (0, 5, 9, 3, 14, 7))
-    fine = draw.choose((10, 14, 18))
-    top = np.full((draw.size, draw.size), 9.0, dtype=np.float32)
-    weight = np.zeros_like(top)
-    grain = draw.noise((12, 120), 2)
-    index = np.arange(draw.size, dtype=np.int32)
-    for slope in (0, 1, -1, 2):
-        flakes = draw.cells(fine // 2, fine * 2)
-        height = draw.rng.random(flakes.count, dtype=np.float32)
-        tone = draw.rng.random(flakes.count, dtype=np.float32)
-        layer = height[flakes.ids] + 1.4 * flakes.nearest
-        value = tone[flakes.ids] + 0.13 * grain + 0.9 * smoothstep(flakes.border, 0.12, 0.0)
-        # A shear keeps the square periodic; a transposition turns the flakes upright.
-        sheared = index[:, None] + (slope % 2) * slope * index[None, :]
-        layer, value = (gather_wrapped(f, index[None, :], sheared) for f in (layer, value))
-        if slope == 2:
-            layer, value = layer.T, value.T
-        nearer = layer < top
-        top, weight = np.where(nearer, layer, top), np.where(nearer, value, weight)
-    return map_colors(0.1 + 0.6 * weight, (scale_color(light, 1.05), light, dark, scale_color(dark, 0.6)))
 
 
 def _draw_species(draw: TextureSampler, among: tuple[int, ...] = tuple(range(len(SPECIES)))) -> tuple[Color, Color]:

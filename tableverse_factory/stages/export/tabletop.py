@@ -5,38 +5,27 @@ from PIL import Image
 
 from schemas.geometry import Picture
 from tableverse_factory.core.png import encode_png
-from tableverse_factory.sources.textures.catalogue import FAMILIES, TEXTURE_COUNT, make_texture, parse_texture_seed
+from tableverse_factory.sources.textures.catalogue import make_texture, parse_texture_seed
 
+# Texture families of most real tables.
 QUIET = (
     "planks", "butcher_block", "veneer", "plywood", "laminate", "lacquer", "plaster", "linen", "marble", "concrete",
 )  # fmt: skip
-"""Texture families of most real tables."""
-
+MEMBERS = 36  # of each family; to draw from more would change every table
 SIDE_PX = 384
-PALETTE = 64
-"""Number of colours: few keep the file to tens of kB without visible steps."""
-
-MAX_SPREAD = 12.0
-"""Most standard deviation of each channel [levels], so that the mean colour represents the table."""
-MAX_SHARE = 0.1
-"""The same as a share of the channel's mean: on dark wood, the spread of a light table would glow."""
-
-BOLDEST = 3.0
-"""Clip of each channel [standard deviations]: tinted veins of a dark stone would glow."""
-
+PALETTE = 64  # number of colours: few keep the file to tens of kB without visible steps
+MAX_SPREAD = 12.0  # most standard deviation of each channel [levels], so that the mean colour represents the table
+MAX_SHARE = 0.1  # the same as a share of the channel's mean: on dark wood, the spread of a light table would glow
+BOLDEST = 3.0  # clip of each channel [standard deviations]: tinted veins of a dark stone would glow
 _SKETCH_PX = 32
 
 
 def draw_tabletop_texture(rng: np.random.Generator, color: tuple[int, int, int]) -> bytes:
-    """Draw a tile of a table-top whose mean colour is the table's, as a PNG file.
+    """Draw a tile of a table-top whose mean sRGB is `color`, as a PNG file.
 
     Of one random member of each quiet family, the nearest in colour is tinted to match.
-
-    Args:
-        rng: Generator of the members.
-        color: Mean sRGB of the table in the picture.
     """
-    numbers = rng.integers(0, TEXTURE_COUNT // len(FAMILIES), len(QUIET))
+    numbers = rng.integers(0, MEMBERS, len(QUIET))
     seeds = [parse_texture_seed(f"{family}-{number}") for family, number in zip(QUIET, numbers, strict=True)]
     wanted = np.array(color, dtype=np.float64)
     gaps = [float(((_compute_mean(make_texture(seed, _SKETCH_PX)) - wanted) ** 2).sum()) for seed in seeds]

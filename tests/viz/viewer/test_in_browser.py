@@ -122,7 +122,7 @@ def _layouts_pieces_contacts_and_tables(small, screenshots):
     tick(small, "Contacts")
     small.get_by_text("contacts,").wait_for()
     before = canvas(small)
-    choose(small, "Table", "checkers")
+    choose(small, "Table", "gingham")
     assert until(lambda: differs(small, before, 0.05))
     small.screenshot(path=screenshots / "viewer-pieces.png")
 
