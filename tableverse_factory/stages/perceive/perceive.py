@@ -3,6 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
+from scipy.spatial import cKDTree
 
 from schemas.config import Config, PerceiveConfig
 from schemas.geometry import Colors, IdImage, Mask, Points
@@ -13,7 +15,6 @@ from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
-from tableverse_factory.stages.perceive.denoise import find_inlier_points
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.stages.perceive.table import (
     compute_camera_to_table,
@@ -25,6 +26,10 @@ from tableverse_factory.stages.perceive.table import (
 
 MIN_POINTS = 100
 MAX_POINTS = 12_000
+NEIGHBOURS = 16
+DEVIATIONS = 2.0
+RADIUS_OF_MEDIAN = 2.5
+MIN_IN_RADIUS = 6
 
 
 def perceive(
@@ -84,13 +89,12 @@ def _build_objects(
         if len(kept) == config.max_objects:
             left_out.append((name, f"there are {config.max_objects} objects already (perceive.max_objects)"))
             continue
-        points, colors = _clean_points(view, _select_mask(candidate, ids))
+        points, colors = _clean_points(view, (ids == candidate.instance) & (ids > 0))
         if len(points) < MIN_POINTS:
             left_out.append((name, f"{candidate.label}: {len(points)} clean points; at least {MIN_POINTS} are needed"))
             continue
-        kept[index] = PerceivedObject(
-            name, index + 1, candidate.label, candidate.score, points, colors, count=candidate.count
-        )
+        label, score, count = candidate.label, candidate.score, candidate.count
+        kept[index] = PerceivedObject(name, index + 1, label, score, points, colors, count=count)
     objects = tuple(
         replace(item, contained_in=kept[holder].object_id)
         if (holder := candidates[index].container) is not None and holder in kept
@@ -98,10 +102,6 @@ def _build_objects(
         for index, item in kept.items()
     )
     return objects, tuple(left_out)
-
-
-def _select_mask(candidate: Candidate, ids: IdImage) -> Mask:
-    return (ids == candidate.instance) & (ids > 0)
 
 
 def _clean_points(view: TableView, mask: Mask) -> tuple[Points, Colors]:
@@ -114,11 +114,25 @@ def _clean_points(view: TableView, mask: Mask) -> tuple[Points, Colors]:
     return points[clean], view.observation.color[rows, columns][clean]
 
 
+def find_inlier_points(points: Points) -> Bool[np.ndarray, " n"]:
+    """Find points whose mean distance to their neighbours is usual and whose surroundings are not empty (section 3.1).
+
+    The radius that must hold `MIN_IN_RADIUS` others follows the points' density: near and far objects count alike.
+    """
+    if len(points) <= NEIGHBOURS:
+        return np.zeros(len(points), dtype=bool)
+    distances, _ = cKDTree(points).query(points, k=NEIGHBOURS + 1)
+    mean = distances[:, 1:].mean(axis=1)
+    usual = mean <= mean.mean() + DEVIATIONS * mean.std()
+    crowd = distances[:, MIN_IN_RADIUS]
+    return usual & (crowd <= max(RADIUS_OF_MEDIAN * float(np.median(crowd)), 1e-6))
+
+
 def _paint_ids(
     view: TableView, candidates: tuple[Candidate, ...], ids: IdImage, objects: tuple[PerceivedObject, ...]
 ) -> IdImage:
     """Paint the instance ids of the objects; where objects share pixels, the last one has them."""
     kept = np.where(view.on_plane, TABLE_ID, 0).astype(np.int32)
     for item in objects:
-        kept[_select_mask(candidates[item.instance_id - 1], ids)] = item.instance_id
+        kept[(ids == candidates[item.instance_id - 1].instance) & (ids > 0)] = item.instance_id
     return kept

@@ -105,8 +105,7 @@ def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generat
 def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
     """Refit the table to a higher plane that fills more of the box in which a detector sees the table.
 
-    Unchanged where the found table fills enough of the box, because objects hide the rest; and where no higher plane
-    fills more of it: a floor may be taken for a table, never the reverse.
+    Unchanged where the found table fills enough of the box, whose rest objects hide, or no higher one fills more.
     """
     x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
     inside = np.zeros(view.valid.shape, dtype=bool)

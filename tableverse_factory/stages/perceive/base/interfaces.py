@@ -16,36 +16,24 @@ TABLE_ID = -1  # value of table-top pixels in an image of ids
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One object named by a detector, or `count` alike, of which the box shows one.
-
-    Attributes:
-        instance: Its value in the image of ids; 0 where it has no pixels there.
-        container: Index of the candidate that contains it; None for none.
-    """
+    """One object named by a detector, or `count` alike, of which the box shows one."""
 
     label: str
     score: float
     box: PixelBox
-    instance: int = 0
-    container: int | None = None
+    instance: int = 0  # its value in the image of ids; 0 where it has no pixels there
+    container: int | None = None  # index of the candidate that contains it
     count: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectionResult(Frozen):
-    """A detector's whole answer.
+    """A detector's whole answer."""
 
-    Attributes:
-        candidates: Every object once, containers before their contents, without the table.
-        table_box: None where the detector gives none.
-        record: Origin of a model's answer; None where no model was asked.
-        ids: The instance at each pixel, shape (h, w); None where the detector gives boxes only, for a BoxSegmenter.
-    """
-
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]  # every object once, containers before their contents, without the table
     table_box: PixelBox | None = None
-    record: DetectionRecord | None = None
-    ids: IdImage | None = None
+    record: DetectionRecord | None = None  # origin of the answer; None where no model was asked
+    ids: IdImage | None = None  # the instance at each pixel; None for boxes only, for a BoxSegmenter
 
 
 class Detector(Protocol):

@@ -40,27 +40,17 @@ def fill_depth_gaps(depth: DepthImage) -> Float64[np.ndarray, "h w"]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableView(Frozen):
-    """The picture, its points, and the table below them.
-
-    Attributes:
-        points_camera: Points, the origin where there is no reading [m].
-        valid: Pixels with a reading or a filled gap.
-        plane: Table plane in the camera frame, its normal upwards.
-        axes: The table frame's x, y and z as camera directions, one per row.
-        outline_xy: Convex outline of the visible table-top, counter-clockwise, see `xy` [m].
-        heights: Heights above the plane, 0 where there is no reading [m].
-        raised: Pixels clearly above the table-top or a little beside it.
-    """
+    """The picture, its points, and the table below them."""
 
     observation: Observation
-    points_camera: Float64[np.ndarray, "h w 3"]
-    valid: Mask
-    plane: Plane
-    axes: Float64[np.ndarray, "3 3"]
-    outline_xy: Points2
-    heights: Float64[np.ndarray, "h w"]
-    on_plane: Mask
-    raised: Mask
+    points_camera: Float64[np.ndarray, "h w 3"]  # [m], the origin where there is no reading
+    valid: Mask  # a reading or a filled gap
+    plane: Plane  # in the camera frame, its normal upwards
+    axes: Float64[np.ndarray, "3 3"]  # the table frame's x, y and z as camera directions, one per row
+    outline_xy: Points2  # convex outline of the visible table-top, counter-clockwise, see `xy` [m]
+    heights: Float64[np.ndarray, "h w"]  # above the plane [m], 0 where there is no reading
+    on_plane: Mask  # the table-top itself
+    raised: Mask  # clearly above the table-top or a little beside it
 
     @property
     def depth(self) -> Float64[np.ndarray, "h w"]:

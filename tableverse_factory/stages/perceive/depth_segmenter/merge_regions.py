@@ -50,26 +50,16 @@ MAX_IN_FRONT = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedRegion:
-    """Features of one region.
+    """Features of one region; n pixels are a regular sample."""
 
-    Attributes:
-        size: Number of its pixels.
-        pixels: Row and column of a regular sample of its pixels, of which are also `points`, `normals` and `xy`.
-        points: Camera frame [m].
-        footprint: Convex outline over the table [m].
-        xy: Along the table [m].
-        near: 5th percentile of the distance along the table, away from the camera [m].
-        rim: 98th percentile of the height [m].
-    """
-
-    size: int
-    pixels: Float64[np.ndarray, "n 2"]
-    points: Points
+    size: int  # number of all its pixels
+    pixels: Float64[np.ndarray, "n 2"]  # row and column
+    points: Points  # camera frame [m]
     normals: Points
-    footprint: Points2
-    xy: Points2
-    near: float
-    rim: float
+    footprint: Points2  # convex outline over the table [m]
+    xy: Points2  # along the table [m]
+    near: float  # 5th percentile of the distance along the table, away from the camera [m]
+    rim: float  # 98th percentile of the height [m]
 
 
 def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[MergedRegion]:

@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from skimage.segmentation import watershed
@@ -61,11 +61,9 @@ def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
         for c, link in links[a].items():
             low, high = min(a, c), max(a, c)
             heapq.heappush(heap, (_compute_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
-    root = np.arange(len(into))
-    for k in range(len(into)):  # a patch only ever goes into one with a lower or equal final root: follow the chain
-        while into[root[k]] != root[k]:
-            root[k] = into[root[k]]
-    return root[ids].astype(np.int32)
+    for k, target in enumerate(into):  # a patch only ever goes into a lower one, whose own root is known by then
+        into[k] = into[target]
+    return np.array(into)[ids].astype(np.int32)
 
 
 def _compute_strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
@@ -76,17 +74,10 @@ def _compute_strength(link: tuple[float, int], size_a: int, size_b: int) -> floa
 
 def _build_links(ids: IdImage, surface: Surface) -> Links:
     count = int(ids.max(initial=0)) + 1
-    keys, strengths = [], []
-    for rows, columns in DIRECTIONS:
-        other, across = shift_image(ids, rows, columns), shift_image(surface.borders, rows, columns)
-        touch = (ids > 0) & (other > 0) & (ids != other)
-        keys.append(_encode_pairs(ids, other, touch, count))
-        strengths.append(np.maximum(surface.borders, across)[touch])
-        for key, strength in _find_gap_links(ids, surface, (rows, columns), count):
-            keys.append(key)
-            strengths.append(strength)
-    pairs, which = np.unique(np.concatenate(keys), return_inverse=True)
-    totals = np.bincount(which, weights=np.concatenate(strengths), minlength=len(pairs))
+    found = (borders for direction in DIRECTIONS for borders in _find_borders(ids, surface, direction))
+    lows, highs, strengths = map(np.concatenate, zip(*found, strict=True))
+    pairs, which = np.unique(lows.astype(np.int64) * count + highs, return_inverse=True)
+    totals = np.bincount(which, weights=strengths, minlength=len(pairs))
     lengths = np.bincount(which, minlength=len(pairs))
     links: Links = {}
     for key, total, length in zip(pairs.tolist(), totals.tolist(), lengths.tolist(), strict=True):
@@ -96,24 +87,25 @@ def _build_links(ids: IdImage, surface: Surface) -> Links:
     return links
 
 
-def _encode_pairs(ids: IdImage, other: IdImage, where: Mask, count: int) -> Int64[np.ndarray, " n"]:
-    low, high = np.minimum(ids, other)[where], np.maximum(ids, other)[where]
-    return low.astype(np.int64) * count + high
+def _find_borders(
+    ids: IdImage, surface: Surface, direction: tuple[int, int]
+) -> Iterator[tuple[Int32[np.ndarray, " n"], Int32[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
+    """Find pairs of pixels with the lower and the higher id, and the strength of the border between them.
 
-
-def _find_gap_links(
-    ids: IdImage, surface: Surface, direction: tuple[int, int], count: int
-) -> Iterator[tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
-    """Find borders across a few pixels without a reading, as sensors leave where the surface steps back."""
-    nothing = surface.points[..., 2] == 0
-    open_gap = np.ones(ids.shape, dtype=bool)
-    for distance in range(2, MAX_GAP_PX + 1):
-        open_gap &= shift_image(nothing, (distance - 1) * direction[0], (distance - 1) * direction[1])
+    They are neighbours, or a few pixels without a reading apart, as sensors leave where the surface steps back.
+    """
+    nothing, open_gap = surface.points[..., 2] == 0, np.ones(ids.shape, dtype=bool)
+    for distance in range(1, MAX_GAP_PX + 1):
         rows, columns = distance * direction[0], distance * direction[1]
         other = shift_image(ids, rows, columns)
-        touch = open_gap & (ids > 0) & (other > 0) & (ids != other)
-        y, x = np.nonzero(touch)
-        yield _encode_pairs(ids, other, touch, count), measure_border(surface, (y, x), (y + rows, x + columns))
+        y, x = np.nonzero(open_gap & (ids > 0) & (other > 0) & (ids != other))
+        touch, ahead = (y, x), (y + rows, x + columns)
+        if distance == 1:
+            strength = np.maximum(surface.borders[touch], surface.borders[ahead])
+        else:
+            strength = measure_border(surface, touch, ahead)
+        yield np.minimum(ids, other)[touch], np.maximum(ids, other)[touch], strength
+        open_gap &= shift_image(nothing, rows, columns)
 
 
 def _merge_links(links: Links, a: int, b: int) -> None:

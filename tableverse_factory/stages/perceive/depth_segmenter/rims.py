@@ -41,22 +41,15 @@ Circle = tuple[float, float, float, float]  # x, y, radius and height [m]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rim(Frozen):
-    """A level circle over the table, in the coordinates of `TableView.xy`: centre, radius and height [m].
-
-    Attributes:
-        floor: 5th percentile of the heights inside [m].
-        sectors: Number of the `SECTORS` directions in which it is visible.
-        within: Pixels seen through its disc, below its height.
-        window: Rows and columns with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around.
-    """
+    """A level circle over the table, in the coordinates of `TableView.xy` [m]."""
 
     center: Float64[np.ndarray, "2"]
     radius: float
     height: float
-    floor: float
-    sectors: int
-    within: Mask
-    window: tuple[slice, slice]
+    floor: float  # 5th percentile of the heights inside [m]
+    sectors: int  # number of the `SECTORS` directions in which it is visible
+    within: Mask  # pixels seen through its disc, below its height
+    window: tuple[slice, slice]  # with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around
 
     def distance(self, xy: Float64[np.ndarray, "*shape 2"]) -> Float64[np.ndarray, "*shape"]:
         """Compute the distance from its axis [m]."""

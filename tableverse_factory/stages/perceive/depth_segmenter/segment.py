@@ -109,10 +109,8 @@ def fill_holes(ids: IdImage) -> IdImage:
 
 def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
     """Turn the result of `segment_depth` into candidates without names, in the order of their ids."""
-    things = [
-        Candidate("object", 1.0, _to_box(window), k, holders[k] - 1 if k in holders else None)
-        for k, window in enumerate(ndimage.find_objects(ids), start=1)
-    ]
+    boxes = enumerate(map(_to_box, ndimage.find_objects(ids)), start=1)
+    things = (Candidate("object", 1.0, box, k, holders[k] - 1 if k in holders else None) for k, box in boxes)
     return DetectionResult(tuple(things), ids=ids)
 
 

@@ -27,17 +27,11 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface(Frozen):
-    """The smoothed surface of a depth image.
+    """The smoothed surface of a depth image."""
 
-    Attributes:
-        points: Camera frame [m].
-        normals: Unit vectors towards the camera, zero where there are too few readings.
-        borders: Strength of the border between objects at each pixel: 0 for none, 1 or more for certain.
-    """
-
-    points: Float64[np.ndarray, "h w 3"]
-    normals: Float64[np.ndarray, "h w 3"]
-    borders: Float64[np.ndarray, "h w"]
+    points: Float64[np.ndarray, "h w 3"]  # camera frame [m]
+    normals: Float64[np.ndarray, "h w 3"]  # unit vectors towards the camera, zero where there are too few readings
+    borders: Float64[np.ndarray, "h w"]  # strength of the border between objects: 0 for none, 1 or more for certain
 
 
 def compute_surface(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Surface:

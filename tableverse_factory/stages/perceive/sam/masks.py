@@ -93,8 +93,7 @@ def _limit_to_containers(scores: Tensor, cut: Float64[np.ndarray, "k 4"], questi
 
 def _dilate_scores(scores: Tensor, reach: int) -> Tensor:
     """Take the maximum score within a square of `reach` cells to each side."""
-    pool = import_torch().nn.functional.max_pool2d
-    size = 2 * reach + 1
+    pool, size = import_torch().nn.functional.max_pool2d, 2 * reach + 1
     rows = pool(scores[None, None], (size, 1), stride=1, padding=(reach, 0))
     return pool(rows, (1, size), stride=1, padding=(0, reach))[0, 0]
 

@@ -3,8 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from schemas.detection import Box
 from tableverse_factory.core.errors import AnswerInvalidError
@@ -28,8 +27,7 @@ Corners = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax in the mod
 ImageSize = tuple[int, int]  # width and height of the picture sent [px]
 
 
-@dataclass(frozen=True, slots=True)
-class BoxScale:
+class BoxScale(NamedTuple):
     """Factors of x and y to 0 to 1000, and the unit's name."""
 
     x: float

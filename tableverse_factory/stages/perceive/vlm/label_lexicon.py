@@ -1,9 +1,8 @@
 """Classification of a detector's label by its words: person, table or object; and whether two labels are synonyms.
 
 Labels are English noun phrases, as the prompt asks. The last noun decides ("hand cream" is cream, "water bottle" a
-bottle) unless "of" follows ("leg of lamb"). Losing an object is worse than keeping a wrong one, which geometry and
-judge still check: so a label excludes only where every word before the noun is known to leave no other reading ("left
-hand", but not "Allegro hand"). An unknown label names an object.
+bottle) unless "of" follows ("leg of lamb"). Losing an object is worse than keeping a wrong one: a label excludes only
+where every word before the noun leaves no other reading ("left hand", but not "Allegro hand").
 """
 
 import re

@@ -28,17 +28,14 @@ _TAG = re.compile(r'(")?<bbox>([-+\d.eE, ]{7,100})</bbox>(?(1)")')
 
 @dataclass(frozen=True, slots=True)
 class ParsedDetection:
-    """One entry of an answer, `where` such as `composites[0].contents[1]`, its box in thousandths of the picture.
+    """One entry of an answer."""
 
-    The label is cleaned, but still untrusted; `held` means in a person's hand.
-    """
-
-    where: str
-    label: str
-    box: Box
+    where: str  # its place there, such as `composites[0].contents[1]`
+    label: str  # cleaned, but still untrusted
+    box: Box  # within the picture, in thousandths
     score: float = 1.0
     description: str = ""
-    held: bool = False
+    held: bool = False  # in a person's hand
     count: int = 1
 
 
@@ -53,23 +50,16 @@ class ParsedComposite:
 
 @dataclass(frozen=True, slots=True)
 class ParsedAnswer:
-    """A parsed answer with boxes of persons seen with head and torso, None where it has no such list.
-
-    Remarks are on entries that were unreadable or had to be corrected.
-    """
+    """A parsed answer, with remarks on entries that were unreadable or had to be corrected."""
 
     detections: tuple[ParsedDetection, ...]
     composites: tuple[ParsedComposite, ...]
-    people: tuple[Box, ...] | None
+    people: tuple[Box, ...] | None  # persons seen with head and torso; None where there is no such list
     remarks: tuple[DetectionRemark, ...]
 
 
 def parse_detections(text: str, order: BoxOrder, sent: ImageSize) -> ParsedAnswer:
-    """Parse a model's text; unreadable entries are left out one by one, with a remark.
-
-    `AnswerInvalidError` says what a model may repair: no JSON object, neither list, an unclear unit of the boxes, too
-    many entries, or most of them unreadable.
-    """
+    """Parse a model's text; unreadable entries are left out with a remark, most of them make the answer invalid."""
     answer = _extract_object(text)
     detections, composites = _read_list(answer, "detections"), _read_list(answer, "composites")
     if "detections" not in answer and "composites" not in answer:
@@ -204,5 +194,4 @@ def _read_text(value: Any) -> str:
     if not isinstance(value, str):
         return ""
     text = replace_lone_surrogates(value[: 4 * MAX_DESCRIPTION_CHARS])
-    printable = "".join(c if c.isprintable() else " " for c in text)
-    return " ".join(printable.split())[:MAX_DESCRIPTION_CHARS]
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:MAX_DESCRIPTION_CHARS]

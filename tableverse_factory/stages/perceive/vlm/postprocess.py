@@ -199,7 +199,8 @@ class _RuleSet:
         """Whether the object is one of those that the `count` of some contents stands for."""
         for composite in self.composites:
             for content in composite.contents:
-                if content.count > 1 and _is_named_inside(entry, content, composite.container):
+                is_inside = compute_share_inside(entry.box, composite.container.box) >= INSIDE
+                if content.count > 1 and is_inside and may_share_name(entry.label, content.label):
                     return self._remark(entry, "counted", f"one of the {content.count} of {content.where}")
         return False
 
@@ -218,10 +219,6 @@ class _RuleSet:
 
 def _is_same(a: ParsedDetection, b: ParsedDetection) -> bool:
     return compute_iou(a.box, b.box) >= SAME_BOX and may_share_name(a.label, b.label)
-
-
-def _is_named_inside(entry: ParsedDetection, content: ParsedDetection, container: ParsedDetection) -> bool:
-    return compute_share_inside(entry.box, container.box) >= INSIDE and may_share_name(entry.label, content.label)
 
 
 def _is_filled_with(container: ParsedDetection, content: ParsedDetection) -> bool:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tableverse_factory.stages.perceive.denoise import find_inlier_points
+from tableverse_factory.stages.perceive.perceive import find_inlier_points
 
 
 def test_stray_points_go_and_the_surface_stays():
