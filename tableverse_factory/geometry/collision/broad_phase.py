@@ -8,26 +8,17 @@ import numpy as np
 from schemas.geometry import Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 
-MAX_CROPPED_SHARE = 0.5
-"""With more of its vertices in the half-space a mesh is not cropped: its whole solid is made once for all."""
-
+MAX_CROPPED_SHARE = 0.5  # with more of its vertices in the half-space a mesh is used whole: its solid is made once
 MAX_STEPS = 20  # of Gilbert's walk: a plane between two objects beside each other is nearly always found by the third
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _TINY = np.finfo(np.float64).tiny
-
 _APEX_OFFSET = np.array([0.0137, 0.0219, 0.0321])  # share of the extent: off every plane of symmetry
 
 
 @dataclass(frozen=True, slots=True)
 class OverlapSlab:
-    """Where two sets of points overlap along a direction.
-
-    Attributes:
-        normal: The direction, a unit vector.
-        low: Least coordinate of the first set [m].
-        high: Greatest coordinate of the second set [m].
-    """
+    """Overlap of two sets along a unit normal [m]: from the least of the first to the greatest of the second."""
 
     normal: Vector3
     low: float
@@ -71,13 +62,7 @@ def crop_to_half_space(mesh: TriangleMesh, normal: Vector3, high: float) -> Tria
     a half-space is convex, the collapsed faces stay beyond. The point lies off all planes of the mesh: manifold3d takes
     faces folded within a plane for degenerate and mends them wrongly.
 
-    Args:
-        mesh: Closed, of one shell.
-        normal: A unit vector.
-        high: Where the half-space ends [m].
-
-    Returns:
-        None where more than `MAX_CROPPED_SHARE` of the vertices are in the half-space.
+    The mesh has one shell. None where more than `MAX_CROPPED_SHARE` of its vertices are in the half-space.
     """
     along = mesh.vertices @ normal
     inside = along < high

@@ -9,13 +9,11 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_ra
 
 TOLERANCE_SHARE = 1e-3  # share of its radius by which the surface may reach into a ball that counts as inside
 MAX_ROUNDS = 100  # five to ten are usual
-
 FIRST_BATCH = 64  # the largest balls are shrunk before the others
 MIN_GAIN = 0.01  # balls larger than the best by no more than this share are not searched for
 RAY_OFFSET = 1e-6  # how far inside rays begin, as a share of the extent: the face that they leave is not hit
-
+# Skew: along no edge that is likely in a mesh.
 _PROBE_DIRECTIONS = np.array([[0.8431, 0.4127, 0.3449], [-0.3178, 0.8052, -0.5006], [0.2903, -0.5618, 0.7747]])
-"""Skew: along no edge that is likely in a mesh."""
 
 
 def find_largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> float:
@@ -24,13 +22,7 @@ def find_largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> fl
     Shrinking balls (Ma, Bae and Choi 2012): each touches its face from inside and starts too large. The surface point
     nearest to its centre is put on the ball, until the centre is inside and no point is in the ball.
 
-    Args:
-        mesh: Closed, its faces counter-clockwise seen from outside.
-        at_least: Smaller balls are not searched for [m].
-        at_most: No ball inside is larger [m].
-
-    Returns:
-        0 where all are at most `at_least`; the largest found so far after `MAX_ROUNDS`.
+    No ball inside is larger than `at_most` [m]; 0 where all are at most `at_least` [m].
     """
     low, high = aabb(mesh.vertices)
     size = float((high - low).max())
@@ -41,7 +33,9 @@ def find_largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> fl
     face = np.flatnonzero(normals.any(axis=1))
     caster = make_raycasting_scene(TriangleMesh(vertices, mesh.faces))
     middles, found = ((a + b + c) / 3)[face], at_least / 2 / size
-    radii = np.minimum(_measure_depths(caster, middles, normals[face]), at_most / size) / 2
+    rays = pack_rays(middles + RAY_OFFSET * normals[face], normals[face])  # through the inside to the other side
+    depths = caster.cast_rays(rays, nthreads=1)["t_hit"].numpy().astype(np.float64) + RAY_OFFSET
+    radii = np.minimum(depths, at_most / size) / 2
     order = np.argsort(-radii, kind="stable")
     # The largest first: their result leaves few of the others. In a round object all centres begin near one point,
     # where every face is equally near and each query is slow.
@@ -53,17 +47,15 @@ def find_largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> fl
 def _find_largest_radius(
     caster: RaycastingScene, touched: Points, inward: Points, radii: Float64[np.ndarray, " n"], found: float
 ) -> float:
-    """Find the largest radius of balls that touch a surface in points (n, 3) with inward unit normals (n, 3).
-
-    `radii` bounds each ball; `found` is returned where none is larger.
-    """
+    """Find the largest radius of balls that touch a surface in points (n, 3), each at most its own, or `found`."""
     for _ in range(MAX_ROUNDS):
         large = radii > (1.0 + MIN_GAIN) * found
         touched, inward, radii = touched[large], inward[large], radii[large]
         if not len(radii):
             break
         centers = touched + radii[:, None] * inward
-        nearest = _find_nearest(caster, centers)
+        closest = caster.compute_closest_points(to_tensor(centers), nthreads=1)["points"]
+        nearest = closest.numpy().astype(np.float64)
         fits = np.linalg.norm(centers - nearest, axis=1) >= (1.0 - TOLERANCE_SHARE) * radii
         fits[fits] = _is_inside(caster, centers[fits])  # a centre may be beyond a film
         found = float(radii[fits].max(initial=found))
@@ -72,16 +64,6 @@ def _find_largest_radius(
         through = np.einsum("ij,ij->i", chord, chord) / np.where(ahead > 0.0, 2.0 * ahead, np.inf)
         radii = np.where(fits, 0.0, np.minimum(through, (1.0 - TOLERANCE_SHARE / 2) * radii))
     return found
-
-
-def _measure_depths(caster: RaycastingScene, points: Points, inward: Points) -> Float64[np.ndarray, " n"]:
-    """Measure the way from surface points through the inside to the other side; infinity where nothing is hit."""
-    hits = caster.cast_rays(pack_rays(points + RAY_OFFSET * inward, inward), nthreads=1)["t_hit"].numpy()
-    return hits.astype(np.float64) + RAY_OFFSET
-
-
-def _find_nearest(caster: RaycastingScene, points: Points) -> Points:
-    return caster.compute_closest_points(to_tensor(points), nthreads=1)["points"].numpy().astype(np.float64)
 
 
 def _is_inside(caster: RaycastingScene, points: Points) -> Bool[np.ndarray, " n"]:

@@ -15,7 +15,6 @@ Bounds = Float64[np.ndarray, " m"]
 Owners = Int64[np.ndarray, " m"]  # group of each constraint; -1 for those that never give way
 
 INFEASIBLE_RESIDUAL = 1e-8  # residual of the dual below which no point satisfies all constraints (1 where none binds)
-
 ITERATIONS_PER_UNKNOWN = 10  # A few are usual
 MAX_ROUNDS = 30
 VIOLATION_TOLERANCE = 1e-9  # constraints violated by more than this become active in the next round
@@ -32,26 +31,14 @@ class SolverEffort:
         self._left = float(most)
 
     def spend(self, work: float, what: str) -> None:
-        """Charge a problem before it is solved; a refused one costs nothing, so that smaller ones may still follow.
-
-        Args:
-            work: In the unit of the budget.
-            what: The problem, for the message.
-
-        Raises:
-            TooMuchWorkError: if it costs more than is left.
-        """
+        """Charge a problem before it is solved; a refused one costs nothing, so that smaller ones may still follow."""
         if work > self._left:
             raise WorkLimitError(f"{what} are more than the work allowed")
         self._left -= work
 
 
 def solve_least_motion(rows: Rows, bounds: Bounds) -> Values | None:
-    """Find the shortest x with `rows @ x >= bounds`; None where there is none.
-
-    Raises:
-        SolverError: if the solver does not converge.
-    """
+    """Find the shortest x with `rows @ x >= bounds`; None where there is none."""
     count = rows.shape[1]
     if not len(rows) or (bounds <= 0.0).all():
         return np.zeros(count)
@@ -71,9 +58,6 @@ def solve_least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: 
     """A short x where the constraints contradict one another: those of one owner give way together, at a price.
 
     Minimises `|x|² + |s / softness|²` under `rows @ x + s[owners] >= bounds`; s is 0 where the owner is -1.
-
-    Raises:
-        SolverError: if those that never give way contradict one another, or the solver comes to no end.
     """
     count = rows.shape[1]
     named, column = np.unique(owners, return_inverse=True)
@@ -96,10 +80,7 @@ def solve_balanced_motion(
     """Minimise `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
 
     Contradicting constraints give way as in `solve_least_violation`. Constraints become active once they are violated:
-    most never are.
-
-    Raises:
-        SolverError: if it is more than the effort allows, or the solver does not converge.
+    most never are. More work than the effort allows is a `SolverError`.
     """
     lower = np.linalg.cholesky(np.eye(rows.shape[1]) + wishes.T @ wishes)
     free = np.linalg.solve(lower.T, np.linalg.solve(lower, wishes.T @ wished))

@@ -23,12 +23,9 @@ MAX_STEPS = 200  # of Newton; three to six are usual. Stopping early leaves more
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingSolid:
-    """An object during rectification: its pieces where they were placed, and how far it has been moved since.
+    """An object during rectification: its pieces where they were placed in the table frame, and how far it moved [m].
 
-    Attributes:
-        solids: Convex pieces in the table frame, before `offset`.
-        offset: Translation since [m].
-        uncovered_m: How far the object's mesh may stick out of its pieces [m].
+    Its mesh may stick out of the pieces by `uncovered_m`.
     """
 
     solids: Solids
@@ -94,9 +91,9 @@ class LinearSweep:
     def room(
         self, moving: Iterable[MovingSolid], fixed: Sequence[MovingSolid], clearance_m: float, limit_m: float
     ) -> float:
-        """Find how far [m] the moving bodies can go before one of them is no longer clear of a fixed one.
+        """Find how far the moving bodies can go before one is no longer clear of a fixed one, 0 to `limit_m` [m].
 
-        At most `limit_m`, and never negative: 0 where they are not clear to begin with, unless they are leaving.
+        It is 0 where they are not clear to begin with, unless they are leaving.
         """
         room = limit_m
         for body in moving:
@@ -107,7 +104,6 @@ class LinearSweep:
         return max(room, 0.0)
 
     def _lower_end(self, pair: _Pair, limit: float) -> float:
-        """Find where the interval in which a pair is too near begins, at most the limit."""
         d = max(pair.low, 0.0)
         for _ in range(MAX_STEPS):
             gap, slope = self._probe(pair, d)
@@ -121,7 +117,6 @@ class LinearSweep:
         return d
 
     def _upper_end(self, pair: _Pair) -> float:
-        """Find where the interval in which a pair is too near ends."""
         d = pair.high
         for _ in range(MAX_STEPS):
             gap, slope = self._probe(pair, d)
@@ -139,7 +134,6 @@ class LinearSweep:
         return max(gap, 0.0), -float(self._result.normal @ self._direction)
 
     def _pairs(self, a: MovingSolid, b: MovingSolid, clearance_m: float) -> list[_Pair]:
-        """Find the pairs of pieces that may come too near for some d >= 0."""
         margin = max(clearance_m + a.uncovered_m + b.uncovered_m, MIN_MARGIN_M)
         low_a, high_a = self._extents(a)
         low_b, high_b = self._extents(b)
@@ -154,9 +148,7 @@ class LinearSweep:
 
     def _extents(self, body: MovingSolid) -> tuple[Points, Points]:
         """Lowest and highest coordinates of each piece in the basis that begins with the direction."""
-        along = body.solids.points @ self._axes
-        shift = body.offset @ self._axes
-        starts = body.solids.starts
+        along, shift, starts = body.solids.points @ self._axes, body.offset @ self._axes, body.solids.starts
         return np.minimum.reduceat(along, starts) + shift, np.maximum.reduceat(along, starts) + shift
 
 

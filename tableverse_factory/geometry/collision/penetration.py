@@ -5,19 +5,17 @@ from itertools import combinations
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.collision.inscribed_ball import find_largest_ball
-from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces, place_pieces
+from tableverse_factory.geometry.collision.solids import find_near_pieces, place_pieces
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_mesh
 
 PairDepth = tuple[int, int, float]  # indices i < j of two objects and how deep they overlap [m], always > 0
 
-THIN_M = 1e-4
-"""Thinner overlaps are not examined further: objects at rest share micrometres with what carries them [m]."""
+THIN_M = 1e-4  # thinner overlaps are not examined further: objects at rest share micrometres with what carries them
 
 
 def measure_piece_penetrations(
@@ -28,8 +26,12 @@ def measure_piece_penetrations(
     The depth of a pair is that of its deepest pair of pieces: the shortest translation that separates them (EPA).
     """
     solids = [place_pieces(p, pose, scale) for p, pose, scale in zip(pieces, poses, scales, strict=True)]
-    depths = ((i, j, _measure_piece_depth(solids[i], solids[j])) for i, j in combinations(range(len(solids)), 2))
-    return [(i, j, depth) for i, j, depth in depths if depth > 0.0]
+    found = []
+    for i, j in combinations(range(len(solids)), 2):
+        depth = max((-gap for gap, _ in find_near_pieces(solids[i], solids[j], 0.0)), default=0.0)
+        if depth > 0.0:
+            found.append((i, j, depth))
+    return found
 
 
 def measure_mesh_penetrations(
@@ -39,12 +41,11 @@ def measure_mesh_penetrations(
 
     The depth of a pair is that of its thickest connected region of shared volume (`measure_thickness`).
     Meshes that are not closed are measured as `make_closed_solid` repairs them.
-
-    Raises:
-        GeometryError: if a mesh cannot be closed.
     """
     solids = [
-        make_closed_solid(mesh)[0].transform(similarity_matrix(pose, scale))
+        make_closed_solid(mesh)[0].transform(
+            np.column_stack([scale * rotation_matrix(pose.quaternion_wxyz), pose.position])
+        )
         for mesh, pose, scale in zip(meshes, poses, scales, strict=True)
     ]
     boxes = [solid.bounding_box() for solid in solids]
@@ -57,11 +58,6 @@ def measure_mesh_penetrations(
             if depth > 0.0:
                 found.append((i, j, depth))
     return found
-
-
-def similarity_matrix(pose: Pose, scale: float) -> Float64[np.ndarray, "3 4"]:
-    """Make the matrix `[scale R | position]` of the layout format."""
-    return np.column_stack([scale * rotation_matrix(pose.quaternion_wxyz), pose.position])
 
 
 def measure_thickness(region: manifold3d.Manifold) -> float:
@@ -89,7 +85,3 @@ def _measure_narrowest_extent(points: Points) -> float:
     except QhullError:  # flat to rounding: no thickness
         return 0.0
     return float(np.ptp(points @ normals.T, axis=0).min())
-
-
-def _measure_piece_depth(a: Solids, b: Solids) -> float:
-    return max((-gap for gap, _ in find_near_pieces(a, b, 0.0)), default=0.0)

@@ -18,43 +18,27 @@ from tableverse_factory.geometry.collision.solids import Solids, make_convex_sha
 from tableverse_factory.geometry.math.transforms import cross_matrix
 
 SIDEWAYS_STRETCH = 6.0  # with z stretched this much, the shortest way out is a sideways one wherever there is any
-CORNER_DEPTH_M = 0.003
-"""Corners this much further from a plane than the nearest one may become the nearest in one step [m]."""
+CORNER_DEPTH_M = 0.003  # corners this much further from a plane than the nearest may become the nearest in one step
 SINGLE_CORNER_M = 0.006  # with more room than this, one corner is watched: one step goes less far [m]
 MAX_CORNERS = 4  # watched corners of either piece
 MIN_RISE = 0.1
 
 
 class PosedPieces:
-    """The pieces of a body, rotated about the origin and then shifted [m].
-
-    Attributes:
-        low: Lowest corner of each piece's box. Shape (k, 3) [m].
-        high: Highest corner of each piece's box. Shape (k, 3) [m].
-        least: Lowest corner of the box of all [m].
-        most: Highest corner of the box of all [m].
-    """
+    """The pieces of a body, rotated about the origin, then shifted; boxes of each (k, 3) and of all in between [m]."""
 
     def __init__(self, solids: Solids, rotation: Matrix3, shift: Vector3) -> None:
         self.solids, self.rotation, self.shift = solids, rotation, shift
         points = solids.points @ rotation.T + shift
-        self._corners = np.split(points, solids.starts[1:])
+        self.corners: list[Points] = np.split(points, solids.starts[1:])
         self.low: Points = np.minimum.reduceat(points, solids.starts)
         self.high: Points = np.maximum.reduceat(points, solids.starts)
         self.least: Vector3 = self.low.min(axis=0)
         self.most: Vector3 = self.high.max(axis=0)
 
-    def corners(self, piece: int) -> Points:
-        """Vertices of a piece [m]."""
-        return self._corners[piece]
-
-    def pose(self) -> coal.Transform3s:
-        """Pose for coal."""
-        return coal.Transform3s(self.rotation, self.shift)
-
     def stretched(self, piece: int, factors: Vector3) -> coal.Convex:
         """Scale each axis of a piece where it is."""
-        return make_convex_shape(self.corners(piece) * factors, self.solids.faces(piece))
+        return make_convex_shape(self.corners[piece] * factors, self.solids.faces[piece])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,20 +71,15 @@ class PlaneFinder:
     def planes(
         self, a: PosedPieces, b: PosedPieces, margin_m: float, reach_m: float, rise: float
     ) -> Iterator[SeparatingPlane]:
-        """Find a plane for each pair of pieces that are no further apart than `margin_m + reach_m`.
+        """Find a plane for each pair of pieces that are no further apart than `margin_m + reach_m` [m].
 
-        Args:
-            a: One body.
-            b: The other.
-            margin_m: The least distance between the two [m].
-            reach_m: Pairs further beyond the margin than this are left out [m].
-            rise: Where pieces overlap: 1 if `a` belongs above `b`, -1 if below, 0 if beside it.
+        Where pieces overlap, `rise` is 1 if `a` belongs above `b`, -1 if below, 0 if beside it.
         """
         reach = margin_m + reach_m
         if (a.least > b.most + reach).any() or (b.least > a.most + reach).any():
             return
         near = ~((a.low[:, None] > b.high[None] + reach) | (b.low[None] > a.high[:, None] + reach)).any(axis=2)
-        pose_a, pose_b = a.pose(), b.pose()
+        pose_a, pose_b = (coal.Transform3s(body.rotation, body.shift) for body in (a, b))
         for i, j in np.argwhere(near).tolist():
             self._result.clear()
             first, second = a.solids.shape(i), b.solids.shape(j)
@@ -110,7 +89,7 @@ class PlaneFinder:
             direction = -np.array(self._result.normal)
             if gap < 0.0:
                 direction = self._way_out(a, i, b, j, direction, rise)
-            yield _make_plane(direction, a.corners(i), b.corners(j), margin_m)
+            yield _make_plane(direction, a.corners[i], b.corners[j], margin_m)
 
     def _way_out(self, a: PosedPieces, i: int, b: PosedPieces, j: int, shortest: Vector3, rise: float) -> Vector3:
         if rise:

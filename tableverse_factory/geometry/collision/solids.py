@@ -10,13 +10,9 @@ from tableverse_factory.geometry.math.transforms import transform_points
 
 
 class Solids:
-    """The pieces of one object in the table frame.
+    """The k pieces of one object in the table frame, with the box of each (k, 3) [m].
 
-    Attributes:
-        points: The vertices of all pieces in the table frame, one piece after the other. Shape (n, 3) [m].
-        starts: Where each piece begins in `points`. Shape (k,).
-        low: Lowest corner of each piece's box. Shape (k, 3) [m].
-        high: Highest corner of each piece's box. Shape (k, 3) [m].
+    `points` are the vertices of all pieces (n, 3) [m], which begin at `starts` (k,); `vertices` and `faces` are theirs.
     """
 
     def __init__(self, vertices: Sequence[Points], faces: Sequence[Faces]) -> None:
@@ -24,36 +20,28 @@ class Solids:
         self.starts = np.cumsum([0, *(len(points) for points in vertices[:-1])])
         self.low: Points = np.minimum.reduceat(self.points, self.starts)
         self.high: Points = np.maximum.reduceat(self.points, self.starts)
-        self._vertices, self._faces = vertices, faces
+        self.vertices, self.faces = vertices, faces
         self._shapes: dict[int, coal.Convex] = {}
 
     def turned(self, rotation: Matrix3, pivot: Vector3) -> "Solids":
         """Rotate the pieces about a point of the table frame."""
-        return Solids([(points - pivot) @ rotation.T + pivot for points in self._vertices], self._faces)
+        return Solids([(points - pivot) @ rotation.T + pivot for points in self.vertices], self.faces)
 
     def rounded(self, decimals: int) -> "Solids":
         """Round the vertices."""
-        return Solids([np.round(points, decimals) for points in self._vertices], self._faces)
-
-    def vertices(self, piece: int) -> Points:
-        """The vertices of a piece in the table frame [m]."""
-        return self._vertices[piece]
-
-    def faces(self, piece: int) -> Faces:
-        """The triangles of a piece, indices into its own vertices."""
-        return self._faces[piece]
+        return Solids([np.round(points, decimals) for points in self.vertices], self.faces)
 
     def shape(self, piece: int) -> coal.Convex:
         """The coal shape of a piece; made on first use, as most pieces come near to nothing."""
         if piece not in self._shapes:
-            self._shapes[piece] = make_convex_shape(self._vertices[piece], self._faces[piece])
+            self._shapes[piece] = make_convex_shape(self.vertices[piece], self.faces[piece])
         return self._shapes[piece]
 
 
 def concatenate_solids(several: Sequence[Solids], offsets: Sequence[Vector3]) -> Solids:
     """Join the pieces of several objects, each translated by its offset."""
     moved = [(s, k, offset) for s, offset in zip(several, offsets, strict=True) for k in range(len(s.starts))]
-    return Solids([s.vertices(k) + offset for s, k, offset in moved], [s.faces(k) for s, k, _ in moved])
+    return Solids([s.vertices[k] + offset for s, k, offset in moved], [s.faces[k] for s, k, _ in moved])
 
 
 def place_pieces(pieces: ConvexPieces, pose: Pose, scale: float) -> Solids:
@@ -77,15 +65,7 @@ def find_near_pieces(
 ) -> Iterator[tuple[float, coal.DistanceResult]]:
     """Find pairs of pieces that come within `reach_m` [m], with `a` moved by `offset` [m].
 
-    Args:
-        a: Some pieces.
-        b: Others, in the same frame.
-        reach_m: Pairs further apart than this are left out [m].
-        offset: Moves `a` [m].
-        signed: Whether gaps of pieces that overlap are negative; else they are 0, for less work.
-
-    Yields:
-        The gap [m] and coal's result, whose object is reused for the next pair.
+    Yields the gap [m] and coal's result, whose object is reused. Overlaps are negative, or 0 for less work: `signed`.
     """
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = signed

@@ -28,11 +28,8 @@ def make_piece(points: Points) -> TriangleMesh:
 def make_bounded_pieces(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[TriangleMesh]:
     """Make a piece of each cluster, or of the two it was merged from, where this saves most volume.
 
-    Args:
-        clusters: From `cut_and_merge`.
-        max_pieces: No more pieces than this, unless there are more clusters.
-        volume_allowed: Volume of the union of the pieces beyond which merges are undone. Afterwards only sums of
-            volumes are updated, assuming that the overlapping share stays the same.
+    Merges are undone while the union of the pieces has more than `volume_allowed`. After the first union only sums of
+    volumes are updated, as if the overlapping share stayed the same.
     """
     pieces = {k: _measure_piece(cluster) for k, cluster in enumerate(clusters)}
     total = sum(piece.volume for piece in pieces.values())

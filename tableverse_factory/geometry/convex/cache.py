@@ -15,8 +15,7 @@ from schemas.identity import content_hash
 from tableverse_factory.core.disk_cache import DiskCache
 
 VERSION = b"pieces 5"  # changes whenever the same shape and parameters would give other pieces
-_PACKAGES = ("coacd", "manifold3d", "numpy", "scipy")
-"""Packages whose versions may change the pieces of the same shape."""
+_PACKAGES = ("coacd", "manifold3d", "numpy", "scipy")  # their versions may change the pieces of the same shape
 
 
 class PieceCache:

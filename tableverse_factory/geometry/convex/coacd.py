@@ -23,14 +23,9 @@ def load_coacd() -> ModuleType:
 
 
 def decompose_with_coacd(mesh: TriangleMesh, max_pieces: int) -> list[Points]:
-    """Decompose a closed mesh of extent 1 into the corners of convex pieces, with a fixed seed.
+    """Decompose a closed, oriented mesh of extent 1 into the corners of convex pieces, with a fixed seed.
 
-    Args:
-        mesh: Closed and oriented: CoACD's own remeshing, which swells thin walls, is off.
-        max_pieces: No more pieces than this.
-
-    Raises:
-        GeometryError: if the mesh is too large for the search, or the search gives nothing.
+    CoACD's own remeshing, which swells thin walls, is off.
     """
     if len(mesh.faces) > MAX_FACES:
         raise GeometryError(f"a mesh of {len(mesh.faces)} triangles is too large for CoACD: at most {MAX_FACES}")

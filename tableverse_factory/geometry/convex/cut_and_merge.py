@@ -13,14 +13,14 @@ import manifold3d
 import numpy as np
 from jaxtyping import Int64
 
-from schemas.geometry import Matrix3, Points, Vector3
+from schemas.geometry import Points, Vector3
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import compute_hull_volume, find_extreme_points, make_hull_mesh
 
 CUT_POSITIONS = (0.25, 0.5, 0.75)  # where a part may be cut, as shares of its extent along an axis
+# Where no cut saves this share of a part's excess, the part is halved across its longest axis: shells (bowls, plates)
+# gain nothing from one cut but much from many, and halves lead to compact patches.
 MIN_SAVING_SHARE = 0.3
-"""Where no cut saves this share of a part's excess, the part is halved across its longest axis: shells (bowls, plates)
-gain nothing from one cut but much from many, and halves lead to compact patches."""
 OVERCUT = 1.5  # cutting goes on to this many times the pieces allowed: merging makes better pieces than cutting alone
 CUT_SHARE = 0.5  # cutting goes on to this share of the volume error allowed; merging spends the rest
 NEGLIGIBLE_SHARE = 1e-9  # parts of less than this share of the solid's volume are rounding, and left out
@@ -37,16 +37,10 @@ class _Part:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PieceCluster:
-    """Points whose hull is one piece.
+    """Corners of the hull of one piece, and the volume of that hull.
 
-    Attributes:
-        points: Corners of the hull. Shape (n, 3).
-        outline: Those that decide its shape, few.
-        low: Lowest corner of the outline's box.
-        high: Highest corner.
-        volume: Of the hull.
-        outline_volume: Of the outline's hull; differences are taken between volumes of outlines.
-        halves: The two it was merged from, or none.
+    The outline is the few corners that decide its shape: `low` and `high` are its box, and differences are taken
+    between volumes of outlines. `halves` are the two clusters that this one was merged from, or none.
     """
 
     points: Points
@@ -59,12 +53,9 @@ class PieceCluster:
 
 
 def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: float) -> list[PieceCluster]:
-    """Decompose a solid into point clusters, in a fixed order, whose hulls together cover it.
+    """Decompose a solid of extent 1 into point clusters, in a fixed order, whose hulls together cover it.
 
-    Args:
-        solid: Closed, of extent 1 and positive volume.
-        max_pieces: No more clusters than this.
-        volume_error: Hulls may add up to this share of the solid's volume, if `max_pieces` allows.
+    Hulls may add up to `volume_error` of the solid's volume, if `max_pieces` allows.
     """
     volume, most = float(solid.volume()), int(OVERCUT * max_pieces)
     parts = _cut(solid, most, CUT_SHARE * volume_error * volume, NEGLIGIBLE_SHARE * volume)
@@ -73,7 +64,7 @@ def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: flo
 
 
 def make_cluster(points: Points) -> PieceCluster:
-    """Make a cluster of points."""
+    """Make the cluster of some points."""
     corners = make_hull_mesh(points).vertices
     outline = find_extreme_points(corners)
     return PieceCluster(corners, outline, *aabb(outline), compute_hull_volume(corners), compute_hull_volume(outline))
@@ -89,11 +80,8 @@ def _cut(solid: manifold3d.Manifold, max_parts: int, excess_allowed: float, negl
     while waiting and len(parts) < max_parts and total > excess_allowed:
         _, worst = heapq.heappop(waiting)
         normal, offset = _choose_plane(parts[worst])
-        halves = [
-            part
-            for side in parts[worst].solid.split_by_plane(normal, offset)
-            for part in _split_shells(side, negligible)
-        ]
+        sides = parts[worst].solid.split_by_plane(normal, offset)
+        halves = [part for side in sides for part in _split_shells(side, negligible)]
         if len(halves) < 2:  # thinner than rounding: it stays whole
             continue
         total += sum(part.excess for part in halves) - parts.pop(worst).excess
@@ -133,7 +121,8 @@ def _make_part(solid: manifold3d.Manifold) -> _Part:
 
 def _choose_plane(part: _Part) -> tuple[Vector3, float]:
     """Choose the best plane across a principal axis; the middle of the longest where none saves enough."""
-    axes = _compute_principal_axes(part.points)
+    centred = part.points - part.points.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1].T
     candidates = [_weigh_cut(part, axis, share) for axis in axes for share in CUT_POSITIONS]
     volume, axis, offset = min(candidates, key=lambda candidate: candidate[0])
     whole = compute_hull_volume(find_extreme_points(part.points))
@@ -155,30 +144,16 @@ def _weigh_cut(part: _Part, axis: Vector3, share: float) -> tuple[float, Vector3
     weight = (start[crossing] / (start[crossing] - end[crossing]))[:, None]
     first, second = part.points[part.edges[crossing, 0]], part.points[part.edges[crossing, 1]]
     rim = first * (1.0 - weight) + second * weight
-    upper = np.concatenate([part.points[above >= 0.0], rim])
-    lower = np.concatenate([part.points[above < 0.0], rim])
-    return (
-        compute_hull_volume(find_extreme_points(upper)) + compute_hull_volume(find_extreme_points(lower)),
-        axis,
-        offset,
-    )
-
-
-def _compute_principal_axes(points: Points) -> Matrix3:
-    """Rows: the eigenvectors of the points' covariance."""
-    centred = points - points.mean(axis=0)
-    return np.linalg.eigh(centred.T @ centred)[1].T
+    upper = find_extreme_points(np.concatenate([part.points[above >= 0.0], rim]))
+    lower = find_extreme_points(np.concatenate([part.points[above < 0.0], rim]))
+    return compute_hull_volume(upper) + compute_hull_volume(lower), axis, offset
 
 
 def _merge(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[PieceCluster]:
-    """Merges the pair whose common hull adds least, again and again, within what is allowed."""
+    """Merge the pair whose common hull adds least, again and again, within what is allowed."""
     alive = dict(enumerate(clusters))
-    waiting = [
-        (_compute_added_volume(alive[i], alive[j]), i, j)
-        for i in alive
-        for j in range(i)
-        if _are_near(alive[i], alive[j])
-    ]
+    near = [(i, j) for i in alive for j in range(i) if _are_near(alive[i], alive[j])]
+    waiting = [(_compute_added_volume(alive[i], alive[j]), i, j) for i, j in near]
     heapq.heapify(waiting)
     total = sum(cluster.volume for cluster in clusters)
     key = len(clusters)

@@ -24,20 +24,15 @@ from tableverse_factory.geometry.mesh.repair import make_closed_solid, solid_to_
 
 FEW_FACES = 5_000  # smaller meshes are not simplified
 MANY_SHELLS = 500  # more shells cannot be simplified to few faces, and none of them will be cut
+# Shares of the longest side; the coarsest that keeps the volume to `SIMPLIFY_VOLUME`: thin walls need a finer one.
 SIMPLIFY_TOLERANCES = (4e-4, 2e-4, 1e-4, 0.0)
-"""The coarsest that keeps the volume within `SIMPLIFY_VOLUME` is taken: thin walls need a finer one. Lengths here are
-shares of the mesh's longest side."""
 SIMPLIFY_VOLUME = 0.01
 MAX_FACES = 20_000  # larger meshes are simplified further, twice as coarsely each time
 GRID = 2.0**-30  # shapes are rounded to this, so that scale leaves no trace in the last bits
 
 
 def decompose(mesh: TriangleMesh, config: RectifyConfig, cache_dir: Path) -> ConvexPieces:
-    """Decompose a mesh into convex pieces that cover it, in its own frame and at scale 1.
-
-    Raises:
-        GeometryError: if the mesh cannot be made a solid.
-    """
+    """Decompose a mesh into convex pieces that cover it, in its own frame and at scale 1."""
     low, high = aabb(check_mesh(mesh, "mesh").vertices)
     center, size = (low + high) / 2, float((high - low).max())
     shape = TriangleMesh(np.round((mesh.vertices - center) / size / GRID) * GRID, mesh.faces)
@@ -69,9 +64,8 @@ def _make_hulls(solid: manifold3d.Manifold, config: RectifyConfig) -> tuple[str,
     if config.max_pieces == 1 or compute_signed_volume(whole) <= allowed:
         return "convex", [whole]
     if config.decomposition == "coacd":
-        return "coacd", [
-            make_piece(points) for points in decompose_with_coacd(solid_to_mesh(_simplify(solid)), config.max_pieces)
-        ]
+        found = decompose_with_coacd(solid_to_mesh(_simplify(solid)), config.max_pieces)
+        return "coacd", [make_piece(points) for points in found]
     clusters = cut_and_merge(_simplify(solid), config.max_pieces, config.volume_error)
     return "cut", make_bounded_pieces(clusters, config.max_pieces, allowed)
 

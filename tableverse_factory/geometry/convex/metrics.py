@@ -9,6 +9,7 @@ from jaxtyping import Float64
 from trimesh.triangles import closest_point
 
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import compute_face_heights, measure_protrusion, unite_hulls
 from tableverse_factory.geometry.mesh.repair import solid_to_mesh
 from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to_surface, sample_surface
@@ -42,10 +43,9 @@ def measure_distance_to_pieces(points: Points, hulls: Sequence[TriangleMesh]) ->
     """Measure the distance of each point to the nearest piece, 0 inside."""
     outside = np.ones(len(points), dtype=bool)
     for hull in hulls:
-        low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
-        near = np.flatnonzero(
-            outside & (points >= low - INSIDE_TOLERANCE).all(axis=1) & (points <= high + INSIDE_TOLERANCE).all(axis=1)
-        )
+        low, high = aabb(hull.vertices)
+        in_box = (points >= low - INSIDE_TOLERANCE).all(axis=1) & (points <= high + INSIDE_TOLERANCE).all(axis=1)
+        near = np.flatnonzero(outside & in_box)
         outside[near] = measure_protrusion(hull, points[near])[0] > INSIDE_TOLERANCE
     distances = np.zeros(len(points))
     distances[outside] = _measure_distance_outside(points[outside], hulls)
@@ -54,7 +54,9 @@ def measure_distance_to_pieces(points: Points, hulls: Sequence[TriangleMesh]) ->
 
 def _measure_distance_outside(points: Points, hulls: Sequence[TriangleMesh]) -> Float64[np.ndarray, " n"]:
     """Measure the distance of points outside all hulls to the nearest; boxes limit the hulls that are tried."""
-    boxes = np.stack([_measure_distance_to_box(points, hull) for hull in hulls], axis=1)
+    corners = [aabb(hull.vertices) for hull in hulls]
+    beyond = (np.maximum(np.maximum(low - points, points - high), 0.0) for low, high in corners)
+    boxes = np.stack([np.linalg.norm(each, axis=1) for each in beyond], axis=1)
     nearest = np.argmin(boxes, axis=1)
     distances = np.full(len(points), np.inf)
     for k, hull in enumerate(hulls):
@@ -64,11 +66,6 @@ def _measure_distance_outside(points: Points, hulls: Sequence[TriangleMesh]) -> 
         nearer = np.flatnonzero((nearest != k) & (boxes[:, k] < distances))
         distances[nearer] = np.minimum(distances[nearer], _measure_distance_to_hull(points[nearer], hull))
     return distances
-
-
-def _measure_distance_to_box(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:
-    low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
-    return np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
 
 
 def _measure_distance_to_hull(points: Points, hull: TriangleMesh) -> Float64[np.ndarray, " n"]:

@@ -14,13 +14,7 @@ Points2 = Float64[np.ndarray, "n 2"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectangle(Frozen):
-    """A rectangle in a plane.
-
-    Attributes:
-        center: Its middle [m].
-        half_size: Half extents along its own axes [m].
-        yaw: Rotation of its own axes, in [-pi/4, pi/4) [rad].
-    """
+    """A rectangle in a plane [m], its own axes rotated by `yaw`, in [-pi/4, pi/4) [rad]."""
 
     center: Float64[np.ndarray, "2"]
     half_size: Float64[np.ndarray, "2"]
@@ -34,11 +28,7 @@ class Rectangle(Frozen):
 
 
 def fit_min_rectangle(points: Points2) -> Rectangle:
-    """Fit the rectangle of least area around all points (one of its sides lies on an edge of their hull).
-
-    Raises:
-        GeometryError: if the points lie on a line.
-    """
+    """Fit the rectangle of least area around all points (one of its sides lies on an edge of their hull)."""
     try:
         hull = points[ConvexHull(points).vertices]
     except (QhullError, ValueError) as error:

@@ -22,12 +22,7 @@ _POINTS_PER_BLOCK = 20_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane(Frozen):
-    """The points `x` with `normal · x = offset`.
-
-    Attributes:
-        normal: Unit length.
-        offset: Signed distance of the plane from the origin along the normal [m].
-    """
+    """The points `x` with `normal · x = offset` [m]; the normal has unit length."""
 
     normal: Vector3
     offset: float
@@ -42,11 +37,7 @@ class Plane(Frozen):
 
 
 def fit_plane(points: Points) -> Plane:
-    """Fit a plane by total least squares.
-
-    Raises:
-        ValueError: for fewer than three points.
-    """
+    """Fit a plane by total least squares."""
     if len(points) < 3:
         raise ValueError(f"{len(points)} points span no plane: give at least 3")
     center = points.mean(axis=0)
@@ -69,11 +60,7 @@ def refine_plane(plane: Plane, points: Points, tolerance: PerPoint) -> Plane:
 def fit_shared_normal(patches: Sequence[Points]) -> Vector3:
     """Fit the common normal of parallel planes, each at its own offset, by total least squares. Its sign is arbitrary.
 
-    Args:
-        patches: Points of each plane; multiplied by weights where some are worth less. Shape (n, 3) each.
-
-    Raises:
-        ValueError: for fewer than three points in all.
+    Each plane has points of shape (n, 3), multiplied by weights where some are worth less.
     """
     if sum(len(points) for points in patches) < 3:
         raise ValueError("fewer than 3 points span no plane")
@@ -87,16 +74,9 @@ def find_dominant_planes(
 ) -> Iterator[tuple[Plane, Selection]]:
     """Find planes in order of their inliers, each by RANSAC in the points that the ones before it left over.
 
-    Args:
-        points: In an order where neighbours in space are near one another (rows of an image): the three points of
-            a hypothesis are drawn close together, so that small planes are hit as well. Shape (n, 3) [m].
-        tolerance: Distance within which each point counts as an inlier [m]. Shape (n,).
-        rng: Draws the hypotheses.
-        max_planes: Stop after this many.
-        min_inliers: Stop where the best plane has fewer.
-
-    Yields:
-        The refined plane and its inliers among all points (those of earlier planes excluded).
+    Yields each refined plane with its inliers, points within `tolerance` (n,) [m], until the best has too few.
+    Neighbours in space must be near one another in the order of the points (n, 3) [m], as in rows of an image: the
+    three points of a hypothesis are drawn close together, so that small planes are hit as well.
     """
     left = np.ones(len(points), dtype=bool)
     for _ in range(max_planes):
@@ -113,14 +93,9 @@ def find_dominant_planes(
 
 def _find_best_plane(points: Points, tolerance: PerPoint, rng: np.random.Generator) -> Plane:
     normals, offsets = _draw_hypotheses(points, rng)
+    blocks = [slice(k, k + _HYPOTHESES_PER_BLOCK) for k in range(0, len(normals), _HYPOTHESES_PER_BLOCK)]
     counts = np.concatenate(
-        [
-            (
-                np.abs(points @ normals[k : k + _HYPOTHESES_PER_BLOCK].T - offsets[k : k + _HYPOTHESES_PER_BLOCK])
-                <= tolerance[:, None]
-            ).sum(axis=0)
-            for k in range(0, len(normals), _HYPOTHESES_PER_BLOCK)
-        ]
+        [(np.abs(points @ normals[some].T - offsets[some]) <= tolerance[:, None]).sum(axis=0) for some in blocks]
     )
     best, best_count = Plane(normals[0], float(offsets[0])), -1
     for k in np.argsort(-counts, kind="stable")[:REFINED_HYPOTHESES]:

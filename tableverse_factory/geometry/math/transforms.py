@@ -11,11 +11,7 @@ def identity_pose() -> Pose:
 
 
 def normalize_quaternion(quaternion_wxyz: Quaternion) -> Quaternion:
-    """Scale a quaternion to unit length, real part not negative: one representative of q and -q.
-
-    Raises:
-        ValueError: if the length is zero or not finite.
-    """
+    """Scale a quaternion to unit length, real part not negative: one representative of q and -q."""
     q = np.asarray(quaternion_wxyz, dtype=np.float64)
     length = float(np.linalg.norm(q))
     if not np.isfinite(length) or length < 1e-9:
@@ -40,14 +36,8 @@ def rotation_matrix(quaternion_wxyz: Quaternion) -> Matrix3:
 def quaternion_from_matrix(rotation: Matrix3) -> Quaternion:
     """Unit quaternion of a rotation matrix, stable for every angle (largest of four candidates)."""
     m = rotation
-    four_squares = np.array(
-        [
-            1 + m[0, 0] + m[1, 1] + m[2, 2],
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-        ]
-    )
+    xx, yy, zz = np.diag(m)
+    four_squares = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
     columns = np.array(
         [
             [four_squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],

@@ -5,7 +5,7 @@ its highest ray, vertex or sharp edge, so a rim thinner than a cell closes; a kn
 not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -20,30 +20,21 @@ Heights = Float64[np.ndarray, "nx ny"]
 CellMask = Bool[np.ndarray, "nx ny"]
 
 CELL_M = 0.003  # spacing of the grid: the walls of household vessels are 2 to 5 mm
-
 MIN_CAVITY_DEPTH_M = 0.015
 MIN_CAVITY_WIDTH_M = 0.025
-MIN_CAVITY_ASPECT = 0.12
-"""Depth over width of the opening: a plate of 25 cm with a rim of 2 cm is no container, a frying pan is one."""
-
+MIN_CAVITY_ASPECT = 0.12  # depth over width: a plate of 25 cm with a rim of 2 cm is no container, a frying pan is one
 LEVEL_TOLERANCE_M = 0.0025
-MIN_FLAT_WIDTH_M = 0.04  # A body carries others on a level patch of at least this diameter
-
+MIN_FLAT_WIDTH_M = 0.04  # a body carries others on a level patch of at least this diameter
 _RAYS_PER_SIDE = 2
 _MIN_WATER_DEPTH_M = 0.003
-_MAX_STEEP_SINE = 0.35
-"""Faces whose normals rise by no more than this sine stand upright: rays 1.5 mm apart miss the rim between them."""
+_MAX_STEEP_SINE = 0.35  # faces of normals that rise no more are upright: rays 1.5 mm apart miss the rim between them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeightMap(Frozen):
-    """Highest and lowest point of a body over each cell; cell (i, j) spans `[(i, j), (i + 1, j + 1)] * cell`.
+    """Highest and lowest point of a body over each cell (nx, ny) [m]; -inf and +inf where the body is not.
 
-    Attributes:
-        cell: Spacing [m].
-        corner: Grid index (i, j) of element (0, 0).
-        top: Shape (nx, ny) [m], -inf where the body is not.
-        bottom: Shape (nx, ny) [m], +inf where the body is not.
+    Cell (i, j) spans `[(i, j), (i + 1, j + 1)] * cell`; `corner` is the (i, j) of element (0, 0).
     """
 
     cell: float
@@ -58,10 +49,8 @@ class HeightMap(Frozen):
 
     def shifted(self, cells: tuple[int, int], rise: float) -> "HeightMap":
         """Move the map by whole cells and lift it by `rise` [m]."""
-        corner = (self.corner[0] + cells[0], self.corner[1] + cells[1])
-        if rise == 0.0:
-            return HeightMap(self.cell, corner, self.top, self.bottom)
-        return HeightMap(self.cell, corner, self.top + rise, self.bottom + rise)
+        moved = replace(self, corner=(self.corner[0] + cells[0], self.corner[1] + cells[1]))
+        return moved if rise == 0.0 else replace(moved, top=self.top + rise, bottom=self.bottom + rise)
 
     def window(self, other: "HeightMap", values: np.ndarray, outside: float | bool) -> np.ndarray:
         """Bring `values` on `other`'s cells to the cells of this map; `outside` where `other` has none."""
@@ -76,14 +65,10 @@ class HeightMap(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cavity(Frozen):
-    """Room in a vessel that opens upwards, as water would fill it.
+    """Room in a vessel that opens upwards, as water would fill it up to `rim_z`, where it would spill [m].
 
-    Attributes:
-        cells: The water's surface, on the cells of the vessel's own map.
-        opening: The same and one cell around: contents may touch the wall.
-        rim_z: Height of that surface, where the vessel would spill [m].
-        floor_z: Its deepest point [m].
-        volume_m3: Of the water [m³].
+    `cells` are the water's surface on the vessel's own map, `opening` one cell more all around: contents may touch the
+    wall.
     """
 
     cells: CellMask
@@ -99,7 +84,7 @@ class Cavity(Frozen):
 
 
 def compute_height_map(mesh: TriangleMesh, caster: RaycastingScene, cell: float = CELL_M) -> HeightMap:
-    """Compute the map of a mesh; `caster` holds the same mesh."""
+    """Compute the map of a mesh, which `caster` holds."""
     low, high = aabb(mesh.vertices)
     first = np.floor(low[:2] / cell).astype(int)
     shape = np.maximum(np.ceil(high[:2] / cell).astype(int) - first, 1)

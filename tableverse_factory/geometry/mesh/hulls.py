@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.geometry import Points, TriangleMesh
 
 VERTICES_PER_ROUND = 6
-SLIVER = 1e-9  # A triangle lower than this share of its length has no reliable normal
+SLIVER = 1e-9  # a triangle lower than this share of its length has no reliable normal
 MIN_CORNER_COSINE = 0.5  # cosine between the direction of a corner and its faces' normals
 
 
@@ -67,9 +67,6 @@ def make_bounded_hull(points: Points, max_vertices: int, tolerance: float) -> Tr
 
     It grows from a simplex: each round adds, face by face, the point furthest outside, until none lies further out than
     `tolerance` or there are enough. Points still outside are then covered by moving the corners outward.
-
-    Raises:
-        ValueError: if the points span no volume.
     """
     corners = make_hull_mesh(points).vertices
     chosen = _find_simplex(corners)
@@ -106,11 +103,7 @@ def _expand_hull(hull: TriangleMesh, points: Points) -> TriangleMesh:
 
 
 def make_hull_mesh(points: Points) -> TriangleMesh:
-    """Make the convex hull as triangles, counter-clockwise seen from outside.
-
-    Raises:
-        ValueError: if the points span no volume.
-    """
+    """Make the convex hull as triangles, counter-clockwise seen from outside; flat points are a `ValueError`."""
     try:
         return TriangleMesh(*orient_faces_outward(ConvexHull(points)))
     except QhullError as error:

@@ -37,14 +37,9 @@ def compute_signed_volume(mesh: TriangleMesh) -> float:
 def compute_volumes_and_centers(
     meshes: Sequence[TriangleMesh], least_m3: float
 ) -> tuple[Float64[np.ndarray, " n"], Points]:
-    """Compute volume [m³] and centre [m] of many small closed meshes at once.
+    """Compute volume [m³] and centre [m] of one or many small closed meshes at once.
 
-    Args:
-        meshes: At least one.
-        least_m3: Smaller ones get this volume, and the mean of their corners as centre.
-
-    Raises:
-        ValueError: if one has no corner or no face.
+    Those smaller than `least_m3` get this volume, and the mean of their corners as centre.
     """
     sizes = np.array([len(mesh.vertices) for mesh in meshes])
     counts = np.array([len(mesh.faces) for mesh in meshes])

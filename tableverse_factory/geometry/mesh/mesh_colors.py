@@ -19,12 +19,7 @@ DEFAULT_COLOR = (178, 178, 184)  # sRGB of uncoloured parts beside coloured ones
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaterialPart:
-    """A mesh of a file, and where it stands in it.
-
-    Attributes:
-        mesh: As trimesh read it; not copied, as pictures would lose their format.
-        matrix: From its own frame to the file's. Shape (4, 4).
-    """
+    """A mesh of a file, and the matrix from its own frame to the file's; a copy would lose the formats of pictures."""
 
     mesh: trimesh.Trimesh
     matrix: Matrix4
@@ -54,9 +49,6 @@ def merge_parts(parts: Sequence[MaterialPart], max_pixels: int) -> TriangleMesh:
     """Merge parts into one mesh, with one texture if any part has a picture, else with vertex colours if any has one.
 
     With a texture, vertices at the same place become one: files split them at its seams.
-
-    Raises:
-        GeometryError: if a picture has more pixels than allowed, or there are no parts.
     """
     if not parts:
         raise GeometryError("it holds no triangles")
@@ -79,15 +71,10 @@ def _read_paint(mesh: trimesh.Trimesh, max_pixels: int) -> _Paint | None:
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     linear, plain = getattr(material, "baseColorFactor", None), getattr(material, "kwargs", {}).get("kd")
     # trimesh supplies a picture of its own, without a format, where there is none
-    if (
-        isinstance(image, Image.Image)
-        and image.format in IMAGE_FORMATS
-        and uv is not None
-        and len(uv) == len(mesh.vertices)
-    ):
-        return _Paint(
-            _apply_tint(_decode_picture(image, max_pixels), linear), np.nan_to_num(np.asarray(uv, dtype=np.float64))
-        )
+    has_uv = uv is not None and len(uv) == len(mesh.vertices)
+    if isinstance(image, Image.Image) and image.format in IMAGE_FORMATS and has_uv:
+        picture = _apply_tint(_decode_picture(image, max_pixels), linear)
+        return _Paint(picture, np.nan_to_num(np.asarray(uv, dtype=np.float64)))
     if linear is not None:
         return _Paint(_apply_tint(np.full((1, 1, 3), 255, dtype=np.uint8), linear), None)
     if plain is not None and len(plain) >= 3:
@@ -96,30 +83,21 @@ def _read_paint(mesh: trimesh.Trimesh, max_pixels: int) -> _Paint | None:
 
 
 def _decode_picture(image: Image.Image, max_pixels: int) -> Picture:
-    """Decode a picture to sRGB, reduced to at most `MAX_SIDE` a side."""
     width, height = image.size
     if not 0 < width * height <= max_pixels:
         raise GeometryError(f"a texture of {width} x {height} pixels; at most {max_pixels} are decoded")
-    opaque = image.convert("RGB")
-    opaque.thumbnail((MAX_SIDE, MAX_SIDE))
-    return np.array(opaque)
+    return _shrink(image.convert("RGB"), MAX_SIDE)
 
 
 def _apply_tint(picture: Picture, factor: np.ndarray | None) -> Picture:
     """Multiply a picture by glTF's colour factor, which is given in linear light."""
     if factor is None or (np.asarray(factor)[:3] == 255).all():
         return picture
-    levels = np.arange(256)[:, None] / 255.0
-    table = _round_to_bytes(255.0 * _to_srgb(_to_linear(levels) * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)))
+    srgb = np.arange(256)[:, None] / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    linear = linear * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)
+    table = _round_to_bytes(255.0 * np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055))
     return np.stack([table[picture[..., k], k] for k in range(3)], axis=-1)
-
-
-def _to_linear(srgb: np.ndarray) -> np.ndarray:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def _to_srgb(linear: np.ndarray) -> np.ndarray:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _round_to_bytes(values: np.ndarray) -> np.ndarray:
@@ -127,7 +105,6 @@ def _round_to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def _merge_vertex_colors(meshes: Sequence[trimesh.Trimesh], paints: Sequence[_Paint | None]) -> Colors | None:
-    """Join the vertex colours of all meshes; None where no mesh has any."""
     if not any(p is not None or mesh.visual.kind == "vertex" for mesh, p in zip(meshes, paints, strict=True)):
         return None
     colors = np.concatenate([_make_vertex_colors(mesh, paint) for mesh, paint in zip(meshes, paints, strict=True)])
@@ -147,7 +124,12 @@ def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | Non
     Coordinates that wrap around are brought back into the picture face by face; a face over several repetitions shows
     one.
     """
-    pictures = [_make_part_picture(part.mesh, paint) for part, paint in zip(parts, paints, strict=True)]
+    pictures = [
+        _round_to_bytes(_make_vertex_colors(part.mesh, None).mean(axis=0)).reshape(1, 1, 3)
+        if paint is None
+        else paint.picture
+        for part, paint in zip(parts, paints, strict=True)
+    ]
     keys = [(picture.shape, picture.tobytes()) for picture in pictures]
     unique = dict(zip(keys, pictures, strict=True))
     rows = dict(zip(unique, np.cumsum([0, *(p.shape[0] for p in unique.values())])[:-1].tolist(), strict=True))
@@ -162,16 +144,9 @@ def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | Non
             pixel = 0.5 + np.stack([uv[..., 0] * (width - 1), rows[key] + (1.0 - uv[..., 1]) * (height - 1)], axis=-1)
             uv = np.array([0.0, 1.0]) + pixel / sheet_size * np.array([1.0, -1.0])
         corners.append(uv)
-    return Texture(_limit_size(sheet), np.concatenate(corners))
-
-
-def _make_part_picture(mesh: trimesh.Trimesh, paint: _Paint | None) -> Picture:
-    """A part's picture, or the mean of its vertex colours."""
-    return (
-        _round_to_bytes(_make_vertex_colors(mesh, paint).mean(axis=0)).reshape(1, 1, 3)
-        if paint is None
-        else paint.picture
-    )
+    if max(sheet.shape[:2]) > MAX_SHEET:
+        sheet = _shrink(Image.fromarray(sheet), MAX_SHEET)
+    return Texture(sheet, np.concatenate(corners))
 
 
 def _wrap_corner_uv(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:
@@ -183,11 +158,9 @@ def _wrap_corner_uv(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndar
     return np.clip(corners, 0.0, 1.0)
 
 
-def _limit_size(sheet: Picture) -> Picture:
-    if max(sheet.shape[:2]) <= MAX_SHEET:
-        return sheet
-    image = Image.fromarray(sheet)
-    image.thumbnail((MAX_SHEET, MAX_SHEET))
+def _shrink(image: Image.Image, most: int) -> Picture:
+    """Reduce a picture in place to at most `most` pixels a side."""
+    image.thumbnail((most, most))
     return np.array(image)
 
 

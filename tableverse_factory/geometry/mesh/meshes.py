@@ -29,16 +29,10 @@ MAX_COORDINATE_M = 1e5
 def read_mesh(
     data: bytes, file_name: str, beside: Mapping[str, bytes] | None = None, max_pixels: int = MAX_PIXELS
 ) -> TriangleMesh:
-    """Decode an OBJ, PLY, STL or GLB file into one mesh with its colours; GLB is turned from Y-up to Z-up.
+    """Decode an untrusted OBJ, PLY, STL or GLB file into one mesh with its colours; GLB is turned from Y-up to Z-up.
 
-    Args:
-        data: The file.
-        file_name: Its ending tells the format.
-        beside: The material file and the pictures that an OBJ names, by the names there.
-        max_pixels: Of each picture.
-
-    Raises:
-        GeometryError: if the file is too large, does not decode, or holds no finite triangles.
+    The ending of the name tells the format. `beside` holds the material file and the pictures that an OBJ names, by the
+    names there. Whatever is wrong with a file, the error is a `GeometryError`.
     """
     suffix = PurePosixPath(file_name).suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -91,11 +85,7 @@ class _MemoryResolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
 
 
 def _collect_parts(scene: trimesh.Scene) -> list[MaterialPart]:
-    """Collect the scene's meshes with their node transforms.
-
-    Raises:
-        GeometryError: if there are too many triangles.
-    """
+    """Collect the scene's meshes with their node transforms."""
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     parts = [MaterialPart(scene.geometry[name], matrix) for matrix, name in placed]
     parts = [part for part in parts if isinstance(part.mesh, trimesh.Trimesh) and len(part.mesh.faces)]
@@ -105,30 +95,28 @@ def _collect_parts(scene: trimesh.Scene) -> list[MaterialPart]:
 
 
 def check_mesh(mesh: TriangleMesh, name: str) -> TriangleMesh:
-    """Return the mesh if it is usable.
+    """Return the mesh if it is usable; else raise a `GeometryError`."""
+    if problem := _find_problem(mesh):
+        raise GeometryError(f"mesh {name!r} {problem}")
+    return mesh
 
-    Raises:
-        GeometryError: if it is empty, not finite, too large, or its indices point nowhere.
-    """
+
+def _find_problem(mesh: TriangleMesh) -> str:
     if len(mesh.faces) == 0 or len(mesh.vertices) == 0:
-        raise GeometryError(f"mesh {name!r} has no triangles")
+        return "has no triangles"
     if len(mesh.faces) > MAX_FACES:
-        raise GeometryError(f"mesh {name!r} has {len(mesh.faces)} triangles; at most {MAX_FACES} are taken")
+        return f"has {len(mesh.faces)} triangles; at most {MAX_FACES} are taken"
     if not np.isfinite(mesh.vertices).all():
-        raise GeometryError(f"mesh {name!r} holds vertices that are NaN or infinite")
+        return "holds vertices that are NaN or infinite"
     if int(mesh.faces.min()) < 0 or int(mesh.faces.max()) >= len(mesh.vertices):
-        raise GeometryError(f"mesh {name!r} has faces that point to missing vertices")
+        return "has faces that point to missing vertices"
     farthest = float(np.abs(mesh.vertices).max())
     if farthest > MAX_COORDINATE_M:
-        raise GeometryError(
-            f"mesh {name!r} reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"
-        )
+        return f"reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"
     extent = float(aabb_size(mesh.vertices).max())
     if not 0.0 < extent <= MAX_EXTENT_M:
-        raise GeometryError(
-            f"mesh {name!r} is {extent:g} m large; give metres, more than 0 and at most {MAX_EXTENT_M:g}"
-        )
-    return mesh
+        return f"is {extent:g} m large; give metres, more than 0 and at most {MAX_EXTENT_M:g}"
+    return ""
 
 
 def from_trimesh(mesh: trimesh.Trimesh) -> TriangleMesh:
@@ -156,11 +144,9 @@ def place_mesh(mesh: TriangleMesh, pose: Pose, scale: float = 1.0) -> TriangleMe
 def concatenate_meshes(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     """Join meshes into one without colours; empty where there are none."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    vertices = [np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]
+    vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
-    return TriangleMesh(
-        np.concatenate(vertices), np.concatenate([np.empty((0, 3), dtype=np.int32), *faces]).astype(np.int32)
-    )
+    return TriangleMesh(vertices, np.concatenate([np.empty((0, 3), dtype=np.int32), *faces]).astype(np.int32))
 
 
 def box_center(mesh: TriangleMesh) -> Vector3:

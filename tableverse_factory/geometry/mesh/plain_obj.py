@@ -4,13 +4,12 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
-from schemas.geometry import Faces, TriangleMesh
+from schemas.geometry import TriangleMesh
 
 _PLAIN = b"0123456789.+-e vf\r\n"
 _NO_INDEX = (b".", b"e")
 _MOST_NUMBERS = 6
 _FEW_BYTES = 50_000  # below it numpy is faster than Arrow: pieces are read by the thousand
-
 _LARGEST = 1e9  # no arithmetic overflows below it
 
 
@@ -30,20 +29,14 @@ def read_plain_obj(data: bytes) -> TriangleMesh | None:
         return None
     if np.abs(vertices).max() > _LARGEST or faces.min() < 1 or faces.max() > len(vertices):
         return None
-    indices = (faces - 1).astype(np.int32)
-    if not _all_used(indices, len(vertices)):
+    indices, used = (faces - 1).astype(np.int32), np.zeros(len(vertices), dtype=bool)
+    used[indices] = True
+    if not used.all():  # the general reader drops the others, and boxes depend on them
         return None
     colors = None
     if vertices.shape[1] == 6:
         colors = (255.0 * np.clip(vertices[:, 3:], 0.0, 1.0)).round().astype(np.uint8)
     return TriangleMesh(vertices[:, :3].copy(), indices, colors)
-
-
-def _all_used(faces: Faces, count: int) -> bool:
-    """Whether every vertex is a corner of a face: the general reader drops others, and boxes depend on them."""
-    used = np.zeros(count, dtype=bool)
-    used[faces] = True
-    return bool(used.all())
 
 
 def _table(text: bytes, letter: bytes, kind: pa.DataType) -> np.ndarray | None:
@@ -55,13 +48,12 @@ def _table(text: bytes, letter: bytes, kind: pa.DataType) -> np.ndarray | None:
     if not lines == text.count(letter) == (b"\n" + text).count(b"\n" + letter + b" "):
         return None
     try:
-        return _by_numpy(text, letter) if len(text) < _FEW_BYTES else _by_arrow(text, kind)
+        if len(text) >= _FEW_BYTES:
+            return _by_arrow(text, kind)
+        rows = text.replace(letter, b"").decode("ascii").splitlines()
+        return np.loadtxt(rows, dtype=np.float64, comments=None, ndmin=2)
     except ValueError:  # Arrow's errors are ValueErrors too
         return None
-
-
-def _by_numpy(text: bytes, letter: bytes) -> np.ndarray:
-    return np.loadtxt(text.replace(letter, b"").decode("ascii").splitlines(), dtype=np.float64, comments=None, ndmin=2)
 
 
 def _by_arrow(text: bytes, kind: pa.DataType) -> np.ndarray | None:

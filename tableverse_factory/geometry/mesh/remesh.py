@@ -15,8 +15,7 @@ SEALED = 0.9  # space within this many voxels of the triangles is blocked: more 
 SKIN = 0.25  # the new surface lies this many voxels outside the triangles
 SAMPLES_PER_VOXEL_FACE = 6.0
 MAX_SAMPLES = 1_000_000
-SAMPLES_PER_VOXEL = 4.0
-"""Along each axis; of samples nearer to one another, in folded or doubled surfaces, one is kept."""
+SAMPLES_PER_VOXEL = 4.0  # along each axis; of samples nearer to one another, in folded or doubled surfaces, one is kept
 MIN_AREA_SHARE = 1e-9  # share of the square of the extent
 
 
@@ -24,9 +23,6 @@ def remesh(mesh: TriangleMesh) -> TriangleMesh:
     """Make a closed surface around the triangles and around the space that they shut off from outside.
 
     Closed but broken surfaces become solids; open sheets become plates, their cavities kept. Error: `SKIN` voxels.
-
-    Raises:
-        GeometryError: if the triangles have no area.
     """
     low, high = aabb(mesh.vertices)
     extent = float((high - low).max())
@@ -35,10 +31,8 @@ def remesh(mesh: TriangleMesh) -> TriangleMesh:
         raise GeometryError(f"{len(mesh.faces)} triangles of {area:g} m² in all, {extent:g} m apart, are no surface")
     voxel = extent / RESOLUTION
     count = int(np.clip(SAMPLES_PER_VOXEL_FACE * area / voxel**2, 1000, MAX_SAMPLES))
-    points = _thin_points(
-        np.concatenate([sample_surface(mesh, count)[0], mesh.vertices[np.unique(mesh.faces)][:MAX_SAMPLES]]),
-        voxel / SAMPLES_PER_VOXEL,
-    )
+    points = np.concatenate([sample_surface(mesh, count)[0], mesh.vertices[np.unique(mesh.faces)][:MAX_SAMPLES]])
+    points = _thin_points(points, voxel / SAMPLES_PER_VOXEL)
     origin = low - 3.0 * voxel
     shape = np.ceil((high - origin) / voxel).astype(int) + 4
     centers = origin + voxel * np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1)

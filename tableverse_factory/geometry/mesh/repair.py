@@ -14,12 +14,9 @@ from tableverse_factory.geometry.mesh.meshes import check_mesh, from_trimesh, to
 from tableverse_factory.geometry.mesh.remesh import remesh
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 
-MIN_FILL_SHARE = 1e-7
-"""A solid that fills less than this share of the cube of its extent is flat: it is remeshed, which gives it body."""
-MAX_CAP_SHARE = 0.25
-"""Holes are capped if the caps have at most this share of the surface: an open bowl of one sheet must stay open."""
-MAX_FACES_STITCHED = 300_000
-"""Larger broken meshes are remeshed at once; finding their neighbours face by face would take minutes."""
+MIN_FILL_SHARE = 1e-7  # a solid that fills less of the cube of its extent is flat: remeshing gives it body
+MAX_CAP_SHARE = 0.25  # most share of the surface that caps may have: an open bowl of one sheet must stay open
+MAX_FACES_STITCHED = 300_000  # larger broken meshes are remeshed at once: finding neighbouring faces would take minutes
 
 
 def make_closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
@@ -27,9 +24,6 @@ def make_closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
 
     The least repair that works is taken: none (empty), `merged` (vertices that coincide), `oriented` (faces turned),
     `filled` (small holes capped), `remeshed` (voxels). Shells inside one another or overlapping count as one body.
-
-    Raises:
-        GeometryError: if the mesh has no finite triangles, or encloses nothing even then.
     """
     check_mesh(mesh, "mesh")
     low, high = aabb(mesh.vertices)
@@ -65,15 +59,10 @@ def orient_outward(shell: manifold3d.Manifold) -> manifold3d.Manifold:
 
 
 def _unite_shells(solid: manifold3d.Manifold) -> manifold3d.Manifold:
-    """Unite the shells of a solid, those that are inside out turned."""
     shells = [orient_outward(shell) for shell in solid.decompose()]
     if len(shells) < 2:
         return shells[0] if shells else solid
     return manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add)
-
-
-def _merge_vertices(mesh: TriangleMesh) -> TriangleMesh:
-    return from_trimesh(_tidy(mesh))
 
 
 def _orient_faces(mesh: TriangleMesh) -> TriangleMesh:
@@ -135,7 +124,7 @@ def _find_boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
 
 
 _REPAIRS: tuple[tuple[str, Callable[[TriangleMesh], TriangleMesh]], ...] = (
-    ("merged", _merge_vertices),
+    ("merged", lambda mesh: from_trimesh(_tidy(mesh))),
     ("oriented", _orient_faces),
     ("filled", _fill_holes),
     ("remeshed", remesh),

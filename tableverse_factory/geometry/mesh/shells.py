@@ -9,7 +9,7 @@ from schemas.geometry import Faces, TriangleMesh
 from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.geometry.mesh.repair import mesh_to_solid, orient_outward, solid_to_mesh
 
-WITHIN_SHARE = 0.01  # A shell is within others if no more than this share of it is outside them
+WITHIN_SHARE = 0.01  # a shell is within others if no more than this share of it is outside them
 SAME_SHARE = 1e-9  # volumes that differ by no more than this share are the same
 REMEMBERED_BYTES = 4 * 1024  # one flag for each mesh of some scenes
 

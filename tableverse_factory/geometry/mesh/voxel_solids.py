@@ -17,13 +17,7 @@ Field = Float64[np.ndarray, "nx ny nz"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelGrid(Frozen):
-    """Sample positions of a field.
-
-    Attributes:
-        origin: Position of sample (0, 0, 0) [m].
-        cell: Spacing [m].
-        shape: Number of samples per axis.
-    """
+    """Positions of the samples of a field: `shape` of them, `cell` apart, (0, 0, 0) at `origin` [m]."""
 
     origin: Vector3
     cell: float
@@ -51,9 +45,6 @@ def extract_surface(field: Field, grid: VoxelGrid) -> TriangleMesh:
 
     The field is a signed distance near its zero (positive inside, [m]) and is clamped to two cells; a border of
     outside samples closes the surface at the grid's edge.
-
-    Raises:
-        GeometryError: if no sample is positive.
     """
     reach = 2 * grid.cell
     clamped = np.clip(field, -reach, reach)
@@ -68,11 +59,7 @@ def extract_surface(field: Field, grid: VoxelGrid) -> TriangleMesh:
 
 
 def to_manifold(mesh: TriangleMesh) -> manifold3d.Manifold:
-    """Convert a mesh to a solid.
-
-    Raises:
-        GeometryError: if it is not the closed, oriented surface of one.
-    """
+    """Convert a mesh to a solid; a `GeometryError` if it is not the closed, oriented surface of one."""
     solid = mesh_to_solid(mesh)
     if solid.status() != manifold3d.Error.NoError or solid.is_empty():
         raise GeometryError(f"the mesh bounds no solid: {solid.status().name}")
@@ -80,11 +67,7 @@ def to_manifold(mesh: TriangleMesh) -> manifold3d.Manifold:
 
 
 def from_manifold(solid: manifold3d.Manifold) -> TriangleMesh:
-    """Convert a solid to its closed surface.
-
-    Raises:
-        GeometryError: if the solid is empty.
-    """
+    """Convert a solid, which must not be empty, to its closed surface."""
     if solid.is_empty():
         raise GeometryError("the solid is empty")
     return solid_to_mesh(solid)

@@ -14,27 +14,21 @@ from tableverse_factory.geometry.registration.icp import Fit, PartialView, Sampl
 
 BODY_POINTS = 300
 UPRIGHT = 0.9  # cosine of the tilt up to which a mesh stands on its own lower face
-ODD_PRICE_M = 0.001  # A mesh that lies on another than its own lower face has to fit this much better
-PROPORTIONS_STD = 0.04
-"""A MeshModel's error of the proportions: of the logarithm of the size along one axis against the others."""
+ODD_PRICE_M = 0.001  # a mesh that lies on another than its own lower face has to fit this much better
+PROPORTIONS_STD = 0.04  # of a mesh model's proportions: of the logarithm of the size along an axis against the others
 STRETCHED_M = 0.0001  # price of proportions that are wrong by one standard deviation
 FARTHEST_M = 0.02
-FLOATS, KNOWN_SUPPORT_M = 0.1, 0.005
-"""Price of a metre between a mesh and its support, and how well this has to be known for that."""
+FLOATS, KNOWN_SUPPORT_M = 0.1, 0.005  # price of a metre between mesh and support, and how well it must be known
 EMPTY_WEIGHT, EMPTY_SLACK_M = 2.0, 0.002
 BELOW_TABLE_M = 0.003
 
-Prices = Float64[np.ndarray, " n"]
 
+def compute_chamfer_costs(
+    mesh: SampledMesh, view: PartialView, fits: Sequence[Fit], points: Points
+) -> Float64[np.ndarray, " n"]:
+    """Chamfer distance of each of one or more fits for a partial view, and what an unusual stand costs [m].
 
-def compute_chamfer_costs(mesh: SampledMesh, view: PartialView, fits: Sequence[Fit], points: Points) -> Prices:
-    """Chamfer distance of each fit for a partial view, and what an unusual stand costs [m].
-
-    Args:
-        mesh: What was fitted.
-        view: What it was fitted to.
-        fits: At least one.
-        points: Those of the observed points that count, table frame [m]. Shape (n, 3).
+    `points` are those of the view that count (n, 3) [m].
     """
     turns, sizes = np.stack([fit.rotation for fit in fits]), np.stack([fit.size for fit in fits])
     shifts = np.stack([fit.shift for fit in fits])

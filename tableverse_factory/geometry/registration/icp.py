@@ -22,31 +22,22 @@ NOISE_M = 0.0004  # lower bound of the points' noise
 OUTLINE_M = 0.002  # accuracy of the free space: a pixel or two, and the error of its depth
 OUTLINE_POINTS = 300
 IN_COMMON = 2.0  # the scatter within one picture shows about half of the error, measured on synthetic truth
-SYSTEMATIC_M, SYSTEMATIC_RAD = 0.0015, 0.0035
-"""Lower bound of the error, from outlines a pixel too narrow and depth quantisation; measured likewise."""
+SYSTEMATIC_M, SYSTEMATIC_RAD = 0.0015, 0.0035  # lower bounds: outlines a pixel too narrow, depth quantisation; measured
 OUTLINES = 30  # effective number of outline points: their errors are correlated
 INDEPENDENT = 300  # effective number of observed points, at most: errors of neighbours are correlated
 SCALE_STD = 1.0  # of the logarithm of the overall size: nearly unconstrained
 SIZE_RANGE = (0.6, 1.6)  # bounds of the size along each axis, against its start
 CELLS = 4  # cells along the object's longest side; points within one have errors in common
 
-Emptiness = Callable[[Points], Float64[np.ndarray, " n"]]
-"""Signed distance of each point to the space seen to be empty [m], negative inside it."""
 Gaps = Float64[np.ndarray, " n"]
+Emptiness = Callable[[Points], Gaps]  # signed distance to the space seen to be empty [m], negative inside it
 Rows = Float64[np.ndarray, "n 9"]
 Matrix9 = Float64[np.ndarray, "9 9"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampledMesh(Frozen):
-    """A surface as points about the middle of its box.
-
-    Attributes:
-        points: Shape (n, 3).
-        normals: Unit normals of the triangles under `points`. Shape (n, 3).
-        tree: Of `points`.
-        length: Of the longest side of the box.
-    """
+    """A surface as points about the middle of its box, with unit normals (n, 3); `length` is the box's longest side."""
 
     points: Points
     normals: Points
@@ -65,14 +56,11 @@ class Fit(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartialView(Frozen):
-    """Observations of an object from one view, table frame.
+    """Points (n, 3) of an object seen from one camera position, table frame [m].
 
-    Attributes:
-        points: Observed [m]. Shape (n, 3).
-        eye: Position of the camera [m].
-        support_z: Height of the support [m]; ignored where the object clearly does not stand there.
-        support_std_m: Its standard deviation, large in a container, whose floor is hidden [m].
-        emptiness: Free space of the same view: the points alone do not show where a face ends.
+    The height of the support is ignored where the object clearly does not stand there; its standard deviation is large
+    in a container, whose floor is hidden. `emptiness` is the free space of the same view: the points alone do not show
+    where a face ends.
     """
 
     points: Points
@@ -84,10 +72,7 @@ class PartialView(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LinearSystem(Frozen):
-    """Linearised equations of a fit in the mesh frame: rotation, translation, logarithms of the sizes.
-
-    One row for each of `points`, and the last for the foot.
-    """
+    """Equations of a fit in the mesh frame: rotation, translation, log sizes; a row per point, then the foot's."""
 
     rows: Rows
     gaps: Gaps
@@ -115,15 +100,10 @@ def subsample(points: Points, count: int) -> Points:
 def run_icp(
     mesh: SampledMesh, view: PartialView, start: Fit, steps: int, settled: float, proportions_std: float
 ) -> Fit:
-    """Find the fit near `start` that agrees best with the view.
+    """Find the fit near `start`, to about 30° and a third of its size, that agrees best with the view.
 
-    Args:
-        mesh: What is fitted.
-        view: What it is fitted to.
-        start: Within the reach of the search: about 30° and a third of its size.
-        steps: At most this many.
-        settled: A step smaller than this is the last [m, rad].
-        proportions_std: Prior standard deviation of the logarithm of the size along an axis against the others.
+    A step smaller than `settled` [m, rad] is the last. `proportions_std` is the prior standard deviation of the
+    logarithm of the size along an axis against the others.
     """
     fit = start
     for k in range(steps):
@@ -181,7 +161,8 @@ def _linearize(
     out_weights = 1.0 / (OUTLINE_M**2 * (1.0 + (out_gaps / (3 * width)) ** 2)) * OUTLINES / OUTLINE_POINTS
     prior, pull = _make_prior(fit, kept, proportions_std)
     return _LinearSystem(
-        np.concatenate([_make_rows(local, n, q), out_rows, foot[None]]),
+        # Derivatives of the gap along the normal by rotation, translation and sizes.
+        np.concatenate([np.concatenate([np.cross(local, n), n, n * q], axis=1), out_rows, foot[None]]),
         np.concatenate([gaps, out_gaps, [off]]),
         np.concatenate([weights, out_weights, [standing]]),
         np.concatenate([view.points, out_points]),
@@ -202,11 +183,6 @@ def _linearize_protrusions(mesh: SampledMesh, view: PartialView, fit: Fit) -> tu
     slopes /= np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1.0)
     away = slopes @ fit.rotation
     return np.concatenate([np.cross(q, away), away, away * q], axis=1), -depth, points
-
-
-def _make_rows(local: Points, n: Points, q: Points) -> Rows:
-    """Derivatives of the gap along the normal by rotation, translation and sizes."""
-    return np.concatenate([np.cross(local, n), n, n * q], axis=1)
 
 
 def _linearize_foot(mesh: SampledMesh, fit: Fit, support_z: float) -> tuple[Float64[np.ndarray, "9"], float]:

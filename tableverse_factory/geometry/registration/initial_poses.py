@@ -5,13 +5,12 @@ the longest axes of mesh and points. Of symmetric headings, only those nearest t
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.optimize import minimize_scalar
 
-from schemas.geometry import Frozen, Matrix3, Points, Vector3
+from schemas.geometry import Matrix3, Points, Vector3
 from tableverse_factory.geometry.registration.fit_cost import UPRIGHT, compute_chamfer_costs
 from tableverse_factory.geometry.registration.icp import Fit, PartialView, SampledMesh, subsample
 from tableverse_factory.geometry.registration.symmetry import rotation_about_axis
@@ -22,25 +21,11 @@ TIPPED_STEP = float(np.deg2rad(15.0))
 MAX_STARTS, MAX_UPRIGHT_STARTS = 7, 3  # in all, and of them those on the mesh's own lower face at first
 APART_RAD, OTHER_SIZE = 0.3, 0.1
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Spread(Frozen):
-    """Extent of the observed points: their 1 % and 99 % quantiles, their mean and their top [m]."""
-
-    low: Vector3
-    high: Vector3
-    middle: Vector3
-    top: float
+_Spread = tuple[Vector3, Vector3, Vector3, float]  # 1 % and 99 % quantiles of the observed points, mean and top [m]
 
 
 def find_initial_poses(mesh: SampledMesh, view: PartialView, folds: Sequence[int]) -> list[Fit]:
-    """Find the best few starts of all kinds, no two of them alike.
-
-    Args:
-        mesh: What is registered.
-        view: What it is registered to.
-        folds: Rotational symmetry about each of the mesh's own axes, 0 for a round one.
-    """
+    """Find the best few starts, no two alike; `folds` about each of the mesh's own axes are 0 for a round one."""
     guesses = list(_generate_guesses(mesh, view, folds))
     price = compute_chamfer_costs(mesh, view, guesses, subsample(view.points, POINTS))
     ordered = [guesses[k] for k in np.argsort(price, kind="stable")]
@@ -53,7 +38,7 @@ def find_initial_poses(mesh: SampledMesh, view: PartialView, folds: Sequence[int
 
 def _generate_guesses(mesh: SampledMesh, view: PartialView, folds: Sequence[int]) -> Iterator[Fit]:
     low, high = np.quantile(view.points, (0.01, 0.99), axis=0)
-    spread = _Spread(low, high, view.points.mean(axis=0), float(np.quantile(view.points[:, 2], 0.995)))
+    spread = low, high, view.points.mean(axis=0), float(np.quantile(view.points[:, 2], 0.995))
     for index, (down, axis) in enumerate(_list_down_rotations()):
         step = TIPPED_STEP if index else HEADING_STEP
         for heading in _list_headings(folds[axis], step):
@@ -75,21 +60,22 @@ def _place_standing(mesh: SampledMesh, view: PartialView, spread: _Spread, rotat
 
     A sheet has hardly any height, and a partly hidden object is too narrow.
     """
+    low, high, mean, top = spread
     turned = rotation @ mesh.points.T
-    seen = mesh.normals @ (rotation.T @ (view.eye - spread.middle)) > 0.0
+    seen = mesh.normals @ (rotation.T @ (view.eye - mean)) > 0.0
     lowest = turned.min(axis=1)
     extent = turned.max(axis=1) - lowest
     if seen.sum() < 10 or not np.hypot(extent[0], extent[1]) > 0.0:
         return
-    by_breadth = float(np.hypot(*(spread.high - spread.low)[:2]) / np.hypot(*extent[:2]))
-    by_height = max(spread.top - view.support_z, 1e-3) / max(float(extent[2]), 1e-3 * mesh.length)
+    by_breadth = float(np.hypot(*(high - low)[:2]) / np.hypot(*extent[:2]))
+    by_height = max(top - view.support_z, 1e-3) / max(float(extent[2]), 1e-3 * mesh.length)
     sizes = [float(np.clip(by_height, 0.5 * by_breadth, 2.5 * by_breadth))]
     if abs(np.log(by_breadth / sizes[0])) > OTHER_SIZE:
         sizes.append(by_breadth)
     visible = turned[:, seen]
     middle = (visible.min(axis=1) + visible.max(axis=1)) / 2
     for size in sizes:
-        shift = (spread.low + spread.high) / 2 - size * middle
+        shift = (low + high) / 2 - size * middle
         shift[2] = view.support_z - size * float(lowest[2])
         yield Fit(rotation, np.full(3, size), shift)
 
@@ -121,7 +107,6 @@ def _compute_principal_axes(points: Points) -> Matrix3:
 
 
 def _refine_heading(mesh: SampledMesh, view: PartialView, start: Fit) -> Fit:
-    """Find the best heading within a step of a start, by a continuous search."""
     few = subsample(view.points, POINTS)
     pivot = few.mean(axis=0)
 

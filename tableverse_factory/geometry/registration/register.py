@@ -35,22 +35,14 @@ MIDDLE_STEPS, FINE_STEPS = 15, 20
 MIDDLE_SETTLED, FINE_SETTLED = 6e-4, 2e-4  # ICP ends with a step smaller than this [m, rad]
 REFINED_STARTS = 2  # starts that are aligned to more points
 DISTINCT = 0.03  # two placements are distinct where their surfaces lie this far apart, over the longest side
-ALIKE_COST_RATIO = 1.05
-"""Cost of a fit turned by a symmetry over that of the fit, up to which the view does not distinguish them."""
-COMPLETED_STD = 0.08
-"""Error of the proportions of a completion from one view, whose far side is guessed; see `PROPORTIONS_STD`."""
+ALIKE_COST_RATIO = 1.05  # up to this ratio of costs the view does not distinguish a fit from one turned by a symmetry
+COMPLETED_STD = 0.08  # `PROPORTIONS_STD` of a completion from one view, whose far side is guessed
 STANDS_STD_M = 0.0015  # of the height of the table, or of another object's top
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration(Frozen):
-    """Pose and size of a mesh, with uncertainty.
-
-    Attributes:
-        pose: The mesh's own frame in the table frame, after `size`.
-        size: Factor along each of the mesh's own axes. Shape (3,).
-        uncertainty: Of the pose.
-    """
+    """Factors along the mesh's own axes, then the pose of its own frame in the table frame, with its uncertainty."""
 
     pose: Pose
     size: Vector3
@@ -58,16 +50,7 @@ class Registration(Frozen):
 
 
 def register(mesh: TriangleMesh, view: PartialView) -> Registration:
-    """Estimate pose and size of a mesh from one view.
-
-    Args:
-        mesh: In its own frame, z up as it usually stands; any unit.
-        view: Of the object.
-
-    Raises:
-        GeometryError: if there are too few points or they lie on a line, if the mesh has no surface, or if either is
-            not finite.
-    """
+    """Estimate pose and size of a mesh, in its own frame with z up as it usually stands and any unit, from one view."""
     _check_inputs(mesh, view.points)
     middle = box_center(mesh)
     ours = sample_mesh(mesh, middle)
@@ -82,13 +65,7 @@ def register(mesh: TriangleMesh, view: PartialView) -> Registration:
 
 
 def estimate_uncertainty(mesh: TriangleMesh, pose: Pose, view: PartialView) -> FitUncertainty:
-    """Estimate the uncertainty of a mesh that was not registered but made in place.
-
-    Args:
-        mesh: In its own frame, metric.
-        pose: Its own frame in the table frame.
-        view: Of the object.
-    """
+    """Estimate the uncertainty of a metric mesh that was not registered but made in place, at `pose` on the table."""
     middle = box_center(mesh)
     rotation = rotation_matrix(pose.quaternion_wxyz)
     fit = Fit(rotation, np.ones(3), pose.position + rotation @ middle)
@@ -120,16 +97,12 @@ def _refine(mesh: SampledMesh, view: PartialView, begun: list[Fit]) -> list[tupl
     def ordered(begun: list[Fit], count: int, steps: int, settled: float) -> list[tuple[Fit, float]]:
         some = replace(view, points=subsample(view.points, count))
         fits = [run_icp(mesh, some, start, steps, settled, PROPORTIONS_STD) for start in begun]
-        return sorted(
-            zip(fits, compute_chamfer_costs(mesh, view, fits, some.points).tolist(), strict=True),
-            key=lambda fit: fit[1],
-        )
+        costs = compute_chamfer_costs(mesh, view, fits, some.points).tolist()
+        return sorted(zip(fits, costs, strict=True), key=lambda fit: fit[1])
 
     tried = ordered(begun, MIDDLE_POINTS, MIDDLE_STEPS, MIDDLE_SETTLED)
-    return (
-        ordered([fit for fit, _ in tried[:REFINED_STARTS]], FINE_POINTS, FINE_STEPS, FINE_SETTLED)
-        + tried[REFINED_STARTS:]
-    )
+    best = ordered([fit for fit, _ in tried[:REFINED_STARTS]], FINE_POINTS, FINE_STEPS, FINE_SETTLED)
+    return best + tried[REFINED_STARTS:]
 
 
 def _resolve_symmetry(mesh: SampledMesh, view: PartialView, fit: Fit, folds: list[int]) -> Fit:

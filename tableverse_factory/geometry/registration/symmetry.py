@@ -6,20 +6,15 @@ from scipy.spatial import cKDTree
 from schemas.geometry import Matrix3, Points
 
 FOLDS = (8, 6, 5, 4, 3, 2)  # candidates, from the most to the fewest
-ODD_TURNS = (0.35, 1.13, 1.87, 2.61)
-"""No simple fractions of a full turn: only a round shape is alike after all of them [rad]."""
+ODD_TURNS = (0.35, 1.13, 1.87, 2.61)  # no simple fractions of a turn: only a round shape is alike after all [rad]
 MAX_QUERIES = 400
-ALIKE = 0.02
-"""Root mean square distance of a surface from itself turned that still counts as alike, over its horizontal size."""
+ALIKE = 0.02  # root mean square distance of a surface from itself turned that counts as alike, over its horizontal size
 
 
 def count_heading_folds(samples: Points, tree: cKDTree, axis: int = 2) -> int:
     """Count the rotational folds about one of the mesh's own axes: 1 for no symmetry, 0 for a round shape.
 
-    Args:
-        samples: Evenly on the surface, about the point that the axis goes through. Shape (n, 3).
-        tree: Of the same samples.
-        axis: 0 for x, 1 for y, 2 for z.
+    The samples (n, 3) lie evenly on the surface, about a point of the axis.
     """
     asked = samples[:: max(1, len(samples) // MAX_QUERIES)]
     across = np.delete(samples, axis, axis=1)
@@ -35,13 +30,7 @@ def _measure_misfit(asked: Points, tree: cKDTree, axis: int, turn: float) -> flo
 
 
 def find_symmetry_turn(rotation: Matrix3, folds: int, axis: int) -> Matrix3:
-    """Find the symmetry of a mesh about its own axis that brings its rotated frame nearest to the unrotated one.
-
-    Args:
-        rotation: Of the mesh, applied after the symmetry.
-        folds: From `count_heading_folds`.
-        axis: 0 for x, 1 for y, 2 for z.
-    """
+    """Find the symmetry of a mesh about its own axis after which `rotation` leaves it nearest to unrotated."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     sine, cosine = rotation[first, second] - rotation[second, first], rotation[first, first] + rotation[second, second]
     angle = float(np.arctan2(sine, cosine))

@@ -14,28 +14,17 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, pack_ra
 from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
 FRICTION = 0.5  # coulomb coefficient of pad on object; the contact normals lie within its cone about the closing axis
-
 MIN_WIDTH_M = 0.001
 FINGER_M = 0.012  # thickness of a finger beyond the contact
-
-MAX_AXIS_SLOPE = 0.6
-"""Largest vertical part of the closing axis: fingers come from above or from the side, never from below."""
-
+MAX_AXIS_SLOPE = 0.6  # largest vertical part of the closing axis: fingers come from above or beside, never from below
 MIN_HEIGHT_M = 0.004  # contacts nearer to what the body stands on are out of the fingertips' reach
-
 _SAMPLES = 512
 _OFF_M = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grips(Frozen):
-    """Antipodal pairs of contacts.
-
-    Attributes:
-        first: Contact of one finger. Shape (n, 3) [m].
-        second: Contact of the other. Shape (n, 3) [m].
-        share: Pairs found over surface points tried.
-    """
+    """Antipodal pairs of contacts, each (n, 3) [m], and their number over that of the surface points tried."""
 
     first: Points
     second: Points
@@ -49,12 +38,9 @@ class Grips(Frozen):
 
 
 def find_antipodal_grips(mesh: TriangleMesh, caster: RaycastingScene, max_width: float) -> Grips:
-    """Find pairs between which a gripper can close on a mesh in the table frame.
+    """Find pairs between which a gripper that opens to `max_width` [m] can close on a mesh as it stands.
 
-    Args:
-        mesh: As it stands [m].
-        caster: Holds the same mesh.
-        max_width: Opening of the gripper [m].
+    The caster holds the same mesh.
     """
     points, inward = sample_inward_normals(mesh, _SAMPLES)
     sign = compute_outward_sign(mesh)
@@ -71,12 +57,8 @@ def find_antipodal_grips(mesh: TriangleMesh, caster: RaycastingScene, max_width:
 def filter_grips(grips: Grips, felt: RaycastingScene, max_width: float) -> Grips:
     """Select the pairs that also hold on a body's convex pieces, which is what a simulation feels.
 
-    Pieces round off small features, and where a neck becomes a cone, pads that close on it slide off.
-
-    Args:
-        grips: Of the mesh.
-        felt: Holds the pieces of the same body where it stands, their normals outwards.
-        max_width: Opening of the gripper [m].
+    Pieces round off small features, and where a neck becomes a cone, pads that close on it slide off. `felt` holds the
+    pieces of the same body where it stands, their normals outwards.
     """
     if not len(grips.first):
         return grips
@@ -97,11 +79,7 @@ def cast_surface_rays(
 ) -> tuple[Float64[np.ndarray, " n"], Points]:
     """Cast rays from just behind their starts: the distance until each hits [m], else inf, and the normals there.
 
-    Args:
-        caster: Holds the mesh.
-        points: Starts; the surface on which one lies is not hit. Shape (n, 3) [m].
-        ways: Unit directions. Shape (n, 3).
-        sign: From `compute_outward_sign`; the normals then point out of the body. Shape (n, 3).
+    The surface on which a start lies is not hit. With `compute_outward_sign` the normals point out of the body.
     """
     hits = caster.cast_rays(pack_rays(points + _OFF_M * ways, ways), nthreads=1)
     distance = hits["t_hit"].numpy().astype(np.float64) + _OFF_M

@@ -12,18 +12,14 @@ from tableverse_factory.geometry.relations.relations import BodyFeatures, comput
 FOOT_TOLERANCE_M = 0.003  # an object that reaches further below the container's foot stands beside it
 INSIDE_SHARE = 0.5  # share of an object below the rim that is within the opening: objects lean out of full bowls
 DIP_M = 0.003
-HEAP_SHARE = 2 / 3
-"""Share of an object on a heap, seen from above, that is over the opening: a pen across a cup is not in it."""
+HEAP_SHARE = 2 / 3  # share of an object on a heap that is over the opening: a pen across a cup is not in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HollowVessel(Frozen):
-    """A container as it stands.
+    """A container as it stands; a dish, or a vessel on its side, has no cavity.
 
-    Attributes:
-        body: Of its mesh; a dish or a vessel on its side has no cavity.
-        room: Cells of the body's map in which contents can be: of the cavity, or all where there is none.
-        floor_z: Where that room begins: the floor of the cavity, or the foot [m].
+    Contents can be in the room, cells of the cavity or else all of the body's map, above its floor or foot [m].
     """
 
     body: BodyFeatures

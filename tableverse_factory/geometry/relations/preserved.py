@@ -15,10 +15,8 @@ from tableverse_factory.geometry.relations.support import Pairs, find_mesh_suppo
 class Relations:
     """Relations in a layout, as pairs of object indices; the table is no object.
 
-    Attributes:
-        carried: Pairs (carried, carrier): their meshes touch, with a normal that points up (`geometry.support`).
-        carried_on_pieces: The same on their convex pieces.
-        contained: Pairs (content, vessel): one reaches into the open room of the other (`geometry.relations`).
+    Pairs (carried, carrier) touch on their meshes or pieces, with a normal that points up (`support`); in pairs
+    (content, vessel) one reaches into the open room of the other (`relations`).
     """
 
     carried: Pairs
@@ -38,14 +36,7 @@ class Relations:
 
 @dataclass(frozen=True, slots=True)
 class PreservedRelations:
-    """How many relations of the truth there are, and how many of them hold in a result.
-
-    Attributes:
-        carried: True pairs (carried, carrier) that are no containment.
-        carried_kept: Those that still hold.
-        contained: True pairs (content, vessel).
-        contained_kept: Those that still hold.
-    """
+    """How many relations of the truth there are, and how many of them hold in a result; contents are not carried."""
 
     carried: int = 0
     carried_kept: int = 0

@@ -30,13 +30,12 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_ra
 
 Points2 = Float64[np.ndarray, "n 2"]
 
+# Axis and sign of each side.
+SIDES = {Relation.LEFT: (0, -1), Relation.RIGHT: (0, 1), Relation.IN_FRONT: (1, -1), Relation.BEHIND: (1, 1)}
 NEXT_TO_GAP_M = 0.06
 SIDE_OVERLAP_M = 0.01  # how far boxes may overlap along the axis and still lie beside each other
-
 CONTACT_GAP_M = 0.005
-SUBMERGED_M = 0.01
-"""How deep below the rim a body must reach to be in the vessel; half its height is enough for the flat."""
-
+SUBMERGED_M = 0.01  # how deep below the rim a body must reach to be in the vessel; half its height will do for the flat
 _INSIDE_SHARE = 0.85
 _FAR_M = 1e3
 _OUTLINE_ANGLES = (np.arange(64) + 0.5) * (2 * np.pi / 64)
@@ -45,16 +44,9 @@ _OUTLINE_DIRECTIONS = np.stack([np.cos(_OUTLINE_ANGLES), np.sin(_OUTLINE_ANGLES)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyFeatures(Frozen):
-    """A body in the table frame.
+    """A body in the table frame: its box, its convex outline from above in order (n, 2), the centre of its columns [m].
 
-    Attributes:
-        low: Lowest corner of its box [m].
-        high: Highest corner of its box [m].
-        outline: Convex outline seen from above, in order. Shape (n, 2) [m].
-        center: Centre of its volume, by columns [m].
-        heights: Seen from above and below.
-        cavity: Its room, where it is a vessel that stands open.
-        flat: Cells of its map on which objects could stand.
+    The cavity is there where it is a vessel that stands open; on the flat cells of its map objects could stand.
     """
 
     low: Vector3
@@ -120,13 +112,13 @@ def compute_outline(points: Points2) -> Points2:
 
 def relation_holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether `x` stands in this relation to `y`."""
-    return _HOLDS[relation](x, y)
+    return is_beside(x, y, *SIDES[relation]) if relation in SIDES else _HOLDS[relation](x, y)
 
 
 def relation_nearly_holds(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> bool:
     """Whether the relation could be said to hold: `relation_holds`, or on that side at all, or not quite beside."""
-    if relation in _SIDES:
-        axis, sign = _SIDES[relation]
+    if relation in SIDES:
+        axis, sign = SIDES[relation]
         edge = y.high[axis] if sign > 0 else -y.low[axis]
         return bool(sign * _box_middle_xy(x)[axis] > edge) or relation_holds(relation, x, y)
     if relation is Relation.NEXT_TO:
@@ -228,8 +220,6 @@ def _measure_corner_to_edge(corners: Points2, outline: Points2) -> float:
     return float(np.sqrt(((to_corner - share[..., None] * edge) ** 2).sum(axis=2)).min())
 
 
-_SIDES = {Relation.LEFT: (0, -1), Relation.RIGHT: (0, 1), Relation.IN_FRONT: (1, -1), Relation.BEHIND: (1, 1)}
-
 _HOLDS: dict[Relation, Callable[[BodyFeatures, BodyFeatures], bool]] = {
     Relation.ON: is_on,
     Relation.IN: is_inside,
@@ -237,8 +227,4 @@ _HOLDS: dict[Relation, Callable[[BodyFeatures, BodyFeatures], bool]] = {
     Relation.INSIDE: is_inside,
     Relation.OUTSIDE: lambda x, y: not is_inside(x, y),
     Relation.NEXT_TO: is_next_to,
-    Relation.LEFT: lambda x, y: is_beside(x, y, 0, -1),
-    Relation.RIGHT: lambda x, y: is_beside(x, y, 0, 1),
-    Relation.IN_FRONT: lambda x, y: is_beside(x, y, 1, -1),
-    Relation.BEHIND: lambda x, y: is_beside(x, y, 1, 1),
 }

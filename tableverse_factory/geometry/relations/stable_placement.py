@@ -15,36 +15,28 @@ from scipy import ndimage
 from schemas.curation import Relation
 from schemas.geometry import Frozen, Vector3
 from tableverse_factory.geometry.mesh.height_maps import CELL_M, LEVEL_TOLERANCE_M, CellMask, HeightMap, Heights
-from tableverse_factory.geometry.relations.relations import BodyFeatures, relation_holds
+from tableverse_factory.geometry.relations.relations import SIDES, BodyFeatures, relation_holds
 
 REACH_M = 0.4  # how far around the bodies the table is considered
-
 CLEARANCE_M = 0.012  # free space around a body put down on the table: a finger's thickness
-
 _DISTANCES_M = (0.02, 0.035, 0.05, 0.09, 0.15)
 _SIDESTEPS = (0.0, -0.5, 0.5)
 CONTACT_M = 0.002
 _STAND_MARGIN_M = 0.002
 _SUPPORT_SHARE = 0.7  # share of the base area that must be carried: a box on a lemon has less
-
 _FLAT_SHARE = 0.6  # share of the area under a body that must be flat: scissors and balls carry nothing
-
 _FITS_SHARE = 0.95
 _SUBMERGED_SHARE = 0.25  # share of a body's height that must come to lie below the rim, or it topples out
-
 _MAX_CANDIDATES = 49
 _ANGLES = np.arange(16) * (2 * np.pi / 16)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _INTO = (Relation.IN, Relation.INTO, Relation.INSIDE)
+_AROUND = tuple(SIDES[side] for side in (Relation.RIGHT, Relation.LEFT, Relation.IN_FRONT, Relation.BEHIND))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SupportSurface(Frozen):
-    """The bodies of a scene on their table.
-
-    Attributes:
-        free: Heights of the bare table: 0 on it, +inf beyond its edge and beyond reach.
-    """
+    """The bodies of a scene on their table; `free` is the bare table, 0 on it and +inf beyond its edge or reach."""
 
     bodies: tuple[BodyFeatures, ...]
     cell: float
@@ -69,12 +61,7 @@ class SupportSurface(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StablePose(Frozen):
-    """A possible placement.
-
-    Attributes:
-        body: The body as it would stand there.
-        offset: How it gets there from where it is (from its new orientation, where one was tried) [m].
-    """
+    """The body as it would stand, and how it gets there from where it is, in the orientation that was tried [m]."""
 
     body: BodyFeatures
     offset: Vector3
@@ -120,27 +107,15 @@ def find_placement(
 ) -> StablePose | None:
     """Find the first place where `x` would stand in this relation to `y`, or None.
 
-    Args:
-        relation: Which one.
-        x: The body to put there, in its present orientation.
-        y: What it relates to.
-        scene: Where both are.
-        heights: `scene.without(index of x)`.
-        poses: `x` in other orientations to try after its own.
+    `heights` are `scene.without(index of x)`; `poses` are `x` in other orientations, to try after its own.
     """
     for body in (x, *poses):
-        for cells in _list_candidates(relation, body, y):
-            moved = drop_body(relation, body, cells, y, scene, heights)
+        for target in _list_targets(relation, body, y):
+            shift = np.rint((target - (body.low + body.high)[:2] / 2) / body.heights.cell).astype(int)
+            moved = drop_body(relation, body, (int(shift[0]), int(shift[1])), y, scene, heights)
             if moved is not None and relation_holds(relation, moved, y):
                 return StablePose(moved, moved.low - body.low)
     return None
-
-
-def _list_candidates(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[tuple[int, int]]:
-    cell = x.heights.cell
-    for target in _list_targets(relation, x, y):
-        shift = np.rint((target - (x.low + x.high)[:2] / 2) / cell).astype(int)
-        yield int(shift[0]), int(shift[1])
 
 
 def _list_targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[np.ndarray]:
@@ -157,7 +132,7 @@ def _list_targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Itera
     half_x, half_y = ((body.high - body.low)[:2] / 2 for body in (x, y))
     for distance in _DISTANCES_M:
         for step in _SIDESTEPS:
-            for axis, sign in _AXES[relation]:
+            for axis, sign in (SIDES[relation],) if relation in SIDES else _AROUND:
                 target = middle.copy()
                 target[axis] += sign * (half_x[axis] + half_y[axis] + distance)
                 target[1 - axis] += step * half_y[1 - axis]
@@ -248,14 +223,3 @@ def _is_clear(window: tuple[slice, slice], filled: CellMask, heights: Heights, s
     around = heights[i0 - spare : i1 + spare, j0 - spare : j1 + spare]
     grown = ndimage.maximum_filter(np.pad(filled, spare), size=2 * spare + 1)
     return bool((around[grown] == 0.0).all())
-
-
-_EAST, _WEST, _NORTH, _SOUTH = (0, 1), (0, -1), (1, 1), (1, -1)
-_AXES: dict[Relation, tuple[tuple[int, int], ...]] = {
-    Relation.LEFT: (_WEST,),
-    Relation.RIGHT: (_EAST,),
-    Relation.IN_FRONT: (_SOUTH,),
-    Relation.BEHIND: (_NORTH,),
-    Relation.NEXT_TO: (_EAST, _WEST, _SOUTH, _NORTH),
-    Relation.OUTSIDE: (_EAST, _WEST, _SOUTH, _NORTH),
-}

@@ -1,4 +1,4 @@
-"""Which body supports which: contacts whose normals point mostly upwards, on meshes and on convex pieces."""
+"""Contacts on meshes and on convex pieces, and supports: those whose normals point mostly upwards."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -6,6 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from schemas.geometry import Points, TriangleMesh, Vector3
+from tableverse_factory.geometry.collision.linear_sweep import MovingSolid
 from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, to_tensor
@@ -14,19 +15,28 @@ from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 Pairs = frozenset[tuple[int, int]]  # (carried, carrier), indices of bodies
 
 REACH_M = 0.002  # surfaces this near touch: a layout that was never simulated keeps gaps of this order
-UPWARD = 0.5
-"""Least vertical part of the unit normal of a supporting contact, 30° above the horizontal; steeper ones only lean."""
+UPWARD = 0.5  # least vertical part of a supporting contact's unit normal: 30° above the horizontal; others only lean
 SAMPLES = 4000  # points on each surface: 1 to 3 mm apart on household objects
 TOUCHING_M = 0.0002  # nearer surfaces have no meaningful direction between them; their normals decide alone
+MAX_MESH_GAP_M = 0.004  # where pieces touch and a mesh is further away than this, the object looks as if it floats
+
+
+def meshes_touch(a: MovingSolid, mesh_a: TriangleMesh, b: MovingSolid, mesh_b: TriangleMesh, reach_m: float) -> bool:
+    """Whether pieces come within `reach_m` [m] where both meshes, in the same frame, are within `MAX_MESH_GAP_M`."""
+    near = find_near_pieces(a.solids, b.solids, reach_m, a.offset - b.offset)
+    midway = [(result.getNearestPoint1() + result.getNearestPoint2()) / 2 + b.offset for _, result in near]
+    if not midway:
+        return False
+    points = to_tensor(np.array(midway))
+    apart = [make_raycasting_scene(mesh).compute_distance(points, nthreads=1).numpy() for mesh in (mesh_a, mesh_b)]
+    return bool((np.maximum(*apart) <= MAX_MESH_GAP_M + reach_m).any())
 
 
 def find_mesh_support(meshes: Sequence[TriangleMesh]) -> Pairs:
     """Find pairs of meshes that touch, the contact's normal pointing up from one into the other.
 
     The normal is the mean over all points of either surface within `REACH_M` of the other, the nearest counting most.
-
-    Args:
-        meshes: As they stand in the table frame, z up, faces counter-clockwise from outside.
+    Meshes are as they stand in the table frame.
     """
     boxes = [aabb(mesh.vertices) for mesh in meshes]
     samples = [sample_surface(mesh, SAMPLES)[0] for mesh in meshes]
@@ -61,7 +71,6 @@ def _select_near_box(points: Points, box: tuple[Vector3, Vector3]) -> Points:
 
 
 def _sum_contact_normals(points: Points, caster: RaycastingScene) -> Vector3:
-    """Sum the outward normals of a surface where points come near it, the nearest weighing most."""
     if not len(points):
         return np.zeros(3)
     found = caster.compute_closest_points(to_tensor(points), nthreads=1)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.config import Config
-from tableverse_factory.geometry.collision.contacts import meshes_touch
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
 from tableverse_factory.geometry.relations.containers import HollowVessel, make_hollow_vessel
+from tableverse_factory.geometry.relations.support import meshes_touch
 from tableverse_factory.physics.simulate.at_rest import Rest
 from tableverse_factory.physics.simulate.freefall import simulate_fall
 from tableverse_factory.stages.rectify.budget import BUDGET_SPENT, SimulationBudget
