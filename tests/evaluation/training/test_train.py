@@ -169,7 +169,7 @@ def test_a_view_that_is_none_or_half_of_one_is_named(views: list[Path], tmp_path
 @pytest.mark.slow
 def test_a_view_that_is_none_is_named_in_one_line_by_a_process_too(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(b"no view")
-    with pytest.raises(InputError, match=r"a\.npz is no view") as told:
+    with pytest.raises(InputError, match=r"a\.npz is not a training view") as told:
         train_network([tmp_path / "a.npz"], tmp_path, SHORT, CPU, jobs=1)
     assert "\n" not in str(told.value)
 
