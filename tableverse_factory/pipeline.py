@@ -21,11 +21,7 @@ from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.settle import settle
 
 _OBSERVE = Stage(
-    "observe",
-    "perception",
-    observe,
-    reads=("observe", "place.mesh_model", "models"),
-    recorded={"depth": record_depth},
+    "observe", "perception", observe, reads=("observe", "place.mesh_model", "models"), recorded={"depth": record_depth}
 )
 _PERCEIVE = Stage(
     "perceive",
@@ -35,11 +31,7 @@ _PERCEIVE = Stage(
     recorded={"detector": record_detector, "segmenter": record_segmenter},
 )
 _CURATE = Stage(
-    "curate",
-    "curation",
-    curate,
-    reads=("curate",),
-    recorded={"answers": record_answers, "prompts": record_prompts},
+    "curate", "curation", curate, reads=("curate",), recorded={"answers": record_answers, "prompts": record_prompts}
 )
 
 _FROM_LAYOUT = (
@@ -49,12 +41,8 @@ _FROM_LAYOUT = (
     Stage("export", "physics", export, reads=("export", "settle")),
 )
 
-STAGES = (
-    _OBSERVE,
-    _PERCEIVE,
-    Stage("place", "geometry", place, reads=("place", "export.jpeg_quality")),
-    *_FROM_LAYOUT,
-)
+_PLACE = Stage("place", "geometry", place, reads=("place", "export.jpeg_quality"))
+STAGES = (_OBSERVE, _PERCEIVE, _PLACE, *_FROM_LAYOUT)
 
 PIPELINES: Pipelines = {
     SceneKind.IMAGE: STAGES,

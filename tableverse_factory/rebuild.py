@@ -26,15 +26,7 @@ def config_from_run(run: Mapping[str, Any], section: str, overrides: Sequence[st
     """Restore the configuration of a dataset as far as an added stage reads it.
 
     Sections of other stages that this version rejects, or that were emptied before publication, get their defaults:
-    nothing reads them, and run.json keeps its values.
-
-    Args:
-        run: From run.json.
-        section: Of the added stage.
-        overrides: Of that section, such as `trajectories.tries=6`.
-
-    Raises:
-        ConfigError: if an override is of another section, or a value is not allowed.
+    nothing reads them, and run.json keeps its values. `overrides`, such as `trajectories.tries=6`, are of `section`.
     """
     if others := [text for text in overrides if text.partition(".")[0].strip() != section]:
         raise ConfigError(
@@ -53,11 +45,7 @@ def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) 
     """Restore the manifest rows that a finished dataset was built from, in the plan's order.
 
     The digest in run.json verifies them. A dataset written by `tableverse export` holds only what may be passed on: its
-    own rows count as its manifest.
-
-    Raises:
-        BuildError: if the dataset is not finished, or its rows are not those of the manifest.
-        StoreError: if the store refuses or does not answer.
+    own rows count as its manifest. BuildError if it is not finished, or its rows are not those of the manifest.
     """
     committed = committed_shards(out)
     if missing := [shard for shard in range(plan.n_shards) if shard not in committed]:
@@ -70,9 +58,8 @@ def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) 
     ordered = [rows[scene_id] for scene_id in plan.scene_ids if scene_id in rows]
     proven = "published" in run or digest_manifest(ordered) == run["manifest"]["sha256"]
     if lacking or not proven:
-        why = (
-            f"{lacking[0]} has no row" if lacking else "the rows of scenes/ are not those that run.json was written for"
-        )
+        others = "the rows of scenes/ are not those that run.json was written for"
+        why = f"{lacking[0]} has no row" if lacking else others
         raise BuildError(
             f"{out}: the manifest cannot be restored ({why}): give it, with `tableverse build MANIFEST OUT --stages "
             "+trajectories` and what the dataset was built with"

@@ -15,33 +15,13 @@ from tableverse_factory.core.storage.files import StoragePath, make_missing_buil
 from tableverse_factory.stage import RecordFunction, Stage
 
 FORMAT = "tableverse-dataset-1"
+# Packages that decide bytes.
 PACKAGES = (
-    "coacd",
-    "coal",
-    "embreex",
-    "manifold3d",
-    "mujoco",
-    "mujoco-menagerie",
-    "networkx",
-    "numpy",
-    "open3d-cpu",
-    "pillow",
-    "pyarrow",
-    "pydantic",
-    "scikit-image",
-    "scipy",
-    "tableverse-factory",
-    "toppra",
-    "trimesh",
+    *("coacd", "coal", "embreex", "manifold3d", "mujoco", "mujoco-menagerie", "networkx", "numpy", "open3d-cpu"),
+    *("pillow", "pyarrow", "pydantic", "scikit-image", "scipy", "tableverse-factory", "toppra", "trimesh"),
 )
-"""Packages that decide bytes."""
-
-CODE = "versions.code"
-"""Key of the hash of this package's code, which a checkout may have changed under the same version."""
-
-AFTERWARDS = "afterwards"
-"""Part with the versions that added trajectories to a dataset which other versions had made."""
-
+CODE = "versions.code"  # key of the hash of this package's code: a checkout may change it under the same version
+AFTERWARDS = "afterwards"  # part with the versions that added trajectories to a dataset which others had made
 _MAX_SHOWN = 6
 
 
@@ -50,12 +30,7 @@ def make_run_record(
 ) -> dict[str, Any]:
     """Make the record of a build: no clock, no host, no path but those that the configuration names.
 
-    Args:
-        config: Of the build.
-        recorded: From `collect_external_inputs`.
-        manifest_sha256: Of the manifest's rows.
-        n_scenes: Number of rows.
-        stages: Fingerprint of each stage, over what it reads besides its input.
+    `recorded` is from `collect_external_inputs`; `stages` holds the fingerprint of what each reads besides its input.
     """
     return {
         "format": FORMAT,
@@ -74,13 +49,8 @@ def extend_run_record(
 ) -> dict[str, Any]:
     """Make the record of a finished dataset to which stages are added, keeping what made it.
 
-    With the versions of the dataset it equals the record of the longer build from the start.
-
-    Args:
-        base: Of the dataset as it is.
-        config: Of the added stages.
-        recorded: From `collect_external_inputs`.
-        added: Fingerprints of the added stages.
+    With the versions of the dataset it equals the record of the longer build from the start. `base` is the record as it
+    is, `added` the fingerprints of the added stages.
     """
     sections = {section: config.model_dump(mode="json")[section] for section in added}
     parts = map_parts_to_stages()
@@ -120,10 +90,6 @@ def collect_external_inputs(
         config: Of the build.
         before: run.json of the build that is resumed; None for a new one. Weights of the hub stay at its commit.
         base: run.json of a finished dataset, whose inputs stay as they are but for those of post-export stages.
-
-    Raises:
-        ConfigError: if the folder of recorded answers, weights on the disk or the file of the robot are missing.
-        ModelAccessError: if the commit of weights of the hub cannot be looked up.
     """
     inputs = {
         part: record(config, before or {}) if base is None or stage.is_post_export else base.get(part)
@@ -154,11 +120,7 @@ def write_run(path: StoragePath, record: Mapping[str, Any]) -> None:
 
 
 def read_run(path: StoragePath) -> dict[str, Any]:
-    """Read run.json.
-
-    Raises:
-        BuildError: if there is none, or it is not the record of a build.
-    """
+    """Read run.json; BuildError if there is none, or it is not the record of a build."""
     try:
         record = json.loads(read_whole(path))
     except FileNotFoundError:
@@ -187,11 +149,7 @@ def resume_refused_error(
 ) -> BuildError:
     """Make the error of a build that would not give the bytes of the one that was begun in `out`.
 
-    Args:
-        out: The dataset.
-        differing: From `diff_run_records`.
-        section: The stage from which everything could be recomputed; empty if there is none.
-        option: The option that recomputes from there, if it is not `--from`.
+    `section` is the stage from which everything could be recomputed, if any, with `option` or `--from`.
     """
     code = (
         f". {CODE} is tableverse-factory's own code, which a `git pull` changes too: --from computes the stage that it "

@@ -15,8 +15,8 @@ Pool = Literal["perception", "geometry", "physics", "curation", "trajectories"]
 
 StageFunction = Callable[[Any, Config, np.random.Generator, Services], Outcome[Any]]
 
+# `record(config, before) -> JSON value`, or None if the stage does not read that input; `before` is run.json.
 RecordFunction = Callable[[Config, Mapping[str, Any]], Any]
-"""`record(config, before) -> JSON value`, or None if the stage does not read that input; `before` is run.json."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +25,10 @@ class Stage:
 
     Attributes:
         name: Also the name of its random stream.
-        pool: Which actors run it.
         run: `run(item, config, rng, services) -> Outcome`. Pure: no clock, no global state, no other randomness.
-        reads: What it reads of the configuration, as `section` or `section.key`; the first is its own section. A
-            change of anything else leaves its output valid.
-        recorded: What it reads besides its input and the configuration (prompts, weights, robot files), by part of
-            run.json: a change of these makes another build.
+        reads: The sections or `section.key`s that it reads, its own first. Other changes leave its output valid.
+        recorded: What it reads besides (prompts, weights, robot files), by part of run.json: a change of these makes
+            another build.
         post_export_tables: Tables that it adds to an exported scene; empty for every stage up to the export. If such a
             stage fails, the scene stays done as it came in, and rows of these tables say what failed.
     """
@@ -54,8 +52,7 @@ class Stage:
 
     def select_values(self, config: Config) -> dict[str, Any]:
         """Select what it reads of a configuration, by dotted key, without the deadline, which changes no output."""
-        tree = config.model_dump(mode="json")
-        found: dict[str, Any] = {}
+        tree, found = config.model_dump(mode="json"), dict[str, Any]()
         for name in self.reads:
             section, _, key = name.partition(".")
             keys = [key] if key else [key for key in tree[section] if key != "deadline_s"]
@@ -63,8 +60,7 @@ class Stage:
         return found
 
 
-Pipelines = Mapping[SceneKind, Sequence[Stage]]
-"""The stages that a manifest row of each kind runs through, in order."""
+Pipelines = Mapping[SceneKind, Sequence[Stage]]  # the stages that a manifest row of each kind runs through, in order
 
 
 def post_export_tables(pipelines: Pipelines) -> dict[str, tuple[str, ...]]:

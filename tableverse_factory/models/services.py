@@ -9,12 +9,9 @@ from tableverse_factory.models.remote.cost_meter import Meter
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of one process, made before the first item; results never depend on the content of a cache.
+    """Services of one process, made before the first item: a cache folder, rate limits and a meter of remote models.
 
-    Attributes:
-        cache_dir: Content-addressed cache on this machine, shared by processes; safe to delete at any time.
-        asking: Rate limits of requests to remote models.
-        meter: Meter of their cost.
+    The cache is content-addressed, shared by processes, and safe to delete at any time; results never depend on it.
     """
 
     cache_dir: Path

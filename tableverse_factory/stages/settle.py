@@ -35,18 +35,13 @@ def settle(
         bodies, slab = make_bodies(layout)
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
-    ended, rest = bring_to_rest(
-        bodies, slab, timestep_s=config.settle.timestep_s, max_time_s=config.settle.max_time_s, gentle=True
-    )
+    step, limit = config.settle.timestep_s, config.settle.max_time_s
+    ended, rest = bring_to_rest(bodies, slab, timestep_s=step, max_time_s=limit, gentle=True)
     return _decide_outcome(layout, ended, slab, rest)
 
 
 def make_bodies(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Slab]:
-    """Make the bodies of a layout, with guessed mass and friction, and the table under them.
-
-    Raises:
-        GeometryError: if an object has no piece that is thick enough to simulate.
-    """
+    """Make the bodies of a layout, with guessed mass and friction, and the table under them."""
     objects = layout.placed.objects
     bodies = tuple(map(make_prior_body, objects, layout.pieces, layout.poses))
     meshes, scales = [item.mesh for item in objects], [item.scale for item in objects]

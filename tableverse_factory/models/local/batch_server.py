@@ -16,10 +16,8 @@ from tableverse_factory.models.local.weights import create_memory_error, release
 from tableverse_factory.models.local.wire import WireError, encode_error, receive_arrays, send_arrays
 
 Arrays = Sequence[np.ndarray]
-BatchModel = Callable[[Sequence[Arrays]], Iterable[Arrays]]
-"""Answers to a batch, in its order; each is sent as soon as the iterable yields it."""
-Heartbeat = Callable[[], None]
-"""To be called every second or so by long work: raises SystemExit when no client is connected any more."""
+BatchModel = Callable[[Sequence[Arrays]], Iterable[Arrays]]  # answers in order, each sent as soon as it is yielded
+Heartbeat = Callable[[], None]  # for long work, every second or so: SystemExit when no client is connected any more
 
 GATHER_S = 0.005  # wait for further questions of a batch that is not full, a twentieth of a forward pass [s]
 IDLE_S = 15.0  # time without connections after which the process ends [s]
@@ -33,14 +31,9 @@ def serve_batches(
 ) -> None:
     """Answer questions until no client has been connected for a while.
 
-    Clients may connect and ask before the model is made. If it cannot be made, each is told why, and the process ends.
-
-    Args:
-        listener: Socket that is bound to `path` and listens.
-        path: Socket file, removed at the end.
-        most: Maximum number of questions in a batch.
-        make: Makes the model.
-        idle_s: See `IDLE_S` [s].
+    Clients may connect and ask before `make` has made the model. If it cannot be made, each is told why, and the
+    process ends. `listener` is bound to the socket file `path`, which is removed at the end; a batch holds at most
+    `most` questions.
     """
     queue = _ConnectionQueue(listener, idle_s)
     try:
@@ -71,8 +64,7 @@ def _refuse_all(error: Exception) -> BatchModel:
 def _answer_batch(model: BatchModel, batch: dict[socket.socket, Arrays]) -> Iterator[tuple[socket.socket, Arrays]]:
     """Answer a batch; if it fails, each question alone, so that none is refused for its neighbour.
 
-    Raises:
-        RuntimeError: if the GPU is lost for this process, which has to end.
+    An error of CUDA itself is raised: the GPU is lost for this process, which has to end.
     """
     left = dict(batch)
     try:
@@ -102,8 +94,6 @@ def _encode_refusal(error: Exception) -> np.ndarray:
 
 
 class _ConnectionQueue:
-    """Open connections and their questions."""
-
     def __init__(self, listener: socket.socket, idle_s: float) -> None:
         self._listener, self.idle_s = listener, idle_s
         self._selector = selectors.DefaultSelector()
@@ -142,7 +132,6 @@ class _ConnectionQueue:
             raise SystemExit
 
     def close(self) -> None:
-        """Close all connections."""
         for key in list(self._selector.get_map().values()):
             if isinstance(key.fileobj, socket.socket):
                 key.fileobj.close()

@@ -8,15 +8,11 @@ from tableverse_factory.core.errors import ModelError
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+# Messages of torch's allocators, the driver and CUDA's libraries when memory is short.
 _NO_MEMORY = (
-    "DefaultCPUAllocator",
-    "can't allocate memory",
-    "CUDA out of memory",
-    "CUDA error: out of memory",
-    "CUBLAS_STATUS_ALLOC_FAILED",
-    "CUDNN_STATUS_ALLOC_FAILED",
+    *("DefaultCPUAllocator", "can't allocate memory", "CUDA out of memory", "CUDA error: out of memory"),
+    *("CUBLAS_STATUS_ALLOC_FAILED", "CUDNN_STATUS_ALLOC_FAILED"),
 )
-"""Messages of torch's allocators, the driver and CUDA's libraries when memory is short."""
 
 
 def run_in_batches(
@@ -24,16 +20,9 @@ def run_in_batches(
 ) -> tuple[list[_Result], int]:
     """Run a model on items; return the results in order, and the batch size that fitted.
 
-    Every forward pass has the same shape: kernels are chosen by it, so a result does not depend on the number of other
-    items. Where memory is short, the size is halved for the remaining items; only then may the last digits differ.
-
-    Args:
-        run: Computes one result for each item of a batch; it pads its tensors to the size that it is given.
-        items: Items in any number.
-        size: Batch size, at least 1.
-
-    Raises:
-        ModelError: if not even one item fits.
+    `run` computes one result for each item of a batch, and pads its tensors to the size that it is given: kernels are
+    chosen by the shape, so a result does not depend on the number of other items. Where memory is short, the size is
+    halved for the remaining items, and only then may the last digits differ; ModelError if not even one item fits.
     """
     results: list[_Result] = []
     while len(results) < len(items):

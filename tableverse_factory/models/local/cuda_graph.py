@@ -6,9 +6,8 @@ from typing import Any
 
 from tableverse_factory.models.local.device import Device, Tensor, import_torch
 
+# Tensors to tensors on the device; output shapes follow from input shapes, and it does not synchronize.
 Forward = Callable[..., tuple[Tensor, ...]]
-"""Tensors to tensors on the device; output shapes follow from input shapes, and it does not synchronize."""
-
 WARM_UPS = 2  # calls before recording, in which libraries create their handles and choose their kernels
 
 

@@ -30,11 +30,7 @@ class Device:
 
 
 def select_device(config: ModelsConfig, key: str = "models.device") -> Device:
-    """Resolve `models.device` and `models.precision` on this machine.
-
-    Args:
-        config: Configuration of models.
-        key: Option or key that sets the device, for the error.
+    """Resolve `models.device` and `models.precision` on this machine; `key` is what sets the device, for the error.
 
     Raises:
         ModelAccessError: without torch, or if a GPU is required and torch sees none.
@@ -52,12 +48,9 @@ def select_device(config: ModelsConfig, key: str = "models.device") -> Device:
 
 
 def import_torch() -> Any:
-    """Import torch, set up for reproducible bytes.
+    """Import torch, set up for reproducible bytes; ModelAccessError without it.
 
     One thread on a CPU; on a GPU cuDNN's deterministic kernels, no kernel benchmarks, and no TF32.
-
-    Raises:
-        ModelAccessError: if it is not installed.
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # must be set before the first CUDA call
     try:

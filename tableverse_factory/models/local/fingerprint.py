@@ -12,30 +12,29 @@ from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import select_device
 
 PACKAGES = ("torch", "transformers")
+# Distributions that are installed from git, by depth model.
 DISTRIBUTED_BY = {
     "depth_anything_3": "depth-anything-3",
     "depth_anything_3_nested": "depth-anything-3",
     "moge_2": "moge",
 }
-"""Distributions that are installed from git, by depth model."""
 _WEIGHT_FILES = ("*.safetensors", "*.json", "*.pt")
 
 
 def identify_model(weights: str, config: ModelsConfig, package: str | None = None) -> dict[str, Any]:
-    """Collect the versions of a model's packages, its device, and the hash of its weights if they are a path.
+    """Collect the versions of `PACKAGES` and `package`, the device that `auto` means, and the hash of weights on disk.
 
-    Args:
-        weights: Folder, file, or name on the hub.
-        config: Device of models; `auto` is resolved on this machine.
-        package: Package that runs the model, besides `PACKAGES`.
+    The device is `none` without torch.
     """
     found: dict[str, Any] = {name: _read_version(name) for name in PACKAGES}
     if package:
         found[package] = _read_version(package) + _read_commit(package)
     if config.device == "auto":
-        found["device"] = _find_auto_device()
-    files = _list_files(weights)
-    if files:
+        try:
+            found["device"] = select_device(ModelsConfig()).kind
+        except ModelAccessError:
+            found["device"] = "none"
+    if files := _list_files(weights):
         found["sha256"] = content_hash(*(f"{path.name} {_hash_file(path)}".encode() for path in files))
     return found
 
@@ -51,14 +50,6 @@ def _list_files(weights: str) -> list[Path]:
     if weights and path.is_dir():
         return sorted(found for pattern in _WEIGHT_FILES for found in path.glob(pattern) if found.is_file())
     return [path] if weights and path.is_file() else []
-
-
-def _find_auto_device() -> str:
-    """Return the device that `auto` means here; `none` without torch."""
-    try:
-        return select_device(ModelsConfig()).kind
-    except ModelAccessError:
-        return "none"
 
 
 def _read_commit(package: str) -> str:

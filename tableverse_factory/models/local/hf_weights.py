@@ -10,6 +10,7 @@ from tableverse_factory.core.errors import InputError, ModelAccessError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.timeouts import call_with_timeout
 
+# Default weights by backend.
 DEFAULT_WEIGHTS = {
     "sam2": "facebook/sam2.1-hiera-large",
     "sam3": "facebook/sam3",
@@ -18,35 +19,20 @@ DEFAULT_WEIGHTS = {
     "depth_anything_3_nested": "depth-anything/DA3NESTED-GIANT-LARGE-1.1",
     "moge_2": "Ruicheng/moge-2-vitl",
 }
-"""Default weights by backend."""
-
 HUB_TIMEOUT_S = 60.0  # limit for the hub to resolve a revision [s]
 
 _NAME = re.compile(r"(?P<name>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _MAX_WORDS = 300
-_UNREACHABLE = frozenset(
-    {
-        "LocalEntryNotFoundError",
-        "OfflineModeIsEnabled",
-        "RevisionResolutionError",
-        "ConnectError",
-        "ConnectTimeout",
-        "ReadTimeout",
-        "TimeoutError",
-        "ConnectionError",
-    }
-)
+_UNREACHABLE = {
+    *("LocalEntryNotFoundError", "OfflineModeIsEnabled", "RevisionResolutionError", "ConnectError"),
+    *("ConnectTimeout", "ReadTimeout", "TimeoutError", "ConnectionError"),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class HubWeights:
-    """A repository on the hub.
-
-    Attributes:
-        name: `owner/name`.
-        revision: Branch, tag or commit; empty for the newest commit.
-    """
+    """A repository on the hub, `owner/name`, and its branch, tag or commit; empty for the newest commit."""
 
     name: str
     revision: str
@@ -59,16 +45,9 @@ def parse_hub_name(weights: str) -> HubWeights | None:
 
 
 def resolve_hub_name(weights: str, key: str) -> HubWeights | None:
-    """Parse the repository that weights name, see `parse_hub_name`.
+    """Parse the repository that weights name, see `parse_hub_name`; ModelAccessError if a path has the same name.
 
-    The meaning of a configuration must not depend on the working directory, so an ambiguous name is refused.
-
-    Args:
-        weights: A folder or file, or `owner/name`, which may be followed by `@` and a revision.
-        key: Key of the configuration, for messages.
-
-    Raises:
-        ModelAccessError: if a folder or file here has the same name.
+    The meaning of a configuration must not depend on the working directory.
     """
     found = parse_hub_name(weights)
     if found is None:
@@ -83,11 +62,7 @@ def resolve_hub_name(weights: str, key: str) -> HubWeights | None:
 
 
 def resolve_source(weights: str, key: str) -> tuple[str, dict[str, str]]:
-    """Return the arguments of `from_pretrained`: a path, or a name on the hub and its revision.
-
-    Raises:
-        ModelAccessError: if there is no such path, or as `resolve_hub_name`.
-    """
+    """Return the arguments of `from_pretrained`: a path, or a name on the hub and its revision."""
     hub = resolve_hub_name(weights, key)
     if hub is not None:
         return hub.name, {"revision": hub.revision} if hub.revision else {}
@@ -140,10 +115,8 @@ def describe_load_error(error: BaseException, weights: str, key: str) -> str:
     if "RevisionNotFoundError" in causes:
         return f"{head}: the hub knows no {revision!r} of this model: give a branch, a tag or a whole commit"
     if "RepositoryNotFoundError" in causes or "not a valid model identifier" in str(error):
-        return (
-            f"{head}: the hub knows no such model, or shows it only to a token (HF_TOKEN); a folder here is written "
-            f"'./{name}'"
-        )
+        shown = "the hub knows no such model, or shows it only to a token (HF_TOKEN)"
+        return f"{head}: {shown}; a folder here is written './{name}'"
     if causes & _UNREACHABLE:
         at = f" --revision {revision}" if revision else ""
         return (

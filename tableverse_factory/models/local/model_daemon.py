@@ -11,8 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,18 +29,15 @@ TRIES = 2  # attempts at one question; a daemon that dies is started again
 DYING_S = 0.5  # time in which a dying daemon closes its listening socket after its connections [s]
 _POLL_S = 0.02
 _MAX_FOLDER = 85  # maximum length of the folder's path; that of a socket may have 107 [bytes]
+# Place of the log in messages, which go into datasets and must not hold paths of this machine.
 _LOG = "a .log in the folder tableverse-UID of $XDG_RUNTIME_DIR, or of the temporary files where that is not set"
-"""Place of the log in messages, which go into datasets and must not hold paths of this machine."""
 _CONNECTIONS: dict[Path, socket.socket] = {}
 
 
 def ask_daemon(module: str, spec: Spec, question: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Ask the daemon of a model, which is started if none listens.
+    """Ask the daemon of a model, which is started if none listens: `module`, which calls `run_daemon`.
 
-    Args:
-        module: Module to run as the daemon; it calls `run_daemon`.
-        spec: Description of the model; equal ones share a daemon, on the same GPU.
-        question: Arrays that the model understands.
+    Equal specs share a daemon, on the same GPU.
 
     Raises:
         ModelAccessError: if a person must act before the model can be used.
@@ -76,8 +72,7 @@ def close_connections(path: Path | None = None) -> None:
 def run_daemon(configure: Callable[[Spec], tuple[int, Callable[[Heartbeat], BatchModel]]]) -> None:
     """Serve a model; to be called by a module that is run as `MODULE SOCKET SPEC`.
 
-    Args:
-        configure: Returns the batch size for a description, and a function that makes the model.
+    `configure` returns the batch size for a description, and a function that makes the model.
     """
     path, spec = Path(sys.argv[1]), json.loads(sys.argv[2])
     listener = socket.socket(socket.AF_UNIX)
@@ -90,26 +85,15 @@ def run_daemon(configure: Callable[[Spec], tuple[int, Callable[[Heartbeat], Batc
 
 def compute_socket_path(module: str, spec: Spec) -> Path:
     """Compute the path of a daemon's socket from the model, its weights on disk, the GPU and this code."""
-    gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    parts = [
-        module,
-        json.dumps(spec, sort_keys=True),
-        stat_weights(str(spec.get("weights", ""))),
-        gpu,
-        str(Path(__file__).resolve()),
-        compute_source_hash(),
-        sys.prefix,
-    ]
+    weights, gpu = stat_weights(str(spec.get("weights", ""))), os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    code = (str(Path(__file__).resolve()), compute_source_hash(), sys.prefix)
+    parts = [module, json.dumps(spec, sort_keys=True), weights, gpu, *code]
     name = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
     return _make_socket_folder() / f"{name}.sock"
 
 
 def _make_socket_folder() -> Path:
-    """Create a folder that only this user can enter, in `XDG_RUNTIME_DIR` or with the temporary files.
-
-    Raises:
-        ModelAccessError: if it belongs to another user or cannot be created.
-    """
+    """Create a folder that only this user can enter, in `XDG_RUNTIME_DIR` or with the temporary files."""
     parents = [Path(name).absolute() for name in (os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir()) if name]
     candidates = [path / f"tableverse-{os.getuid()}" for path in parents if path.is_dir()]
     fitting = [path for path in candidates if len(os.fsencode(path)) <= _MAX_FOLDER]
@@ -131,21 +115,15 @@ def _make_socket_folder() -> Path:
 
 
 def _connect(path: Path, module: str, spec: Spec) -> socket.socket:
-    """Connect to the daemon, and start it if none listens.
-
-    Raises:
-        ModelError: if it does not start.
-    """
-    with _hold_lock(path.with_name("lock")):
-        end = _try_connect(path)
-        if end is not None:
+    with contextlib.closing(path.with_name("lock").open("ab")) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # only one process looks for a daemon and starts it
+        if end := _try_connect(path):
             return end
         path.unlink(missing_ok=True)
         process = _start(path, module, spec)
         until = time.monotonic() + START_S
         while time.monotonic() < until and process.poll() is None:
-            end = _try_connect(path)
-            if end is not None:
+            if end := _try_connect(path):
                 return end
             time.sleep(_POLL_S)
     raise ModelError(f"the process of the model did not start; its last words are in {_LOG}")
@@ -169,11 +147,3 @@ def _start(path: Path, module: str, spec: Spec) -> "subprocess.Popen[bytes]":
     command = [sys.executable, "-P", "-m", module, str(path), json.dumps(spec)]
     with path.with_suffix(".log").open("wb") as log:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
-
-
-@contextmanager
-def _hold_lock(path: Path) -> Iterator[None]:
-    """Hold a lock, so that only one process looks for a daemon and starts it."""
-    with contextlib.closing(path.open("ab")) as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

@@ -36,15 +36,8 @@ def compute_pixel_values(
 ) -> Tensor:
     """Resize and normalize pictures to one batch, shape (n, 3, height, width), in the device's precision.
 
-    Resizes as torchvision does with `antialias=True`; values are rounded before they are normalized, as in training.
-    The aspect ratio is not kept.
-
-    Args:
-        pictures: Shape (h, w, 3) each, uint8, on the device.
-        size: Height and width of the model's input.
-        normal: Normalization that the model was trained with.
-        device: Device of the model.
-        kernel: Interpolation.
+    Resizes as torchvision does with `antialias=True`, to a height and width that need not keep the aspect ratio; values
+    are rounded before they are normalized, as in training. Pictures are uint8 on the device, of shape (h, w, 3) each.
     """
     mean, deviation = _upload_constants(normal, device)
     planes = import_torch().cat([_resize(picture, size, kernel) for picture in pictures])
@@ -64,6 +57,5 @@ def _resize(picture: Tensor, size: tuple[int, int], kernel: Kernel) -> Tensor:
     planes = picture.permute(2, 0, 1)[None].to(torch.float32)
     if planes.shape[-2:] == size:
         return planes
-    interpolate = torch.nn.functional.interpolate
-    resized = interpolate(planes, size, mode=kernel, align_corners=False, antialias=True)
+    resized = torch.nn.functional.interpolate(planes, size, mode=kernel, align_corners=False, antialias=True)
     return resized.round().clamp(0.0, 255.0)

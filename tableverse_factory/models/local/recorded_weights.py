@@ -9,18 +9,14 @@ from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.models.local.fingerprint import DISTRIBUTED_BY, identify_model, identify_onnx_model
 from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS, pin_commit, resolve_hub_name
 
+# Section and key of the configuration that name weights of the Hub, by the part of run.json that records them.
 _KEYS = {"depth": ("observe", "depth_weights"), "segmenter": ("perceive", "segmenter_weights")}
-"""Section and key of the configuration that name weights of the Hub, by the part of run.json that records them."""
 
 
 def record_weights(part: str, backend: str, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Identify the weights of a backend; weights of the Hub stay at the commit that the build began with.
+    """Identify the weights of a backend for the `part` of run.json: its published ones if none are named.
 
-    Args:
-        part: Of run.json: `depth` or `segmenter`.
-        backend: Name of the backend, whose published weights are meant if none are named.
-        config: Of the build.
-        before: run.json of the build that is resumed, or empty.
+    Weights of the Hub stay at the commit that the build began with: `before` is its run.json, or empty.
 
     Raises:
         ConfigError: if weights on the disk are missing.
@@ -38,11 +34,7 @@ def record_weights(part: str, backend: str, config: Config, before: Mapping[str,
 
 
 def record_onnx(key: str, weights: str) -> dict[str, Any]:
-    """Identify an .onnx file.
-
-    Raises:
-        ConfigError: if it is missing.
-    """
+    """Identify an .onnx file; ConfigError if it is missing."""
     return _require_weights(key, weights, identify_onnx_model(weights), "give the .onnx file")
 
 

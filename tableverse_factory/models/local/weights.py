@@ -14,8 +14,8 @@ from tableverse_factory.models.local.hf_weights import describe_load_error, reso
 
 _Model = TypeVar("_Model")
 _LOADED: dict[tuple[object, ...], Any] = {}
+# Errors that transformers raises for a configuration or weights of another model.
 _UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError, ImportError)
-"""Errors that transformers raises for a configuration or weights of another model."""
 
 
 def load_once(key: tuple[object, ...], make: Callable[[], _Model]) -> _Model:
@@ -35,19 +35,13 @@ def release_models() -> None:
 
 
 def load_pretrained(
-    architecture: str,
-    weights: str,
-    device: Device,
-    key: str,
-    kinds: Collection[str],
-    exact: Collection[str] = (),
+    architecture: str, weights: str, device: Device, key: str, kinds: Collection[str], exact: Collection[str] = ()
 ) -> Any:
-    """Load a transformers model from safetensors alone, without code from the hub.
+    """Load a transformers model from safetensors alone, without code from the hub; the local cache is searched first.
 
     Args:
         architecture: Name of its class in transformers.
-        weights: A folder, or `owner/name` or `owner/name@revision` on the hub; the local cache is searched first, so
-            that no network is needed when all files are there.
+        weights: A folder, or `owner/name` or `owner/name@revision` on the hub.
         device: Device and precision.
         key: Key of the configuration that names the weights, for messages.
         kinds: Accepted values of `model_type`.
@@ -83,11 +77,7 @@ def load_pretrained(
 
 
 def move_to_device(model: Any, device: Device, exact: Collection[str] = ()) -> Any:
-    """Move a model to a device and its precision, but for the child modules in `exact`, which stay in float32.
-
-    Raises:
-        ModelAccessError: if it does not fit into the memory.
-    """
+    """Move a model to a device and its precision, but for the child modules in `exact`, which stay in float32."""
     model.eval().requires_grad_(False)
     kept = {name: part for name, part in model.named_children() if name in exact}
     for name in kept:
@@ -112,11 +102,7 @@ def create_memory_error(error: BaseException) -> ModelAccessError:
 
 
 def load_foreign(make: Callable[[], _Model], weights: str, key: str) -> _Model:
-    """Load a model with a foreign package, which may raise anything for bad weights.
-
-    Raises:
-        ModelAccessError: in one line, whatever the package raises.
-    """
+    """Load a model with a foreign package; whatever that raises for bad weights becomes a ModelAccessError."""
     try:
         return make()
     except Exception as error:

@@ -16,17 +16,11 @@ from tableverse_factory.core.framing import FrameError, encode_header, read_fram
 MAX_ARRAYS = 16
 MAX_BYTES = 1 << 30  # maximum size of one array: a picture of 200 million pixels fits
 
+# Errors that numpy raises for a malformed header.
 _ARRAY_ERRORS = (
-    ValueError,
-    EOFError,
-    SyntaxError,
-    TypeError,
-    MemoryError,
-    OverflowError,
-    RecursionError,
-    tokenize.TokenError,
+    *(ValueError, EOFError, SyntaxError, TypeError),
+    *(MemoryError, OverflowError, RecursionError, tokenize.TokenError),
 )
-"""Errors that numpy raises for a malformed header."""
 
 
 class WireError(Exception):
@@ -34,11 +28,7 @@ class WireError(Exception):
 
 
 def send_arrays(connection: socket.socket, arrays: Sequence[np.ndarray]) -> None:
-    """Send a message; the label of each frame is the number of arrays that follow it.
-
-    Raises:
-        WireError: if the other end is gone.
-    """
+    """Send a message; the label of each frame is the number of arrays that follow it."""
     try:
         for following, array in zip(reversed(range(len(arrays))), arrays, strict=True):
             file = io.BytesIO()
@@ -50,15 +40,7 @@ def send_arrays(connection: socket.socket, arrays: Sequence[np.ndarray]) -> None
 
 
 def receive_arrays(connection: socket.socket, within_s: float | None = None) -> list[np.ndarray]:
-    """Receive the next message.
-
-    Args:
-        connection: Socket to read from.
-        within_s: Limit for the whole message; None for no limit [s].
-
-    Raises:
-        WireError: at the end of the stream, after the limit, or for bytes that are no message.
-    """
+    """Receive the next message; WireError at the end of the stream, after `within_s` [s], or for other bytes."""
     until = None if within_s is None else time.monotonic() + within_s
     arrays: list[np.ndarray] = []
     following = b""
@@ -98,11 +80,7 @@ def encode_error(kind: str, message: str) -> np.ndarray:
 
 
 def decode_error(array: np.ndarray) -> tuple[str, str]:
-    """Decode the class and message of an error.
-
-    Raises:
-        WireError: if the array holds none.
-    """
+    """Decode the class and message of an error; WireError if the array holds none."""
     try:
         kind, message = json.loads(array.astype(np.uint8).tobytes())
     except ValueError as error:

@@ -31,22 +31,14 @@ class AnswerCache:
         return ChatCompletion(**{**record, "usage": Usage(**record["usage"])})
 
     def put(self, key: str, completion: ChatCompletion) -> None:
-        """Store an answer.
-
-        Raises:
-            ModelAccessError: if the disk refuses; further answers would be paid for and lost.
-        """
+        """Store an answer; ModelAccessError if the disk refuses: further answers would be paid for and lost."""
         try:
             self._files.put(key, json.dumps(asdict(completion), sort_keys=True).encode())
         except OSError as error:
             raise _describe_disk_error(self._files.folder, error) from error
 
     def check(self) -> None:
-        """Check that answers can be stored, before one is paid for.
-
-        Raises:
-            ModelAccessError: if the folder cannot be written.
-        """
+        """Check that answers can be stored, before one is paid for."""
         try:
             self._files.folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._files.folder):

@@ -29,9 +29,11 @@ _KEY_HEADERS: dict[str, Callable[[str], dict[str, str]]] = {
 }
 
 MOST_CALLS = 2 * ATTEMPTS  # maximum number of requests for one question: two rounds, each with all its retries
-
 _REPAIR_CHARS = 20_000  # maximum length of an answer that is sent back for repair
-
+_REPAIR_PROMPT = (
+    "That answer cannot be used: {}. Give the whole answer again, corrected, as one JSON object in the schema, "
+    "and nothing else."
+)
 _KEY_CHARS = 8  # shorter keys are placeholders for a local server, such as `none`, and may occur in an answer
 
 T = TypeVar("T")
@@ -39,14 +41,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Reply(Generic[T]):
-    """A validated answer.
-
-    Attributes:
-        value: Value that was read from the text.
-        text: Text of the answer.
-        usage: Tokens and requests of all rounds.
-        rounds: 1, or 2 if the first answer had to be repaired.
-    """
+    """The value read from an answer's text, and the cost of its rounds: one, or two if it had to be repaired."""
 
     value: T
     text: str
@@ -82,14 +77,8 @@ class ModelClient:
     ) -> Reply[T]:
         """Ask, and parse the answer with `read`; an answer that it refuses goes back once, with the reason.
 
-        Args:
-            read: Parses the text, or raises AnswerInvalidError with what is wrong.
-            prompt: Text of the question.
-            images: PNG or JPEG files.
-            schema: JSON schema of the answer, without bounds and lengths: servers refuse large grammars.
-
-        Raises:
-            ModelAccessError, AnswerInvalidError, BudgetSpentError, ModelError: see `ask`.
+        `read` raises AnswerInvalidError with what is wrong; images are PNG or JPEG files; the JSON schema has no bounds
+        and lengths, as servers refuse large grammars. Other errors are those of `ask`.
         """
         deadline = time.monotonic() + self._endpoint.timeout_s
         question = (Message("user", prompt, tuple(images)),)
@@ -99,11 +88,9 @@ class ModelClient:
         except AnswerInvalidError as problem:
             if first.refusal:
                 raise
-            repair = (
-                Message("model", first.text[:_REPAIR_CHARS] or "(nothing)"),
-                Message("user", _write_repair_prompt(problem)),
-            )
-            second = self._complete((*question, *repair), schema, deadline)
+            given = Message("model", first.text[:_REPAIR_CHARS] or "(nothing)")
+            repair = Message("user", _REPAIR_PROMPT.format(str(problem)[:500]))
+            second = self._complete((*question, given, repair), schema, deadline)
         return Reply(_parse_answer(read, second), second.text, first.usage + second.usage, 2)
 
     def _complete(self, messages: tuple[Message, ...], schema: Mapping[str, Any], deadline: float) -> ChatCompletion:
@@ -119,8 +106,7 @@ class ModelClient:
         calls = self._meter.paid.calls
 
         async def send(client: BoundedClient) -> ChatCompletion:
-            """Request a completion; its tokens are paid even if it is empty."""
-            nonlocal tokens
+            nonlocal tokens  # they are paid even if the completion is empty
             completion = await PROTOCOLS[self._endpoint.dialect](client, self._endpoint, messages, sent)
             if completion is None:
                 host = format_host(self._endpoint.base_url)
@@ -133,12 +119,12 @@ class ModelClient:
             return completion
 
         completion = send_with_retries(self._endpoint, send, headers, deadline, self._turn, key.encode())
-        completion = replace(
-            completion,
-            text=replace_lone_surrogates(redact_keys(completion.text, headers, min_chars=_KEY_CHARS)),
-            refusal=replace_lone_surrogates(redact_keys(completion.refusal, headers, min_chars=_KEY_CHARS)),
-            usage=replace(tokens, calls=self._meter.paid.calls - calls),
+        text, refusal = (
+            replace_lone_surrogates(redact_keys(part, headers, min_chars=_KEY_CHARS))
+            for part in (completion.text, completion.refusal)
         )
+        usage = replace(tokens, calls=self._meter.paid.calls - calls)
+        completion = replace(completion, text=text, refusal=refusal, usage=usage)
         self._cache.put(key, completion)
         return completion
 
@@ -159,10 +145,3 @@ def _parse_answer(read: Callable[[str], T], completion: ChatCompletion) -> T:
         if completion.cut_off:
             raise AnswerInvalidError(f"the answer was cut off: {error}", error.reason) from error
         raise
-
-
-def _write_repair_prompt(problem: AnswerInvalidError) -> str:
-    return (
-        f"That answer cannot be used: {str(problem)[:500]}. "
-        "Give the whole answer again, corrected, as one JSON object in the schema, and nothing else."
-    )

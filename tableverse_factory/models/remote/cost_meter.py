@@ -7,24 +7,16 @@ from schemas.outcome import NO_COST, UNLIMITED, Allowance, ModelCost
 from tableverse_factory.core.errors import BudgetSpentError
 
 
-def _ignore_cost(_spent: ModelCost) -> None:
-    pass
-
-
 class Meter:
-    """Meter of one stage on one scene, from `reset` to `reset`.
+    """Meter of one stage on one scene, from `reset` to `reset`, at first without a limit.
 
     Attributes:
         cost: Cost of the answers when they were first given, including those from the cache.
         paid: Cost of the requests since the last `reset`.
     """
 
-    def __init__(self, note: Callable[[ModelCost], None] = _ignore_cost) -> None:
-        """Create a meter without a limit.
-
-        Args:
-            note: Called with every cost: of a request before it is sent, of tokens when they are counted.
-        """
+    def __init__(self, note: Callable[[ModelCost], None] = lambda _spent: None) -> None:
+        """Create a meter; `note` gets every cost: of a request before it is sent, of tokens when they are counted."""
         self._note = note
         self._left = UNLIMITED
         self.cost, self.paid = NO_COST, NO_COST
@@ -42,21 +34,13 @@ class Meter:
         self.cost += cost
 
     def check(self) -> None:
-        """Check that the allowance is not spent.
-
-        Raises:
-            BudgetSpentError: if it is.
-        """
+        """Raise BudgetSpentError if the allowance is spent."""
         calls, usd = self._left.calls, self._left.usd
         if (calls is not None and calls <= 0) or (usd is not None and usd <= 0.0):
             raise BudgetSpentError("the budget is spent")
 
     def add_request(self) -> None:
-        """Count a request that is about to be sent.
-
-        Raises:
-            BudgetSpentError: if the allowance is spent.
-        """
+        """Count a request that is about to be sent; BudgetSpentError if the allowance is spent."""
         self.check()
         self._spend(ModelCost(calls=1))
 
@@ -69,8 +53,5 @@ class Meter:
         self.cost += spent
         self.paid += spent
         calls, usd = self._left.calls, self._left.usd
-        self._left = replace(
-            self._left,
-            calls=None if calls is None else calls - spent.calls,
-            usd=None if usd is None else usd - spent.usd,
-        )
+        left_usd = None if usd is None else usd - spent.usd
+        self._left = replace(self._left, calls=None if calls is None else calls - spent.calls, usd=left_usd)

@@ -20,19 +20,13 @@ class Endpoint:
     """One model behind one address, without its key.
 
     Attributes:
-        dialect: Protocol of the server.
         base_url: Address without `/chat/completions` or `/models/…`; checked by `schemas.address`.
-        model: Name of the model at the server.
         key_env: Environment variable that holds the key; empty for a server without keys.
         enforce_schema: Whether the server is asked to enforce the schema; some servers refuse to.
         timeout_s: Limit for a question with all retries, waits and the repair round [s].
-        connect_s: Limit for a connection [s].
         read_s: Longest silence of the server; models that think first are silent for long [s].
-        max_body_bytes: Maximum size of an answer.
         attempts: Maximum number of requests per exchange.
         backoff_s: Wait before the first retry; it doubles with each further one [s].
-        usd_per_million_input: Price of a million input tokens [USD].
-        usd_per_million_output: Price of a million output tokens [USD].
         section: Section of the configuration that this comes from, for messages; empty without one.
     """
 
@@ -57,11 +51,7 @@ class Endpoint:
         return ModelCost(usage.calls, usage.input_tokens, usage.output_tokens, price / 1e6)
 
     def read_key(self) -> str:
-        """Read the key from the environment; empty if none is configured.
-
-        Raises:
-            ModelAccessError: if the variable is unset or holds what no HTTP header can.
-        """
+        """Read the key from the environment; empty if none is configured, ModelAccessError if it is no key."""
         if not self.key_env:
             return ""
         key = os.environ.get(self.key_env, "").strip()

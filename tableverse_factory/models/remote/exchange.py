@@ -11,13 +11,7 @@ from tableverse_factory.core.optional_imports import import_extra
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message of a conversation.
-
-    Attributes:
-        role: `user` or `model`.
-        text: Text of the message.
-        images: PNG or JPEG files that precede the text.
-    """
+    """A message of `user` or `model`: PNG or JPEG files, then text."""
 
     role: str
     text: str
@@ -34,22 +28,13 @@ class Usage:
 
     def __add__(self, other: "Usage") -> "Usage":
         return Usage(
-            self.input_tokens + other.input_tokens,
-            self.output_tokens + other.output_tokens,
-            self.calls + other.calls,
+            self.input_tokens + other.input_tokens, self.output_tokens + other.output_tokens, self.calls + other.calls
         )
 
 
 @dataclass(frozen=True, slots=True)
 class ChatCompletion:
-    """Answer of a chat model.
-
-    Attributes:
-        text: Text of the answer; untrusted.
-        usage: Tokens and requests.
-        refusal: Reason for a refusal, in the server's words; empty for an answer.
-        cut_off: Whether the answer ended at a limit of tokens.
-    """
+    """Untrusted answer of a chat model, or its reason to refuse one; `cut_off` if it ended at a limit of tokens."""
 
     text: str
     usage: Usage
@@ -63,11 +48,7 @@ class ChatCompletion:
 
 
 def detect_media_type(image: bytes) -> str:
-    """Return `image/png` or `image/jpeg`, by the first bytes.
-
-    Raises:
-        ValueError: if it is neither.
-    """
+    """Return `image/png` or `image/jpeg`, by the first bytes; ValueError if it is neither."""
     if image.startswith(b"\x89PNG\r\n\x1a\n"):
         return "image/png"
     if image.startswith(b"\xff\xd8\xff"):
@@ -99,11 +80,7 @@ def replace_lone_surrogates(text: str) -> str:
 
 
 def import_client(module: str) -> Any:
-    """Import the package of a protocol.
-
-    Raises:
-        ModelAccessError: if it is not installed.
-    """
+    """Import the package of a protocol; ModelAccessError if it is not installed."""
     try:
         return import_extra(module, "a model behind an address", "vlm")
     except InputError as error:

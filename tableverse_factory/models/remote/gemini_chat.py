@@ -16,24 +16,11 @@ from tableverse_factory.models.remote.exchange import (
 )
 from tableverse_factory.models.remote.http import BoundedClient
 
-_REFUSALS = frozenset(
-    {
-        "SAFETY",
-        "RECITATION",
-        "LANGUAGE",
-        "BLOCKLIST",
-        "PROHIBITED_CONTENT",
-        "SPII",
-        "ESCALATION",
-        "MODEL_ARMOR",
-        "IMAGE_SAFETY",
-        "IMAGE_PROHIBITED_CONTENT",
-        "IMAGE_RECITATION",
-        "OTHER",
-    }
+# Finish reasons of a candidate that is no answer.
+_REFUSALS = (
+    *("SAFETY", "RECITATION", "LANGUAGE", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII", "ESCALATION", "MODEL_ARMOR"),
+    *("IMAGE_SAFETY", "IMAGE_PROHIBITED_CONTENT", "IMAGE_RECITATION", "OTHER"),
 )
-"""Finish reasons of a candidate that is no answer."""
-
 _CUT_OFF = ("MAX_TOKENS", "CONTINUATION")
 
 

@@ -20,11 +20,11 @@ from tableverse_factory.models.remote.exchange import get_path
 from tableverse_factory.models.remote.http_errors import format_host, raise_for_answer, redact_keys
 
 _LEAST_S = 0.001
+# Headers taken over from the caller: client libraries add others, some of them from the environment.
 _SENT_HEADERS = ("host", "content-type", "content-length", "user-agent")
-"""Headers taken over from the caller: client libraries add others, some of them from the environment."""
 
+# Context of every request: waits until it may be sent, at most until the deadline that it is given.
 Turn = Callable[[float], AbstractContextManager[None]]
-"""Context of every request: waits until it may be sent, at most until the deadline that it is given."""
 
 T = TypeVar("T")
 
@@ -42,12 +42,7 @@ class BoundedClient(httpx.AsyncClient):
     """
 
     def __init__(self, endpoint: Endpoint, left_s: float, headers: Mapping[str, str]) -> None:
-        """Open a client.
-
-        Args:
-            endpoint: Address and times.
-            left_s: Time left for the request [s].
-            headers: Headers with the key.
+        """Open a client with `left_s` [s] for the request and the key in its headers.
 
         Raises:
             ModelAccessError: if the environment names an unusable proxy or certificate file.
@@ -68,12 +63,7 @@ class BoundedClient(httpx.AsyncClient):
             ) from error
 
     async def send(self, request: httpx.Request, **_options: Any) -> httpx.Response:
-        """Send a request and read its whole answer.
-
-        Raises:
-            TransientError: if another attempt may succeed.
-            AnswerInvalidError, ModelAccessError, ModelError: see `raise_for_answer`.
-        """
+        """Send a request and read its whole answer; raises as `raise_for_answer`."""
         host, own = request.url.netloc, httpx.URL(self._endpoint.base_url).netloc
         if host != own:
             raise ModelError(f"a request for {own.decode()} was addressed to {host.decode()}; it was not sent")
@@ -100,11 +90,8 @@ class BoundedClient(httpx.AsyncClient):
         data = bytearray()
         async for chunk in response.aiter_raw():
             data += chunk
-            if len(data) > self._endpoint.max_body_bytes:
-                raise ModelError(
-                    f"{format_host(self._endpoint.base_url)}: the answer is longer than "
-                    f"{self._endpoint.max_body_bytes} bytes"
-                )
+            if len(data) > (most := self._endpoint.max_body_bytes):
+                raise ModelError(f"{format_host(self._endpoint.base_url)}: the answer is longer than {most} bytes")
         body = _parse_json(data)
         header = response.headers.get("retry-after")
         wait_s = _find_retry_delay(body) if header is None else parse_retry_after(header)
@@ -112,16 +99,10 @@ class BoundedClient(httpx.AsyncClient):
             body = get_path(body, 0)
         if is_success and not isinstance(body, Mapping):
             raise TransientError("the answer is no whole JSON object", wait_s)
-        raise_for_answer(
-            response.status_code, body if isinstance(body, Mapping) else {}, self._endpoint, self._key_headers, wait_s
-        )
-        content = json.dumps(body).encode()
-        return httpx.Response(
-            response.status_code,
-            headers={"Content-Type": "application/json"},
-            content=content,
-            request=response.request,
-        )
+        status, found = response.status_code, body if isinstance(body, Mapping) else {}
+        raise_for_answer(status, found, self._endpoint, self._key_headers, wait_s)
+        kind, content = {"Content-Type": "application/json"}, json.dumps(body).encode()
+        return httpx.Response(status, headers=kind, content=content, request=response.request)
 
 
 def send_with_retries(
@@ -167,11 +148,7 @@ def send_with_retries(
 
 
 def post_json(endpoint: Endpoint, path: str, body: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Post a JSON object to a path below the endpoint's address and return the JSON object of its answer.
-
-    Raises:
-        AnswerInvalidError, ModelAccessError, ModelError: see `send_with_retries`.
-    """
+    """Post a JSON object to a path below the endpoint's address and return that of its answer (`send_with_retries`)."""
     url = f"{endpoint.base_url.rstrip('/')}/{path}"
 
     async def send(client: BoundedClient) -> Mapping[str, Any]:

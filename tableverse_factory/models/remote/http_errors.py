@@ -19,10 +19,10 @@ _CREDIT_WORDS = frozenset({"insufficient_quota", "billing_hard_limit_reached", "
 _MALFORMED = frozenset({400, 422})  # statuses of a request with an unknown schema, often without a message about it
 _UNSTATED = 502  # stands for the status of an error that came with a status of success
 
+# Marks of an error about a picture or a prompt, as opposed to the key.
 _CONTENT_STATUSES = frozenset({400, 403, 451, _UNSTATED})
 _CONTENT_CODES = ("content_filter", "content_policy", "moderation", "sensitivecontent")
 _CONTENT_WORDS = ("requires moderation", "input was flagged", "prompt was flagged", "content was flagged")
-"""Marks of an error about a picture or a prompt, as opposed to the key."""
 
 
 def raise_for_answer(
@@ -30,12 +30,8 @@ def raise_for_answer(
 ) -> None:
     """Return for a success, and raise for everything else.
 
-    Args:
-        status: HTTP status.
-        body: JSON object of the answer, empty without one; untrusted.
-        endpoint: Server that answered.
-        headers: Headers with the key, which messages must not contain.
-        wait_s: Wait that the server asks for [s].
+    The JSON `body` is untrusted, and empty without one; `wait_s` is what the server asks for [s]; messages must not
+    contain the key, which is in the headers.
 
     Raises:
         TransientError: if another attempt may succeed.
@@ -61,13 +57,10 @@ def raise_for_answer(
     if status in _TRANSIENT:
         raise TransientError(text, wait_s)
     key = f"{endpoint.section}.enforce_schema" if endpoint.section else "enforce_schema"
-    about_schema = endpoint.dialect in ("openai", "gemini") and _may_be_schema(status, message)
-    hint = f"; does it help to configure {key}: false?" if about_schema and endpoint.enforce_schema else ""
+    about_schema = status in _MALFORMED or any(word in message.lower() for word in _SCHEMA_WORDS)
+    enforced = endpoint.dialect in ("openai", "gemini") and endpoint.enforce_schema
+    hint = f"; does it help to configure {key}: false?" if about_schema and enforced else ""
     raise ModelError(f"{host}: {text}{hint}")
-
-
-def _may_be_schema(status: int, message: str) -> bool:
-    return status in _MALFORMED or any(word in message.lower() for word in _SCHEMA_WORDS)
 
 
 def _is_about_content(status: int, error: Any, message: str) -> bool:

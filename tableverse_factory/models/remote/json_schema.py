@@ -1,7 +1,6 @@
-"""JSON schemas of answers, in the subset that strict servers accept.
+"""JSON schemas of answers, in the subset that strict servers accept: every property required, nothing bounded.
 
-Every property is required and nothing is bounded: servers compile schemas to grammars and refuse large ones. Bounds
-are checked when an answer is read.
+Servers compile schemas to grammars and refuse large ones; bounds are checked when an answer is read.
 """
 
 from typing import Any

@@ -10,17 +10,12 @@ from tableverse_factory.core.errors import AnswerInvalidError
 MAX_ANSWER_CHARS = 262_144  # maximum length of an answer, including thoughts in its text
 
 T = TypeVar("T", bound=BaseModel)
-
 _FENCE = "```"
 _THOUGHTS = ("<think>", "</think>")
 
 
 def parse_json_object(text: str) -> dict[str, Any]:
-    """Parse the JSON object in a text.
-
-    Raises:
-        AnswerInvalidError: if there is none, or the text is longer than `MAX_ANSWER_CHARS`.
-    """
+    """Parse the JSON object in a text; AnswerInvalidError if there is none, or over `MAX_ANSWER_CHARS`."""
     if len(text) > MAX_ANSWER_CHARS:
         raise AnswerInvalidError(f"the answer is longer than {MAX_ANSWER_CHARS} characters")
     answer = _strip_thoughts(text.lstrip())
@@ -38,11 +33,7 @@ def parse_json_object(text: str) -> dict[str, Any]:
 
 
 def validate_answer(value: Any, model: type[T]) -> T:
-    """Validate a JSON value against a pydantic model.
-
-    Raises:
-        AnswerInvalidError: if it is invalid; names the first invalid place, for a round of repair.
-    """
+    """Validate a JSON value; the AnswerInvalidError names the first invalid place, for a round of repair."""
     try:
         return model.model_validate(value)
     except ValidationError as error:

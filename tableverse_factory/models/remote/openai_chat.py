@@ -69,7 +69,6 @@ def _read_completion(body: Mapping[str, Any]) -> ChatCompletion | None:
 
 
 def _join_text(content: Any) -> str:
-    """Return the text of a message: a string, or a list of parts of which some are text."""
     if isinstance(content, list):
         return "".join(part for part in (get_path(item, "text") for item in content) if isinstance(part, str))
     return content if isinstance(content, str) else ""

@@ -16,11 +16,8 @@ from pathlib import Path
 from schemas.config import AskingConfig
 from tableverse_factory.core.errors import ModelAccessError, ModelError
 
-_WAIT_S, _LONGEST_WAIT_S = 0.02, 0.25
-"""Interval between two checks, per request that must end first, and its maximum [s]."""
-
+_WAIT_S, _LONGEST_WAIT_S = 0.02, 0.25  # interval between two checks, per request that must end first, and its maximum
 _TICKET = "place-"
-
 _NEXT = struct.Struct("<d")
 
 
@@ -33,10 +30,7 @@ class RateLimiter:
 
     @contextmanager
     def turn(self, deadline: float) -> Iterator[None]:
-        """Wait until a request may start; it is under way while the block lasts.
-
-        Args:
-            deadline: When to give up, on `time.monotonic` [s].
+        """Wait until a request may start, until `deadline` on `time.monotonic` [s]; the block is the request.
 
         Raises:
             ModelError: if it may not start before the deadline.

@@ -13,9 +13,7 @@ from schemas.geometry import Vector3
 
 MIN_MASS_KG = 0.002
 MAX_MASS_KG = 30.0
-
-_SURFACE_SHARE = 0.8
-"""Surface of a rounded object over that of its box: pi/4 for an upright cylinder, 0.52 to 1 for ball and box."""
+_SURFACE_SHARE = 0.8  # of a rounded object over its box: pi/4 for an upright cylinder, 0.52 to 1 for ball and box
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +21,10 @@ class Material:
     """A substance and how it fills an object.
 
     Attributes:
-        name: Of the matter: `ceramic`, `food`, …
         density_kg_m3: Of the matter itself [kg/m³].
-        friction: Sliding friction against another everyday surface.
         fill: Share of the mesh's volume that is matter, 0 to 1.
+        wall_m: Wall [m] of what is hollow, which bounds the mass where the mesh is solid; None for solid objects.
         rolling: Tangent of the slope on which a round object of it starts to roll.
-        wall_m: Wall of an open vessel or a case [m], which bounds the mass where the mesh is solid but the object
-            hollow; None for solid objects.
     """
 
     name: str
@@ -47,8 +42,7 @@ _GLASS = Material("glass", 2500.0, 0.7, wall_m=0.003)
 _SHEET_METAL = Material("metal", 7800.0, 0.7, wall_m=0.0012)
 _METAL = Material("metal", 7800.0, 0.7)
 _TOOL = Material("metal", 7800.0, 0.7, fill=0.45)
-_CUTLERY = Material("metal", 7800.0, 0.7, wall_m=0.0004)
-"""A sheet of 2 mm that covers a fifth of its box: thin objects are reconstructed far too thick."""
+_CUTLERY = Material("metal", 7800.0, 0.7, wall_m=0.0004)  # 2 mm over a fifth of the box: meshes are far too thick
 _FILLED = Material("filled container", 1000.0, 0.8, fill=0.9)
 _CARTON = Material("carton", 700.0, 0.8, fill=0.5)
 _PAPER = Material("paper", 750.0, 0.8)
@@ -95,10 +89,7 @@ def guess_material(label: str) -> Material:
     """Guess the material from the words of a label (untrusted text); `DEFAULT_MATERIAL` where none is known."""
     words = set(re.findall(r"[a-z]+", label.lower()[:500]))
     words |= {word[:-1] for word in words if word.endswith("s")}
-    for keywords, material in LEXICON:
-        if words & keywords:
-            return material
-    return DEFAULT_MATERIAL
+    return next((material for keywords, material in LEXICON if words & keywords), DEFAULT_MATERIAL)
 
 
 def estimate_rolling_friction_m(label: str, size: Vector3) -> float:

@@ -11,11 +11,7 @@ from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_body
 
 
 def make_prior_body(item: PlacedObject, pieces: ConvexPieces, pose: Pose) -> SceneBody:
-    """Make the body of an object at a pose, with the mass and friction of its guessed material.
-
-    Raises:
-        GeometryError: if no piece is thick enough to simulate.
-    """
+    """Make the body of an object at a pose, with the mass and friction of its guessed material."""
     try:
         body = make_scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, 1.0, pose)
     except GeometryError as error:

@@ -26,27 +26,20 @@ MAX_DOCUMENTS = 64
 MAX_REFERENCES = 20_000
 MAX_SETTINGS = 64
 MAX_LOOKUPS = 1_000_000  # of paths, in all possible folders
-
 MAX_TOTAL_BYTES = 2 * 1024**3
 
 _ATTRIBUTE = re.compile(rb"\b(file\w*|meshdir|texturedir|assetdir)\s*=\s*(?:\"([^\"]*)\"|'([^']*)')")
-_ENTITY = re.compile(r"&(?:#x([0-9a-fA-F]{1,20})|#([0-9]{1,20})|(quot|amp|apos|lt|gt));")
-"""As known to the XML reader of MuJoCo."""
+_ENTITY = re.compile(r"&(?:#x([0-9a-fA-F]{1,20})|#([0-9]{1,20})|(quot|amp|apos|lt|gt));")  # as in MuJoCo's XML reader
 _NAMED_ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
+# Characters that may end a name early, invalid entities, and drives, which Linux takes for folders.
 _UNREADABLE = re.compile(r"[\x00-\x1f\x7f]|&#|^\s*[A-Za-z]:[\\/]")
-"""Characters that may end a name early, invalid entities, and drives, which Linux takes for folders."""
 
 
 def load_mjcf(path: Path, root: Path | None = None) -> mujoco.MjModel:
-    """Load the model of a file on disk.
-
-    Args:
-        path: The MJCF file.
-        root: All files that it names must lie below this folder; its own folder by default.
+    """Load the model of a file on disk; all files that it names must lie below `root`, by default its own folder.
 
     Raises:
-        InputError: `bad_mjcf` if it names a file elsewhere or too many bytes, MuJoCo does not load it, or it holds
-            numbers that are not finite.
+        InputError: `bad_mjcf` if it names others or too many bytes, does not load, or holds a NaN or infinite number.
     """
     try:
         check_files(path, root or path.parent)
@@ -75,11 +68,7 @@ def check_files(path: Path, root: Path) -> tuple[Path, ...]:
 
 
 def check_references(document: bytes, files: Collection[str]) -> None:
-    """Check that a document in memory names only these files: MuJoCo would open all others on the disk.
-
-    Args:
-        document: An exported scene, its files in `assets/`.
-        files: Their paths beside the document.
+    """Check that an exported scene in memory names only these files: MuJoCo would open all others on the disk.
 
     Raises:
         InputError: `bad_mjcf` for any other.
@@ -95,12 +84,8 @@ def check_references(document: bytes, files: Collection[str]) -> None:
 class _FileSearch:
     """Search through documents that name documents: every path is tried in every folder known so far.
 
-    Attributes:
-        root: Folder that must hold all files.
-        files: Found so far, in order.
-        homes: Folders of the documents.
-        settings: Folders that the documents name for their meshes and textures.
-        references: Paths that the documents name, in every reading.
+    `homes` are the folders of the documents; `settings` the folders, and `references` the paths that they name, in
+    every reading.
     """
 
     root: Path
@@ -135,10 +120,8 @@ class _FileSearch:
             return
         self.documents += 1
         if self.documents > MAX_DOCUMENTS or path.stat().st_size > MAX_DOCUMENT_BYTES:
-            raise InputError(
-                f"{called!r}: at most {MAX_DOCUMENTS} documents of at most {MAX_DOCUMENT_BYTES} bytes are read",
-                "bad_mjcf",
-            )
+            most = f"at most {MAX_DOCUMENTS} documents of at most {MAX_DOCUMENT_BYTES} bytes are read"
+            raise InputError(f"{called!r}: {most}", "bad_mjcf")
         known_bases, known_references = self._bases(), tuple(self.references)
         self.homes[path.parent] = None
         for name, value in attributes:
@@ -151,11 +134,7 @@ class _FileSearch:
         self._find(known_references, [base for base in bases if base not in known_bases])
 
     def check_absent(self) -> None:
-        """Refuse paths that leave the folder from every base, whether they exist or not.
-
-        Raises:
-            InputError: `bad_mjcf`.
-        """
+        """Refuse paths that leave the folder from every base, whether they exist or not."""
         bases = self._bases()
         known = {path.name for path in self.files}  # `strippath` may leave only the name
         for value in self.references:
@@ -173,7 +152,6 @@ class _FileSearch:
         )
 
     def _bases(self) -> dict[Path, None]:
-        """Possible base folders of paths."""
         return dict.fromkeys(home / setting for home in self.homes for setting in self.settings)
 
     def _find(self, references: Collection[str], bases: Collection[Path]) -> None:
@@ -206,11 +184,7 @@ def _check_picture_size(data: mmap.mmap, called: str) -> None:
 
 
 def _find_attributes(document: bytes | mmap.mmap) -> Iterator[tuple[str, str]]:
-    """Find every attribute that names a file or folder, in every reading, also in comments.
-
-    Raises:
-        InputError: `bad_mjcf` for a name with further readings.
-    """
+    """Find every attribute that names a file or folder, in every reading, also in comments; others are refused."""
     for match in _ATTRIBUTE.finditer(document):
         written = os.fsdecode(match[2] if match[2] is not None else match[3])
         meant = _ENTITY.sub(_decode_entity, written)

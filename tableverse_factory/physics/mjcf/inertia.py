@@ -13,23 +13,16 @@ from tableverse_factory.geometry.mesh.mass_integrals import integrate_volume
 from tableverse_factory.geometry.mesh.repair import solid_to_mesh
 from tableverse_factory.geometry.mesh.shells import is_one_shell, unite_shells
 
-MIN_GYRATION_M = 5e-4
-"""Least radius of gyration about any axis: below it, single contacts spin a body faster than a 2 ms step resolves."""
-
+MIN_GYRATION_M = 5e-4  # least radius about any axis: below it, single contacts spin a body too fast for a 2 ms step
 REMEMBERED_BYTES = 4 * 1024  # one flag for each mesh of some scenes
-
 MIN_COMPACTNESS = 1e-3  # least volume over that of the box for which a closed mesh counts as a solid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MassProperties(Frozen):
-    """Mass properties of a body of uniform density, in the mesh's own frame.
+    """Mass properties of a body of uniform density, in the mesh's own frame: centre [m], inertia about it [kg m²].
 
-    Attributes:
-        volume_m3: Volume that the mass was spread over.
-        center: Centre of mass [m].
-        inertia: About the centre of mass [kg m²]. Shape (3, 3).
-        source: `mesh`, or `pieces` or `hull` where the mesh is not a closed volume.
+    `source` is `mesh`, or `pieces` or `hull` where the mesh is not a closed volume.
     """
 
     mass_kg: float
@@ -45,13 +38,7 @@ class MassProperties(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VolumeMoments(Frozen):
-    """Moments of the volume that a body's mass is spread over, in the mesh's own frame.
-
-    Attributes:
-        center: Its centre [m].
-        second: Second moments about the centre [m⁵]. Shape (3, 3).
-        source: As in `MassProperties`.
-    """
+    """Centre [m] and second moments about it [m⁵] of the volume that a mass is spread over, in the mesh's own frame."""
 
     volume_m3: float
     center: Vector3
@@ -78,7 +65,7 @@ def compute_volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) 
         found = _integrate_closed(mesh if is_one_shell(mesh) else unite_shells(mesh), "mesh")
         if found is not None:
             return found
-    union = _unite_hulls(hulls)
+    union = solid_to_mesh(unite_hulls(hulls))
     found = _integrate_closed(union, "pieces") if len(union.faces) else None
     return found or _integrate_hull(np.concatenate([hull.vertices for hull in hulls]))
 
@@ -103,9 +90,7 @@ def _integrate_closed(mesh: TriangleMesh, source: str) -> VolumeMoments | None:
     low, high = aabb(mesh.vertices)
     if volume <= MIN_COMPACTNESS * float(np.prod(high - low)) or not ((low <= center) & (center <= high)).all():
         return None
-    if np.linalg.eigvalsh(moments)[0] <= 0.0:
-        return None
-    return VolumeMoments(volume, center, moments, source)
+    return VolumeMoments(volume, center, moments, source) if np.linalg.eigvalsh(moments)[0] > 0.0 else None
 
 
 def _compute_inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
@@ -118,12 +103,6 @@ def _compute_inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
     return inertia + max(lacking, 0.0) * np.eye(3)
 
 
-def _unite_hulls(hulls: tuple[TriangleMesh, ...]) -> TriangleMesh:
-    return solid_to_mesh(unite_hulls(hulls))
-
-
 def _integrate_hull(points: np.ndarray) -> VolumeMoments:
-    hull = ConvexHull(points)
-    corners, faces = orient_faces_outward(hull)
-    volume, center, moments = integrate_volume(TriangleMesh(corners, faces))
-    return VolumeMoments(volume, center, moments, "hull")
+    hull = TriangleMesh(*orient_faces_outward(ConvexHull(points)))
+    return VolumeMoments(*integrate_volume(hull), "hull")

@@ -14,8 +14,7 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
     """Load the model of a scene's files: `scene.xml` and those in `assets/`.
 
     Raises:
-        InputError: `bad_mjcf` if there is no `scene.xml`, it names a file that is not here, MuJoCo refuses it, or it
-            holds numbers that are not finite.
+        InputError: `bad_mjcf` if it is not here, names others, does not load, or holds numbers that are not finite.
     """
     assets = _select_assets(files)
     try:
@@ -28,11 +27,7 @@ def load_model(files: Mapping[str, bytes]) -> mujoco.MjModel:
 
 
 def load_spec(files: Mapping[str, bytes]) -> mujoco.MjSpec:
-    """Load a scene's files as a specification, to edit, attach and compile.
-
-    Raises:
-        InputError: as `load_model`; compiling it may raise further errors.
-    """
+    """Load a scene's files as a specification, to edit, attach and compile, which may raise further errors."""
     assets = _select_assets(files)
     try:
         return mujoco.MjSpec.from_string(files["scene.xml"].decode(), assets=assets)

@@ -7,9 +7,7 @@ from tableverse_factory.core.errors import GeometryError
 
 _ZERO, _MINUS, _POINT = b"0"[0], b"-"[0], b"."[0]
 _BLANK = 0  # placeholder where a shorter number has no digit; it is removed at the end
-
-_MIN_VECTORIZED = 600  # python formats fewer numbers faster
-
+_MIN_VECTORIZED = 600  # Python formats fewer numbers faster
 _MAX_EXACT_INTEGER = 2.0**53  # limit of exact integers in float64
 
 
@@ -26,11 +24,7 @@ def format_integer_lines(head: bytes, numbers: Int64[np.ndarray, "n k"], ends: b
 
 
 def format_decimal_lines(head: bytes, numbers: Float64[np.ndarray, "n k"], decimals: int, ends: bytes) -> bytes:
-    """Format like `format_integer_lines` with a fixed number of decimals, rounded; zero has no sign.
-
-    Raises:
-        GeometryError: if a number is not finite.
-    """
+    """Format like `format_integer_lines` with a fixed number of decimals, rounded; zero has no sign."""
     if not np.isfinite(numbers).all():
         raise GeometryError("a table of numbers to be written holds NaN or infinite ones")
     if numbers.size < _MIN_VECTORIZED or float(np.abs(numbers).max()) >= _MAX_EXACT_INTEGER / 10.0**decimals:
@@ -45,7 +39,6 @@ def format_decimal_lines(head: bytes, numbers: Float64[np.ndarray, "n k"], decim
 
 
 def _format_each(head: bytes, numbers: np.ndarray, form: str, ends: bytes) -> bytes:
-    """Format with Python, one by one."""
     line = head.decode() + "".join(form + end for end in ends.decode())
     return ((line * len(numbers)) % tuple(numbers.ravel().tolist())).encode()
 

@@ -16,19 +16,12 @@ from tableverse_factory.physics.mjcf.number_format import format_decimal_lines, 
 MAX_PIECE_VERTICES = 64
 MIN_MESH_VERTICES = 4
 MIN_PIECE_THICKNESS_M = 5e-5  # thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail
-
 ROUNDING_UNITS = 4  # units of the last digit by which rounding may lift a corner over the plane of a compact face
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance(Frozen):
-    """Colours of a mesh as a texture.
-
-    Attributes:
-        texture_png: The file.
-        points: Distinct uv coordinates, v upwards. Shape (k, 2).
-        corners: Indices of them at each face's corners. Shape (m, 3).
-    """
+    """Colours of a mesh as a texture: distinct uv coordinates, v upwards, and their indices at each face's corners."""
 
     texture_png: bytes
     points: Float64[np.ndarray, "k 2"]
@@ -89,19 +82,14 @@ def prepare_hulls(hulls: tuple[TriangleMesh, ...], scale: float) -> tuple[Triang
     Raises:
         GeometryError: if nothing is left, or a piece has more vertices than MuJoCo's fast path takes.
     """
-    kept = []
-    for hull in hulls:
-        piece = _make_thick_piece(scale_and_quantize(hull, scale)) if len(hull.vertices) >= 4 else None
-        if piece is None:
-            continue
-        if len(piece.vertices) > MAX_PIECE_VERTICES:
-            raise GeometryError(f"a convex piece has {len(piece.vertices)} vertices; at most {MAX_PIECE_VERTICES}")
-        kept.append(piece)
+    solid = (_make_thick_piece(scale_and_quantize(hull, scale)) for hull in hulls if len(hull.vertices) >= 4)
+    kept = tuple(piece for piece in solid if piece is not None)
+    if many := [len(piece.vertices) for piece in kept if len(piece.vertices) > MAX_PIECE_VERTICES]:
+        raise GeometryError(f"a convex piece has {many[0]} vertices; at most {MAX_PIECE_VERTICES}")
     if not kept:
-        raise GeometryError(
-            f"none of {len(hulls)} convex pieces is {MIN_PIECE_THICKNESS_M * 1e3:g} mm thick: too small or too flat"
-        )
-    return tuple(kept)
+        thick = f"{MIN_PIECE_THICKNESS_M * 1e3:g} mm thick"
+        raise GeometryError(f"none of {len(hulls)} convex pieces is {thick}: too small or too flat")
+    return kept
 
 
 def _make_thick_piece(piece: TriangleMesh) -> TriangleMesh | None:

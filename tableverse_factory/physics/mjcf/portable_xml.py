@@ -16,18 +16,13 @@ def make_portable_xml(xml: str, bodies: Mapping[str, tuple[Pose, MassProperties]
     its compiler's rounding noise as the pose of every mesh geom, whose frame is the body's own. The colour space of a
     texture is always `auto`, which MuJoCo 3.3 does not know; several contacts per pair of pieces, which stable rest
     needs, are the default of MuJoCo 4 alone.
-
-    Args:
-        xml: As MuJoCo wrote it.
-        bodies: Pose and mass properties of each body by its name.
     """
     root = ET.fromstring(xml)  # noqa: S314 - written by MuJoCo a moment ago
     find_or_add_child(find_or_add_child(root, "option"), "flag").set("multiccd", "enable")
     for texture in root.iter("texture"):
         texture.attrib.pop("colorspace", None)
     for element in root.iter("body"):
-        name = element.get("name", "")
-        if name in bodies:
+        if (name := element.get("name", "")) in bodies:
             _write_body(element, *bodies[name])
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"

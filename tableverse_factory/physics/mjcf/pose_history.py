@@ -8,13 +8,7 @@ from schemas.geometry import Pose
 
 @dataclass(frozen=True, slots=True)
 class PoseHistory:
-    """Facts about the objects of an exported scene that its XML does not hold, by object id.
-
-    Attributes:
-        placed: Poses from the picture or the layout file; copies of a content have none.
-        rectified: Poses after rectification, before settling.
-        contained_in: Container of each object that was placed in one.
-    """
+    """Poses as placed (copies have none) and as rectified, before settling, and containers, by object id."""
 
     placed: Mapping[str, Pose] = field(default_factory=dict)
     rectified: Mapping[str, Pose] = field(default_factory=dict)

@@ -24,21 +24,14 @@ from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
 
 MAX_PIECES = 1000
 _POSITION, _QUATERNION = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
-_TEXTURE_AND_NORMALS = re.compile(rb"^v[tn] [^\n]*\n|/[0-9]*", re.MULTILINE)
-"""Texture and normal data of an OBJ: without it, it is read in a tenth of the time."""
+_TEXTURE_AND_NORMALS = re.compile(rb"^v[tn] [^\n]*\n|/[0-9]*", re.MULTILINE)  # without, it is read ten times as fast
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneObject(Frozen):
-    """One object of an exported scene.
+    """One object of an exported scene: its mesh, without colours, and pieces in its own frame [m].
 
-    Attributes:
-        mesh: In its own frame, without colours [m].
-        hulls: Its convex pieces in the same frame, for collision.
-        pose: Its own frame in the table frame.
-        mass_kg: As exported.
-        standing: The mesh in the table frame.
-        body: Its features.
+    `standing` is the mesh in the table frame, and `body` the features of that.
     """
 
     object_id: str
@@ -51,11 +44,7 @@ class SceneObject(Frozen):
 
 
 def load_scene_objects(files: Mapping[str, bytes], object_rows: Iterable[Mapping[str, Any]]) -> dict[str, SceneObject]:
-    """Load the objects of a scene by id, in the order of the rows.
-
-    Args:
-        files: The scene's files by name.
-        object_rows: Its rows of objects/.
+    """Load the objects of a scene by id, in the order of its rows of objects/.
 
     Raises:
         InputError: `bad_scene` if a row names no file, or its pose or mass is no number.
@@ -65,11 +54,7 @@ def load_scene_objects(files: Mapping[str, bytes], object_rows: Iterable[Mapping
 
 
 def read_slab(files: Mapping[str, bytes]) -> Slab:
-    """Read the table-top of `scene.xml`: its rectangle on z = 0.
-
-    Raises:
-        InputError: `bad_mjcf` if there is no scene.xml with a table box, or it names unknown files.
-    """
+    """Read the table-top of `scene.xml`: its rectangle on z = 0; InputError `bad_mjcf` without one."""
     check_references(files.get("scene.xml", b""), files.keys())
     try:
         spec = mujoco.MjSpec.from_string(files["scene.xml"].decode())
@@ -85,12 +70,7 @@ def read_slab(files: Mapping[str, bytes]) -> Slab:
 
 
 def load_mesh(files: Mapping[str, bytes], object_id: str) -> TriangleMesh:
-    """Load the mesh of one object in its own frame, without colours.
-
-    Raises:
-        InputError: `bad_scene` if there is no such object.
-        GeometryError: if it does not decode.
-    """
+    """Load the mesh of one object in its own frame, without colours; InputError `bad_scene` if there is none."""
     return _read_asset_mesh(files, f"{ASSETS}/{make_file_stem(object_id)}.obj")
 
 
@@ -113,9 +93,7 @@ def _load_object(files: Mapping[str, bytes], row: Mapping[str, Any]) -> SceneObj
     if not np.isfinite(numbers).all() or not 0 < count <= MAX_PIECES:
         raise InputError(f"{object_id}: its row holds what is no pose, mass or number of pieces", "bad_scene")
     pieces = tuple(_read_asset_mesh(files, f"{ASSETS}/{stem}_piece_{index:02d}.obj") for index in range(count))
-    return make_scene_object(
-        object_id, _read_asset_mesh(files, f"{ASSETS}/{stem}.obj"), pieces, pose, float(numbers[7])
-    )
+    return make_scene_object(object_id, load_mesh(files, object_id), pieces, pose, float(numbers[7]))
 
 
 def _read_asset_mesh(files: Mapping[str, bytes], name: str) -> TriangleMesh:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import mujoco
 import numpy as np
@@ -14,12 +15,9 @@ Rgb = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenery(Frozen):
-    """Meshes in the table frame; the last part is the table.
+    """Meshes as they stand in the table frame [m]; the last part is the table, which has no name.
 
-    Attributes:
-        names: Object id of each part but the last.
-        parts: Meshes as they stand [m], in their own colours where they have some.
-        colors: sRGB of each part that has no texture of its own.
+    `colors` holds the sRGB of each part that has no texture of its own.
     """
 
     names: tuple[str, ...]
@@ -37,56 +35,41 @@ def make_scenery(names: Sequence[str], meshes: Sequence[TriangleMesh], slab: Sla
 
 
 def load_scenery(model: mujoco.MjModel, table: str = "table", visual_group: int = 2) -> Scenery:
-    """Load the visual meshes and the table's box of a model in its initial state.
-
-    Args:
-        model: Compiled.
-        table: Name of the table's body.
-        visual_group: Group of the geoms that are drawn.
-    """
+    """Load the visual meshes and the table's box of a model in its initial state."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     names: list[str] = []
-    parts: list[TriangleMesh] = []
-    colors: list[Rgb | None] = []
+    placed: list[tuple[TriangleMesh, Rgb | None]] = []
     boards: list[tuple[TriangleMesh, Rgb | None]] = []
     for geom in range(model.ngeom):
         body = model.body(int(model.geom_bodyid[geom])).name
         kind = int(model.geom_type[geom])
         if kind == mujoco.mjtGeom.mjGEOM_BOX and body == table:
-            board = _place_geom(make_geom_box(model, geom), data, geom)
-            boards.append((board, None if board.texture is not None else read_geom_color(model, geom)))
+            boards.append(_place_geom(make_geom_box(model, geom), model, data, geom))
         elif kind == mujoco.mjtGeom.mjGEOM_MESH and int(model.geom_group[geom]) == visual_group:
-            mesh = read_geom_mesh(model, geom)
             names.append(body)
-            parts.append(_place_geom(mesh, data, geom))
-            colors.append(None if mesh.texture is not None else read_geom_color(model, geom))
-    for board, color in boards[:1]:
-        parts.append(board)
-        colors.append(color)
-    return Scenery(tuple(names), tuple(parts), tuple(colors))
+            placed.append(_place_geom(read_geom_mesh(model, geom), model, data, geom))
+    placed += boards[:1]
+    return Scenery(tuple(names), tuple(mesh for mesh, _ in placed), tuple(color for _, color in placed))
 
 
 def make_box_mesh(half_size: np.ndarray) -> TriangleMesh:
     """Make an axis-aligned box around the origin [m]; its faces share no vertices, so that edges stay sharp."""
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
-    for axis in range(3):
+    vertices, faces = np.zeros((6, 4, 3)), np.zeros((6, 2, 3), dtype=np.int32)
+    for side, (axis, sign) in enumerate(product(range(3), (-1.0, 1.0))):
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        for sign in (-1.0, 1.0):
-            corners = np.zeros((4, 3))
-            corners[:, axis] = sign
-            corners[:, u], corners[:, v] = (-1, 1, 1, -1), (-1, -1, 1, 1)
-            first = 4 * len(vertices)
-            vertices.append(corners * half_size)
-            quad = [[0, 1, 2], [0, 2, 3]] if sign > 0 else [[0, 2, 1], [0, 3, 2]]
-            faces.append(np.array(quad, dtype=np.int32) + first)
-    return TriangleMesh(np.concatenate(vertices), np.concatenate(faces))
+        vertices[side, :, axis], vertices[side, :, u], vertices[side, :, v] = sign, (-1, 1, 1, -1), (-1, -1, 1, 1)
+        faces[side] = 4 * side + np.array([[0, 1, 2], [0, 2, 3]] if sign > 0 else [[0, 2, 1], [0, 3, 2]])
+    return TriangleMesh(vertices.reshape(-1, 3) * half_size, faces.reshape(-1, 3))
 
 
-def _place_geom(mesh: TriangleMesh, data: mujoco.MjData, geom: int) -> TriangleMesh:
+def _place_geom(
+    mesh: TriangleMesh, model: mujoco.MjModel, data: mujoco.MjData, geom: int
+) -> tuple[TriangleMesh, Rgb | None]:
+    """Place a geom's mesh, and read its colour where it has no texture."""
     rotation = data.geom_xmat[geom].reshape(3, 3)
-    return replace(mesh, vertices=mesh.vertices @ rotation.T + data.geom_xpos[geom])
+    placed = replace(mesh, vertices=mesh.vertices @ rotation.T + data.geom_xpos[geom])
+    return placed, None if mesh.texture is not None else read_geom_color(model, geom)
 
 
 def make_geom_box(model: mujoco.MjModel, geom: int) -> TriangleMesh:

@@ -12,13 +12,7 @@ REMEMBERED_BYTES = 64 * 1024 * 1024  # the objects of many scenes: stages in one
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyShape(Frozen):
-    """Mesh and convex pieces in metres, in the mesh's own frame.
-
-    Attributes:
-        mesh: Scaled and rounded as its file is written.
-        hulls: Convex pieces, likewise, without those too thin to simulate.
-        moments: Of the volume that the object's mass is spread over.
-    """
+    """Mesh and convex pieces [m], in the mesh's own frame, rounded as written; no piece is too thin to simulate."""
 
     mesh: TriangleMesh
     hulls: tuple[TriangleMesh, ...]
@@ -26,11 +20,7 @@ class BodyShape(Frozen):
 
 
 def make_body_shape(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], scale: float) -> BodyShape:
-    """Make the shape of a mesh and its pieces at `scale`.
-
-    Raises:
-        GeometryError: if no piece is thick enough to simulate.
-    """
+    """Make the shape of a mesh and its pieces at `scale`; GeometryError if no piece is thick enough to simulate."""
     pieces, moments = _make_collision_shape(replace(mesh, vertex_colors=None, texture=None), hulls, scale)
     return BodyShape(scale_and_quantize(mesh, scale), pieces, moments)
 

@@ -17,14 +17,7 @@ OBJECT_MARGIN_M = 0.10  # the slab reaches this far beyond every object, as a pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slab(Frozen):
-    """A rectangle on z = 0 in the table frame, the top of a board.
-
-    Attributes:
-        center_xy: Its middle [m].
-        half_size_xy: Half extents along its own axes [m].
-        yaw: Rotation of its own axes about z [rad].
-        color: sRGB.
-    """
+    """A rectangle on z = 0 in the table frame [m], the top of a board, its own axes turned about z by `yaw` [rad]."""
 
     center_xy: Float64[np.ndarray, "2"]
     half_size_xy: Float64[np.ndarray, "2"]

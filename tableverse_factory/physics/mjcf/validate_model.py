@@ -9,17 +9,13 @@ import numpy as np
 
 from tableverse_factory.core.errors import InputError
 
+# Shorter steps take hours for the certificate; longer ones leave fewer than two between its nudges [s].
 MIN_STEP_S, MAX_STEP_S = 1e-5, 0.05
-"""Shorter steps take hours for the certificate; longer ones leave fewer than two between its nudges [s]."""
 
 
 @contextmanager
 def raise_on_nan() -> Iterator[None]:
-    """Refuse a NaN in a model that is loaded inside, which MuJoCo replaces by a default with a warning.
-
-    Raises:
-        InputError: `bad_mjcf`.
-    """
+    """Refuse a NaN in a model that is loaded inside, which MuJoCo replaces by a default with a warning."""
     messages: list[str] = []  # MuJoCo would write its warnings into a log file in the current folder
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(messages.append)
@@ -32,11 +28,7 @@ def raise_on_nan() -> Iterator[None]:
 
 
 def check_finite(model: mujoco.MjModel) -> None:
-    """Check that all numbers of a model are finite: MuJoCo accepts NaN and infinity in most places.
-
-    Raises:
-        InputError: `bad_mjcf`, naming an array with another number.
-    """
+    """Check that all numbers of a model are finite: MuJoCo accepts NaN and infinity in most places."""
     found = []
     for place, holder in (("", model), ("option.", model.opt)):
         for name in (name for name in dir(holder) if not name.startswith("_")):
@@ -49,13 +41,7 @@ def check_finite(model: mujoco.MjModel) -> None:
 
 
 def check_time_step(model: mujoco.MjModel) -> None:
-    """Check that the time step suits the certificate.
-
-    Raises:
-        InputError: `bad_mjcf`.
-    """
-    step = float(model.opt.timestep)
+    """Check that the time step suits the certificate."""
+    step, allowed = float(model.opt.timestep), f"{MIN_STEP_S:g} to {MAX_STEP_S:g} s"
     if not MIN_STEP_S <= step <= MAX_STEP_S:
-        raise InputError(
-            f"the timestep is {step:g} s; drift is measured with {MIN_STEP_S:g} to {MAX_STEP_S:g} s", "bad_mjcf"
-        )
+        raise InputError(f"the timestep is {step:g} s; drift is measured with {allowed}", "bad_mjcf")

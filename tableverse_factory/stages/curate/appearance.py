@@ -5,7 +5,7 @@ from skimage.color import rgb2lab
 
 from schemas.geometry import TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.mesh.height_maps import measure_inscribed_width
 from tableverse_factory.geometry.mesh.hulls import cross_rows
 from tableverse_factory.geometry.relations.relations import BodyFeatures
@@ -15,16 +15,11 @@ _DARK = 0.16
 _PALE = 0.18
 _DULL = 0.1
 _LIGHT = 80.0
-_TINT = 20.0
-"""Lightness and chroma in CIELAB: a light surface with less chroma is white in tinted light."""
+_TINT = 20.0  # lightness and chroma in CIELAB: a light surface with less chroma is white in tinted light
+# Upper end of each hue [degrees]; red wraps around.
 _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
-"""Upper end of each hue [degrees]; red wraps around."""
-
 _LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}
-
-_DIGITS = np.array([65_536, 256, 1])
-"""Weights that pack an sRGB colour into one number."""
-
+_DIGITS = np.array([65_536, 256, 1])  # weights that pack an sRGB colour into one number
 _ELONGATED = 3.5
 _FLAT = 0.15
 _BASE_M = 0.001
@@ -59,9 +54,8 @@ def _classify_colors(rgb: np.ndarray) -> np.ndarray:
     r, g, b = rgb.T
     safe = np.maximum(spread, 1e-9)
     hue = np.select([value == r, value == g], [(g - b) / safe % 6, (b - r) / safe + 2], (r - g) / safe + 4) * 60
-    edges = np.array([edge for edge, _ in _HUES])
     of_hue = np.array([COLORS.index(name) for _, name in _HUES] + [COLORS.index("red")])
-    names = of_hue[np.searchsorted(edges, hue)]
+    names = of_hue[np.searchsorted([edge for edge, _ in _HUES], hue)]
     brownish = (hue >= 10) & (hue < 45) & ((value < 0.6) | ((saturation < 0.5) & (value < 0.75)))
     names = np.where(brownish, COLORS.index("brown"), names)
     names = np.where((names == COLORS.index("red")) & (saturation < 0.45) & (value > 0.8), COLORS.index("pink"), names)

@@ -7,20 +7,14 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 
 from schemas.config import CurateConfig
-from schemas.curation import (
-    HINGE_CATEGORIES,
-    Assessment,
-    JudgeAnswer,
-    JudgeRemark,
-    ObjectAssessment,
-    Relabelling,
-)
+from schemas.curation import HINGE_CATEGORIES, Assessment, JudgeAnswer, JudgeRemark, ObjectAssessment, Relabelling
 from schemas.identity import clean_label
 from tableverse_factory.physics.bodies.materials import compute_mass_bounds_kg
 from tableverse_factory.stages.curate.interfaces import Judgement
-from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
+from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.labels import estimate_label_confidence, estimate_physical_properties
 from tableverse_factory.stages.curate.phrases import name_objects
 from tableverse_factory.stages.curate.score import UNUSABLE_CAP, WEIGHTS, weigh_criteria
@@ -29,10 +23,8 @@ from tableverse_factory.stages.curate.task_checks import check_tasks
 MAX_PHRASES = 20
 MAX_REMARKS = 100
 _PARTS = ("label_confidence", "physical_properties", "object_relabeling")
-_OFF_CRITERIA = 2.0
-"""Difference between the final score and the weighted criteria that is worth a remark [points]."""
-
-_INDEX = re.compile(r"\s*[_#]\s*\d+$")
+_OFF_CRITERIA = 2.0  # difference between the final score and the weighted criteria that is worth a remark [points]
+_INDEX = re.compile(r"\s*[_#]\s*\d+$")  # of a renderer
 
 
 def assess_answer(judgement: Judgement, case: JudgeInput, config: CurateConfig) -> Assessment:
@@ -59,39 +51,39 @@ def assess_answer(judgement: Judgement, case: JudgeInput, config: CurateConfig) 
 
 def _assess_objects(answer: JudgeAnswer, case: JudgeInput) -> tuple[ObjectAssessment, ...]:
     """Assess each object of the scene, in order; what the answer lacks comes from the rules and is marked."""
-    sure = tuple(
-        answer.label_confidence.get(str(i), estimate_label_confidence(item)) for i, item in enumerate(case.items)
-    )
-    complete = all(str(i) in answer.object_relabeling for i in range(len(case.items)))
+    given, confidence = answer.object_relabeling, answer.label_confidence
+    sure = tuple(confidence.get(str(i), estimate_label_confidence(item)) for i, item in enumerate(case.items))
+    complete = all(str(i) in given for i in range(len(case.items)))
     ruled = () if complete else name_objects(case, sure)
-    names = [answer.object_relabeling.get(str(i)) or ruled[i] for i in range(len(case.items))]
+    names = [given.get(str(i)) or ruled[i] for i in range(len(case.items))]
     phrases = Counter(phrase.casefold() for name in names for phrase in set(name.distinguishing_phrases))
     shared = {phrase for phrase, count in phrases.items() if count > 1}
-    return tuple(
-        _assess_object(answer, case, index, sure[index], _clean_name(name, shared)) for index, name in enumerate(names)
-    )
+    return tuple(_assess_object(answer, case, index, sure[index], name, shared) for index, name in enumerate(names))
 
 
 def _assess_object(
-    answer: JudgeAnswer, case: JudgeInput, index: int, sure: float, name: Relabelling
+    answer: JudgeAnswer, case: JudgeInput, index: int, sure: float, name: Relabelling, shared: set[str]
 ) -> ObjectAssessment:
+    """Assess one object; `shared` phrases are said of several objects."""
     key, item = str(index), case.items[index]
     errors = answer.severe_label_error
     wrong = errors.has_severe_label_error and index in errors.evidence_ids
     answered = answer.physical_properties.get(key)
     physical = answered or estimate_physical_properties(item)
-    mass, clipped = _clip_mass(physical.mass_kg, item)
+    low, high = compute_mass_bounds_kg(item.volume_m3, item.size)
+    mass = min(max(physical.mass_kg, low), high) if math.isfinite(physical.mass_kg) else low
     hinge = physical.hinge_category if physical.hinge_category in HINGE_CATEGORIES else None
+    own = dict.fromkeys(phrase for phrase in name.distinguishing_phrases if phrase.casefold() not in shared)
     return ObjectAssessment(
         object_id=item.object_id,
-        relabel_name=name.relabel_name,
-        distinguishing_phrases=name.distinguishing_phrases[:MAX_PHRASES],
+        relabel_name=clean_label(_INDEX.sub("", name.relabel_name)),
+        distinguishing_phrases=tuple(own)[:MAX_PHRASES],
         label_confidence=sure,
         label_error=wrong,
         corrected_label=errors.correct_labels.get(key, "") if wrong else "",
         mass_kg=mass,
         answered_mass_kg=None if answered is None else answered.mass_kg,
-        mass_clipped=clipped,
+        mass_clipped=mass != physical.mass_kg,
         has_hinge=physical.has_hinge,
         hinge_category=hinge if physical.has_hinge else None,
         graspable=case.feasibility.is_graspable(index, mass),
@@ -99,20 +91,6 @@ def _assess_object(
         non_tabletop=index in answer.usability.evidence_ids.get("NON_TABLETOP_OBJECT", ()),
         from_rules=tuple(part for part in _PARTS if key not in getattr(answer, part)),
     )
-
-
-def _clip_mass(mass_kg: float, item: JudgedObject) -> tuple[float, bool]:
-    """Clip the mass to what the volume allows; also tell whether that changed it."""
-    low, high = compute_mass_bounds_kg(item.volume_m3, item.size)
-    possible = min(max(mass_kg, low), high) if math.isfinite(mass_kg) else low
-    return possible, possible != mass_kg
-
-
-def _clean_name(name: Relabelling, shared: set[str]) -> Relabelling:
-    """Remove a renderer's index from the name, and phrases that are repeated or said of several objects."""
-    own = dict.fromkeys(phrase for phrase in name.distinguishing_phrases if phrase.casefold() not in shared)
-    plain = clean_label(_INDEX.sub("", name.relabel_name))
-    return Relabelling(relabel_name=plain, distinguishing_phrases=tuple(own))
 
 
 def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
@@ -126,9 +104,8 @@ def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
     if not usable and answer.final_score > UNUSABLE_CAP:
         yield JudgeRemark(code="score_capped", detail=f"{answer.final_score} for an unusable scene")
     elif usable and abs(answer.final_score - weighted) > _OFF_CRITERIA:
-        yield JudgeRemark(
-            code="score_off_criteria", detail=f"{answer.final_score}, but its criteria give {weighted:.1f}"
-        )
+        detail = f"{answer.final_score}, but its criteria give {weighted:.1f}"
+        yield JudgeRemark(code="score_off_criteria", detail=detail)
 
 
 def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemark]:
@@ -150,17 +127,16 @@ def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemar
 def _remark_on_objects(answer: JudgeAnswer, objects: tuple[ObjectAssessment, ...]) -> Iterator[JudgeRemark]:
     """Remark on what was filled, clipped or left out, object by object."""
     for index, verdict in enumerate(objects):
-        name = answer.object_relabeling.get(str(index))
-        yield from (
-            JudgeRemark(code="filled_from_rules", object_id=verdict.object_id, detail=p) for p in verdict.from_rules
-        )
+        remark = partial(JudgeRemark, object_id=verdict.object_id)
+        yield from (remark(code="filled_from_rules", detail=part) for part in verdict.from_rules)
         if verdict.mass_clipped and verdict.answered_mass_kg is not None:
-            text = f"{verdict.answered_mass_kg:.4g} kg became {verdict.mass_kg:.4g} kg"
-            yield JudgeRemark(code="mass_clipped", object_id=verdict.object_id, detail=text)
+            detail = f"{verdict.answered_mass_kg:.4g} kg became {verdict.mass_kg:.4g} kg"
+            yield remark(code="mass_clipped", detail=detail)
         physical = answer.physical_properties.get(str(index))
         if physical and physical.has_hinge and physical.hinge_category not in (*HINGE_CATEGORIES, None):
-            yield JudgeRemark(code="unknown_hinge", object_id=verdict.object_id)
+            yield remark(code="unknown_hinge")
+        name = answer.object_relabeling.get(str(index))
         if name is not None and name.relabel_name != verdict.relabel_name:
-            yield JudgeRemark(code="index_in_name", object_id=verdict.object_id, detail=name.relabel_name)
+            yield remark(code="index_in_name", detail=name.relabel_name)
         if name is not None and len(set(name.distinguishing_phrases)) > len(verdict.distinguishing_phrases):
-            yield JudgeRemark(code="phrase_of_several", object_id=verdict.object_id)
+            yield remark(code="phrase_of_several")

@@ -27,10 +27,6 @@ def curate(
 
     Drops: `judge_answer_missing` (nothing was recorded), `judge_answer_invalid` (no usable answer, also after a round
     of repair), `judge_answer_refused` (the model refuses to judge this picture).
-
-    Raises:
-        ModelAccessError: if a model's key or credit is refused.
-        ModelError: if a model does not answer.
     """
     case = build_judge_input(scene, config.curate)
     judge = config.curate.judge
@@ -50,7 +46,7 @@ def compare_verdicts(verdict: Assessment, rules: Assessment) -> Agreement:
     pairs = list(zip(verdict.objects, rules.objects, strict=True))
     same = [may_share_noun(find_head_noun(a.relabel_name), find_head_noun(b.relabel_name)) for a, b in pairs]
     ratios = [a.mass_kg / b.mass_kg for a, b in pairs if a.answered_mass_kg is not None]
-    tasks, rules_tasks = _list_accepted(verdict), _list_accepted(rules)
+    tasks, rules_tasks = ({(t.x_id, t.relation, t.y_id) for t in v.tasks if t.accepted} for v in (verdict, rules))
     return Agreement(
         rules_usable=rules.usable,
         rules_score=rules.quality_score,
@@ -59,7 +55,3 @@ def compare_verdicts(verdict: Assessment, rules: Assessment) -> Agreement:
         rules_tasks=len(rules_tasks),
         shared_tasks=len(tasks & rules_tasks),
     )
-
-
-def _list_accepted(verdict: Assessment) -> set[tuple[str, str, str]]:
-    return {(task.x_id, task.relation, task.y_id) for task in verdict.tasks if task.accepted}

@@ -20,22 +20,13 @@ from tableverse_factory.geometry.relations.relations import (
 from tableverse_factory.geometry.relations.stable_placement import SupportSurface, find_placement
 from tableverse_factory.geometry.relations.stand_upright import stand_upright
 
-MIN_GRIP_SHARE = 0.01
-"""Share of surface points with an antipodal partner below which an object is not graspable."""
-
+MIN_GRIP_SHARE = 0.01  # share of surface points with an antipodal partner below which an object is not graspable
 MIN_FREE_GRIPS = 2
 _SAME = {Relation.INTO: Relation.IN, Relation.INSIDE: Relation.IN}
 
 
 class Feasibility:
-    """Tests of tasks in one scene, with a cache of what they measure.
-
-    Args:
-        meshes: Settled mesh of each object, table frame [m].
-        grips: Antipodal grips of each object.
-        scene: The objects on their table.
-        max_mass_kg: Payload of the gripper.
-    """
+    """Tests of tasks in one scene, with a cache of what they measure; meshes are settled, in the table frame [m]."""
 
     def __init__(
         self, meshes: tuple[TriangleMesh, ...], grips: tuple[Grips, ...], scene: SupportSurface, max_mass_kg: float
@@ -82,10 +73,9 @@ class Feasibility:
     def _find_pick_obstacle(self, x: int) -> str:
         if self._grips[x].share < MIN_GRIP_SHARE:
             return "not_graspable"
-        body_x = self._scene.bodies[x]
-        for other, body in enumerate(self._scene.bodies):
-            if other != x and (rests_on(body, body_x) or is_inside(body, body_x)):
-                return "carries_others"
+        body_x, others = self._scene.bodies[x], (b for i, b in enumerate(self._scene.bodies) if i != x)
+        if any(rests_on(body, body_x) or is_inside(body, body_x) for body in others):
+            return "carries_others"
         return "" if self._count_free_grips(x) >= MIN_FREE_GRIPS else "out_of_reach"
 
     def _count_free_grips(self, x: int) -> int:
@@ -102,8 +92,6 @@ class Feasibility:
         """Turn the object by a quarter about the vertical, and stand it on its end where it is long."""
         if x not in self._turned:
             on_end = stand_upright(self._meshes[x])
-            turned: tuple[BodyFeatures, ...] = (rotate_body_quarter_turn(self._scene.bodies[x]),)
-            if on_end is not None:
-                turned += (compute_body_features(on_end, cell=self._scene.cell),)
-            self._turned[x] = turned
+            standing = () if on_end is None else (compute_body_features(on_end, cell=self._scene.cell),)
+            self._turned[x] = (rotate_body_quarter_turn(self._scene.bodies[x]), *standing)
         return self._turned[x]

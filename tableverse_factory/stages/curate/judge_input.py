@@ -20,8 +20,7 @@ from tableverse_factory.physics.mjcf.slab import fit_slab
 from tableverse_factory.stages.curate.appearance import measure_color_shares
 from tableverse_factory.stages.curate.feasibility import Feasibility
 
-_MAX_CELLS = 400
-"""Most cells along the longer side of the layout: huge layouts get coarser maps."""
+_MAX_CELLS = 400  # most cells along the longer side of the layout: huge layouts get coarser maps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,8 +29,6 @@ class JudgedObject(Frozen):
 
     Attributes:
         mesh: Settled mesh, table frame [m].
-        body: Features of that mesh.
-        grips: Antipodal grips on its mesh and its convex pieces.
         size: Extents of the scaled mesh along its own axes [m].
         volume_m3: Volume of the scaled mesh, or of its pieces where it is open [m³].
         fit_residual_m: Median distance from the observed points to the mesh [m].
@@ -54,13 +51,7 @@ class JudgedObject(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgeInput:
-    """One scene to judge.
-
-    Attributes:
-        table: The table as exported, wide enough for every object.
-        feasibility: Tests what can be picked up and placed where.
-        penetration_before_m: Deepest pair penetration of the placed layout on the pieces [m].
-    """
+    """One scene to judge, its table as exported; `penetration_before_m` is the deepest of the placed pieces [m]."""
 
     scene_id: str
     items: tuple[JudgedObject, ...]
@@ -92,13 +83,9 @@ def build_judge_input(scene: SettledScene, config: CurateConfig) -> JudgeInput:
 
 
 def _measure_object(
-    item: PlacedObject,
-    mesh: TriangleMesh,
-    hulls: tuple[TriangleMesh, ...],
-    pose: Pose,
-    cell: float,
-    gripper_width: float,
+    item: PlacedObject, mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...], pose: Pose, cell: float, width: float
 ) -> JudgedObject:
+    """Measure an object with its settled mesh and pose, for a gripper's opening `width` [m]."""
     low, high = aabb(item.mesh.vertices)
     before = None if item.copy_of else box_center(place_mesh(item.mesh, item.pose, item.scale))
     caster = make_raycasting_scene(mesh)
@@ -109,7 +96,7 @@ def _measure_object(
         confidence=item.label_confidence,
         mesh=mesh,
         body=compute_body_features(mesh, caster, cell),
-        grips=filter_grips(find_antipodal_grips(mesh, caster, gripper_width), pieces_caster, gripper_width),
+        grips=filter_grips(find_antipodal_grips(mesh, caster, width), pieces_caster, width),
         size=np.asarray((high - low) * item.scale),
         volume_m3=make_body_shape(item.mesh, hulls, item.scale).moments.volume_m3,
         fit_residual_m=item.fit_residual_m,

@@ -6,9 +6,7 @@ from tableverse_factory.stages.curate.appearance import name_shape
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import find_hinge_category, is_generic, look_up_size_range
 
-SEVERE_FACTOR = 2.5
-"""A label is an error where the size is outside the lexicon's range by more than this factor: the paper asks for a
-high bar."""
+SEVERE_FACTOR = 2.5  # sizes further outside the lexicon's range are label errors: the paper asks for a high bar
 GENERIC_CONFIDENCE = 0.3
 
 
@@ -32,8 +30,7 @@ def estimate_label_confidence(item: JudgedObject) -> float:
 
 def _compute_size_error(item: JudgedObject) -> float:
     """Factor by which the object is too small or too large for its label; at most 1 where the size is possible."""
-    known = look_up_size_range(item.label)
-    if known is None:
+    if (known := look_up_size_range(item.label)) is None:
         return 1.0
     longest = max(float(item.size.max()), 1e-6)
     return max(known[0] / longest, longest / known[1])

@@ -7,7 +7,6 @@ import re
 from functools import lru_cache
 
 GENERIC = frozenset({"object", "thing", "item", "unknown"})
-
 COLORS = ("black", "white", "grey", "brown", "red", "orange", "yellow", "green", "blue", "purple", "pink")
 
 
@@ -15,6 +14,7 @@ def _split_values(**words: str) -> dict[str, frozenset[str]]:
     return {name: frozenset(value.split()) for name, value in words.items()}
 
 
+# Head nouns of each kind of table-top object.
 KINDS = _split_values(
     drinkware="mug cup glass tumbler wineglass goblet teacup",
     dish="plate saucer dish platter board coaster placemat",
@@ -33,8 +33,7 @@ KINDS = _split_values(
     device="phone remote camera mouse keyboard laptop tablet clock watch speaker charger calculator headphones",
     toy="toy ball puzzle block blocks lego doll figurine plush cube dice car",
 )
-"""Head nouns of each kind of table-top object."""
-
+# Kinds that people put into a container of a kind.
 CONTENTS = _split_values(
     drinkware="cutlery food office",
     bowl="food packaged cutlery toy drinkware bowl",
@@ -43,8 +42,7 @@ CONTENTS = _split_values(
     packaged="food cutlery office toy tool unknown",
     unknown="food packaged cutlery toiletry tool office device toy unknown",
 )
-"""Kinds that people put into a container of a kind."""
-
+# Kinds that people put on top of an object of a kind.
 CARRIES = _split_values(
     dish="food drinkware bowl cutlery packaged dish",
     storage="drinkware dish bowl cutlery food packaged toiletry tool office device toy unknown",
@@ -53,8 +51,7 @@ CARRIES = _split_values(
     toy="toy",
     unknown="drinkware dish bowl packaged toiletry tool office device toy unknown",
 )
-"""Kinds that people put on top of an object of a kind."""
-
+# Names that belong on no table, and words that turn such a name into that of a small object.
 _WORDS = _split_values(
     living_or_large="person man woman child boy girl baby people human face hand arm leg foot finger head body "
     "dog cat bird horse cow rabbit hamster fish turtle snake "
@@ -63,8 +60,7 @@ _WORDS = _split_values(
     miniature="toy figurine statue model miniature plush doll stuffed plastic lego picture photo sculpture "
     "ornament hot",
 )
-"""Names that belong on no table, and words that turn such a name into that of a small object."""
-
+# Head nouns, and the smallest and largest longest dimension of such an object [m].
 SIZES_M = (
     ("mug cup teacup tumbler", 0.05, 0.20),
     ("bowl ramekin", 0.05, 0.45),
@@ -84,8 +80,7 @@ SIZES_M = (
     ("mouse", 0.05, 0.20),
     ("coin key dice", 0.008, 0.12),
 )
-"""Head nouns, and the smallest and largest longest dimension of such an object [m]."""
-
+# Hinge categories and the names that have one, the first match deciding; all words of a name must occur.
 _HINGED = (
     ("TrashCan", "trash can, garbage can"),
     ("Box", "lunch box, tool box, jewelry box, pizza box"),
@@ -97,25 +92,12 @@ _HINGED = (
     ("Bottle", "shampoo, mustard, ketchup, lotion, detergent, sanitizer"),
     ("Box", "lunchbox, toolbox, briefcase, suitcase"),
 )
-"""Hinge categories and the names that have one, the first match deciding; all words of a name must occur."""
-
-_SYNONYMS = tuple(
-    frozenset(words.split())
-    for words in (
-        "mug cup teacup",
-        "can tin",
-        "box carton package packet",
-        "plate dish saucer platter",
-        "bowl ramekin basin",
-        "pan frypan skillet",
-        "marker pen",
-    )
+_SYNONYMS = (
+    *({"mug", "cup", "teacup"}, {"can", "tin"}, {"box", "carton", "package", "packet"}, {"bowl", "ramekin", "basin"}),
+    *({"plate", "dish", "saucer", "platter"}, {"pan", "frypan", "skillet"}, {"marker", "pen"}),
 )
-
 _TAIL = re.compile(r"\b(with|without|of|in|on|for|from|containing|and|labeled|labelled)\b.*")
-_KNOWN_LABELS = 512
-"""Cache size; a scene has few labels, looked up thousands of times."""
-
+_KNOWN_LABELS = 512  # cache size; a scene has few labels, looked up thousands of times
 _PLURAL = frozenset({"scissors", "pliers", "tongs", "glasses", "chips", "headphones", "shears", "glass", "chopsticks"})
 
 
@@ -126,11 +108,6 @@ def split_label(label: str) -> tuple[str, ...]:
     return words or ("object",)
 
 
-def simplify_label(label: str) -> str:
-    """Shorten the label to a name for people: words only, at most six of them."""
-    return " ".join(split_label(label)[:6])
-
-
 @lru_cache(_KNOWN_LABELS)
 def find_head_noun(label: str) -> str:
     """Find the noun that names the object, in the singular: the last word before `with`, `of` and the like.
@@ -138,8 +115,7 @@ def find_head_noun(label: str) -> str:
     `bottle of water` is a bottle; a label that starts with such a word keeps its last.
     """
     name = " ".join(split_label(label))
-    words = (_TAIL.sub("", name).split() or name.split())[-1:]
-    word = words[0]
+    word = (_TAIL.sub("", name).split() or name.split())[-1]
     known = word in _PLURAL or not word.endswith("s") or word.endswith("ss")
     return word if known or len(word) < 4 else word[:-1]
 

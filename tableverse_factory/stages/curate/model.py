@@ -28,13 +28,7 @@ class ModelJudge:
         self._client = ModelClient(read_endpoint(config), services)
 
     def judge(self, case: JudgeInput) -> Judgement:
-        """Ask the model about the scene.
-
-        Raises:
-            AnswerInvalidError: if the answer is unusable, also after a round of repair, or the model refuses.
-            ModelAccessError: if key, permission or credit is missing.
-            ModelError: if the server does not answer.
-        """
+        """Ask the model about the scene; raises as `ModelClient.ask`."""
         prompt = build_judge_prompt([item.label for item in case.items])
         schema = build_judge_schema(len(case.items))
         reply = self._client.ask_for(parse_judgement, prompt, [_encode_views(case)], schema)

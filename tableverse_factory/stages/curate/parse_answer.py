@@ -11,9 +11,7 @@ from tableverse_factory.models.remote.json_text import parse_json_object, valida
 
 MAX_TASKS = 500
 MAX_ENTRIES = 1000
-UNREADABLE_ID = -1
-"""Replaces an id that is no integer; never valid."""
-
+UNREADABLE_ID = -1  # replaces an id that is no integer; never valid
 _ID = re.compile(r"-?[0-9]{1,9}")
 
 
@@ -28,15 +26,14 @@ def parse_judgement(text: str) -> JudgeAnswer:
         AnswerInvalidError: if the text is too long, holds no JSON object, or lacks those three.
     """
     raw = parse_json_object(text)
+    tasks = raw.get("generated_tasks")
     cleaned = {
-        "usability": raw.get("usability"),
-        "per_criterion": raw.get("per_criterion"),
-        "final_score": raw.get("final_score"),
+        **{name: raw.get(name) for name in ("usability", "per_criterion", "final_score")},
         "severe_label_error": _read_label_errors(raw.get("severe_label_error")),
         "label_confidence": _read_confidences(raw.get("label_confidence")),
         "physical_properties": _keep_valid_entries(raw.get("physical_properties"), PhysicalProperties),
         "object_relabeling": _keep_valid_entries(raw.get("object_relabeling"), Relabelling),
-        "generated_tasks": _read_tasks(raw.get("generated_tasks")),
+        "generated_tasks": [_read_task(task) for task in (tasks[:MAX_TASKS] if isinstance(tasks, list) else [])],
     }
     return validate_answer(cleaned, JudgeAnswer)
 
@@ -75,12 +72,8 @@ def _read_confidences(value: Any) -> dict[str, float]:
     }
 
 
-def _read_tasks(value: Any) -> list[dict[str, Any]]:
-    tasks = value[:MAX_TASKS] if isinstance(value, list) else []
-    return [_read_task(task if isinstance(task, dict) else {}) for task in tasks]
-
-
-def _read_task(task: dict[str, Any]) -> dict[str, Any]:
+def _read_task(value: Any) -> dict[str, Any]:
+    task = value if isinstance(value, dict) else {}
     readable: dict[str, Any] = {
         "instruction": _read_text(task.get("instruction"))[:1000],
         "X_id": _read_integer(task.get("X_id")),

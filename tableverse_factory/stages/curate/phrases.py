@@ -14,23 +14,17 @@ from tableverse_factory.stages.curate.lexicon import (
     find_head_noun,
     is_generic,
     may_share_noun,
-    simplify_label,
     split_label,
 )
 
 MAX_PHRASES = 8
-OWN_COLOR = 0.55
-"""Least surface share of a colour for an object to be called by it."""
-
-FOREIGN_COLOR = 0.25
-"""Least surface share from which a colour might be said of an object, so that it no longer distinguishes another."""
-
+OWN_COLOR = 0.55  # least surface share of a colour for an object to be called by it
+FOREIGN_COLOR = 0.25  # least share from which a colour might be said of an object: it distinguishes no other then
 MARGIN_M = 0.02
 MARGIN_RATIO = 1.25
 _MIN_STEP_M = 0.01
 _TRUSTED = 0.5
-_ORDINALS = ("second", "third")
-"""Ordinals that people use at a table."""
+_ORDINALS = ("second", "third")  # ordinals that people use at a table
 
 
 def name_objects(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
@@ -66,15 +60,13 @@ class ObjectNamer:
     def _may_mean(self, name: str, j: int) -> bool:
         if not all(self._may_be(color, j) for color in find_color_words(name)):
             return False
-        head = find_head_noun(name)
         if is_generic(name):
             return True  # anything is an object, and a spoon is a long one
-        others = set(split_label(self.names[j]))
-        modifiers = set(split_label(name)) - {head} - set(COLORS) - {"gray"}
+        head, item = find_head_noun(name), self._items[j]
         if is_generic(self.names[j]):
-            item = self._items[j]
             return may_be_called(head, item.body, item.size, item.volume_m3)
-        return may_share_noun(head, find_head_noun(self.names[j])) and modifiers <= others
+        same = may_share_noun(head, find_head_noun(self.names[j]))
+        return same and _list_modifiers(name) <= set(split_label(self.names[j]))
 
     def _may_be(self, color: str, j: int) -> bool:
         item = self._items[j]
@@ -84,22 +76,15 @@ class ObjectNamer:
 
     def _is_called(self, noun: str, j: int) -> bool:
         """Whether the object clearly goes by this noun; everything on the table is an `object`."""
-        own, item = set(split_label(self.names[j])), self._items[j]
-        colors, head = find_color_words(noun), find_head_noun(noun)
-        same = head == find_head_noun(self.names[j]) or is_generic(noun)
-        others = set(split_label(noun)) - {head, "gray"} - set(COLORS)
-        return (
-            same
-            and others <= own
-            and all(c in find_color_words(self.names[j]) or c == find_main_color(item) for c in colors)
-        )
+        own, main = self.names[j], find_main_color(self._items[j])
+        same = find_head_noun(noun) == find_head_noun(own) or is_generic(noun)
+        colored = all(color in find_color_words(own) or color == main for color in find_color_words(noun))
+        return same and colored and _list_modifiers(noun) <= set(split_label(own))
 
     def _propose_phrases(self, index: int) -> Iterator[tuple[str, list[int]]]:
         """Propose phrases, each with all objects that it may mean."""
         yield from self._propose_simple(index)
-        name = self.names[index]
-        matching = self.matching(name)
-        yield from self._propose_relations(index, name, matching)
+        yield from self._propose_relations(index, self.names[index], self.matching(self.names[index]))
         for noun, group in self._list_nouns(index):
             if len(group) > 2 and all(self._is_called(noun, j) for j in group):
                 yield from self._propose_ordinals(index, noun, group)
@@ -139,9 +124,8 @@ class ObjectNamer:
                     continue
                 landmark = next((phrase for phrase, whom in self._propose_simple(other) if whom == [other]), None)
                 if landmark is not None:
-                    whom = [
-                        j for j in matching if j != other and relation_holds(relation, self._items[j].body, item.body)
-                    ]
+                    rivals = (j for j in matching if j != other)
+                    whom = [j for j in rivals if relation_holds(relation, self._items[j].body, item.body)]
                     yield f"the {name} {relation.value} {landmark}", whom
 
     def _propose_ordinals(self, index: int, name: str, matching: list[int]) -> Iterator[tuple[str, list[int]]]:
@@ -164,10 +148,14 @@ def find_main_color(item: JudgedObject) -> str | None:
 
 def _choose_name(item: JudgedObject, confidence: float) -> str:
     if not is_generic(item.label) and confidence >= _TRUSTED:
-        return simplify_label(item.label)
+        return " ".join(split_label(item.label)[:6])
     shape = name_shape(item.body, item.size, item.volume_m3)
     color = find_main_color(item)
     return f"{color} {shape}" if color else shape
+
+
+def _list_modifiers(name: str) -> set[str]:
+    return set(split_label(name)) - {find_head_noun(name), "gray"} - set(COLORS)
 
 
 def _compute_middle(item: JudgedObject) -> np.ndarray:

@@ -73,6 +73,7 @@ Answer with one JSON object of this shape, without code fences and without a wor
 as text:
 """
 
+# Repeated in the prompt: a server may neither enforce the schema nor show it to its model.
 SHAPE = """\
 {"usability": {"usable": boolean, "reason_codes": [string], "evidence_ids": {"NON_TABLETOP_OBJECT": [integer]}},
  "severe_label_error": {"has_severe_label_error": boolean, "evidence_ids": [integer],
@@ -87,12 +88,10 @@ SHAPE = """\
  "final_score": integer,
  "generated_tasks": [{"instruction": string, "X_id": integer, "X_name": string, "Y_id": integer, "Y_name": string,
                       "relation": string, "initial_relation_satisfied": false}]}"""
-"""Repeated in the prompt: a server may neither enforce the schema nor show it to its model."""
 
 _QUOTED = ", ".join(f'"{relation.value}"' for relation in Relation)
 RULES = _RULES.format(hinges=", ".join(HINGE_CATEGORIES), relations=_QUOTED) + SHAPE
-PROMPT_SHA256 = content_hash(RULES.encode())
-"""Identifies the version of the prompt in every answer's origin and in run.json."""
+PROMPT_SHA256 = content_hash(RULES.encode())  # the version of the prompt in every answer's origin and in run.json
 
 
 def build_judge_prompt(labels: Sequence[str]) -> str:
@@ -111,7 +110,6 @@ def build_judge_schema(n_objects: int) -> Schema:
         return object_of(dict.fromkeys(map(str, range(n_objects)), value))
 
     ids, score = list_of(INTEGER), {"score": INTEGER}
-    codes = enum_of("EXTREME_REGIONAL_PARTITION", "NON_TABLETOP_OBJECT")
     criteria = {
         "category_diversity": score,
         "geometric_plausibility": score | {"bad_geometry_ids": ids},
@@ -120,21 +118,14 @@ def build_judge_schema(n_objects: int) -> Schema:
     }
     usability = {
         "usable": BOOLEAN,
-        "reason_codes": list_of(codes),
+        "reason_codes": list_of(enum_of("EXTREME_REGIONAL_PARTITION", "NON_TABLETOP_OBJECT")),
         "evidence_ids": object_of({"NON_TABLETOP_OBJECT": ids}),
     }
     label_error = {"has_severe_label_error": BOOLEAN, "evidence_ids": ids, "correct_labels": each(nullable(STRING))}
-    hinge = nullable(enum_of(*HINGE_CATEGORIES))
+    hinge, relation = nullable(enum_of(*HINGE_CATEGORIES)), enum_of(*(relation.value for relation in Relation))
     physical = {"mass_kg": NUMBER, "has_hinge": BOOLEAN, "hinge_category": hinge}
-    task = {
-        "instruction": STRING,
-        "X_id": INTEGER,
-        "X_name": STRING,
-        "Y_id": INTEGER,
-        "Y_name": STRING,
-        "relation": enum_of(*(relation.value for relation in Relation)),
-        "initial_relation_satisfied": BOOLEAN,
-    }
+    ends = {"X_id": INTEGER, "X_name": STRING, "Y_id": INTEGER, "Y_name": STRING}
+    task = {"instruction": STRING, **ends, "relation": relation, "initial_relation_satisfied": BOOLEAN}
     return object_of(
         {
             "usability": object_of(usability),

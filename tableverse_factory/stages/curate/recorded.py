@@ -11,19 +11,14 @@ from tableverse_factory.stages.curate.prompt import PROMPT_SHA256
 
 
 def record_answers(config: Config, _before: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Hash the names and bytes of the answers that are replayed.
-
-    Raises:
-        ConfigError: if there are none.
-    """
+    """Hash the names and bytes of the answers that are replayed; ConfigError if there are none."""
     if config.curate.judge != "replay":
         return None
     folder = Path(config.curate.replay_dir)
-    if not folder.is_dir():
-        raise ConfigError(f"curate.replay_dir: {folder} is no folder; give the one with <scene_id>.json in it")
     files = sorted(path for path in folder.glob("*.json") if path.is_file())
     if not files:
-        raise ConfigError(f"curate.replay_dir: {folder} holds no answers; give the one with <scene_id>.json in it")
+        problem = "holds no answers" if folder.is_dir() else "is no folder"
+        raise ConfigError(f"curate.replay_dir: {folder} {problem}; give the one with <scene_id>.json in it")
     digests = (f"{path.name} {content_hash(path.read_bytes())}".encode() for path in files)
     return {"sha256": content_hash(*digests), "files": len(files)}
 

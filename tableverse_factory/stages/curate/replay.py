@@ -10,8 +10,7 @@ from tableverse_factory.stages.curate.interfaces import Judgement
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.parse_answer import parse_judgement
 
-_MAX_BYTES = 4 * MAX_ANSWER_CHARS
-"""Bound on the bytes read: a character of UTF-8 takes at most four."""
+_MAX_BYTES = 4 * MAX_ANSWER_CHARS  # bound on the bytes read: a character of UTF-8 takes at most four
 
 
 class ReplayJudge:
@@ -21,11 +20,7 @@ class ReplayJudge:
         self._folder = Path(config.replay_dir)
 
     def judge(self, case: JudgeInput) -> Judgement:
-        """Read the recorded answer.
-
-        Raises:
-            AnswerInvalidError: if there is none, it is too large, or it does not follow the paper's schema.
-        """
+        """Read the recorded answer; AnswerInvalidError if there is none or it does not follow the paper's schema."""
         path = self._folder / f"{case.scene_id}.json"
         try:
             with path.open("rb") as file:

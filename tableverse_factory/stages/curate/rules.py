@@ -30,6 +30,7 @@ class RulesJudge:
     def answer(self, case: JudgeInput) -> JudgeAnswer:
         """Give the seven outputs (paper appendix B)."""
         count = len(case.items)
+        ids = [str(index) for index in range(count)]
         usability = judge_usability(case)
         confidence = tuple(estimate_label_confidence(item) for item in case.items)
         physical = tuple(estimate_physical_properties(item) for item in case.items)
@@ -37,10 +38,7 @@ class RulesJudge:
         graspable = tuple(index for index in range(count) if case.feasibility.is_graspable(index, masses[index]))
         names = name_objects(case, confidence)
         plain = tuple(name.relabel_name for name in names)
-        partitioned = "EXTREME_REGIONAL_PARTITION" in usability.reason_codes
-        criteria = score_criteria(case, plain, graspable, partitioned)
-        phrases = tuple(name.distinguishing_phrases for name in names)
-        ids = [str(index) for index in range(count)]
+        criteria = score_criteria(case, plain, graspable, "EXTREME_REGIONAL_PARTITION" in usability.reason_codes)
         return JudgeAnswer(
             usability=usability,
             severe_label_error=find_label_errors(case),
@@ -49,5 +47,5 @@ class RulesJudge:
             per_criterion=criteria,
             object_relabeling=dict(zip(ids, names, strict=True)),
             final_score=compute_final_score(criteria, count, usability.usable),
-            generated_tasks=generate_tasks(case, plain, phrases, masses, self._config.max_tasks),
+            generated_tasks=generate_tasks(case, names, masses, self._config.max_tasks),
         )

@@ -4,15 +4,9 @@ from schemas.curation import CriterionScore, PerCriterion
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic
 
-WEIGHTS = {
-    "category_diversity": 0.45,
-    "geometric_plausibility": 0.15,
-    "graspability": 0.15,
-    "layout_clarity": 0.25,
-}
+WEIGHTS = {"category_diversity": 0.45, "geometric_plausibility": 0.15, "graspability": 0.15, "layout_clarity": 0.25}
 FEW_OBJECTS = 5
 UNUSABLE_CAP = 4
-
 _MANY_OBJECTS = 10
 _MANY_CATEGORIES = 8
 _BAD_FIT_M = 0.012
@@ -29,12 +23,11 @@ def score_criteria(
     bad = tuple(index for index, item in enumerate(case.items) if has_bad_geometry(item))
     count = max(len(case.items), 1)
     ungraspable = tuple(index for index in range(len(case.items)) if index not in graspable)
+    share = _to_points(len(graspable) / count)
     return PerCriterion(
         category_diversity=CriterionScore(score=_score_diversity(names)),
         geometric_plausibility=CriterionScore(score=_to_points(1 - 1.5 * len(bad) / count), bad_geometry_ids=bad),
-        graspability=CriterionScore(
-            score=_to_points(len(graspable) / count), graspable_ids=graspable, ungraspable_ids=ungraspable
-        ),
+        graspability=CriterionScore(score=share, graspable_ids=graspable, ungraspable_ids=ungraspable),
         layout_clarity=CriterionScore(score=_to_points(_measure_clarity(case, partitioned))),
     )
 

@@ -7,9 +7,7 @@ from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic, may_share_noun
 
 MAX_INSTRUCTION_CHARS = 300
-MAX_TASKS = 200
-"""Most tasks of one answer; further ones are refused as `too_many`."""
-
+MAX_TASKS = 200  # most tasks of one answer; further ones are refused as `too_many`
 _RELATIONS = {relation.value: relation for relation in Relation}
 _TABLES = frozenset({"table", "tabletop", "desk", "countertop", "worktop"})
 
@@ -17,25 +15,13 @@ _TABLES = frozenset({"table", "tabletop", "desk", "countertop", "worktop"})
 def check_tasks(
     answer: JudgeAnswer, case: JudgeInput, objects: tuple[ObjectAssessment, ...], source: str
 ) -> tuple[TaskAssessment, ...]:
-    """Check every task of the answer, in its order.
-
-    Args:
-        answer: The judge's answer.
-        case: The scene.
-        objects: Verdicts on its objects, in the scene's order.
-        source: Name of the judge, kept with each task.
-    """
+    """Check every task of the answer, in its order; `source` is the judge's name, kept with each."""
     seen: set[tuple[int, str, int]] = set()
     tasks = []
     for number, task in enumerate(answer.generated_tasks):
         triple = (task.x_id, task.relation, task.y_id)
-        refusal = (
-            "too_many"
-            if number >= MAX_TASKS
-            else "repeated"
-            if triple in seen
-            else _explain_refusal(task, case, objects)
-        )
+        early = "too_many" if number >= MAX_TASKS else "repeated" if triple in seen else ""
+        refusal = early or _explain_refusal(task, case, objects)
         seen.add(triple)
         tasks.append(
             TaskAssessment(

@@ -1,18 +1,14 @@
 """Part G by rules: pick-and-place tasks that meet every hard constraint, as diverse as the scene allows."""
 
 from collections import Counter
-from collections.abc import Iterator
 
-from schemas.curation import GeneratedTask, Relation
+from schemas.curation import GeneratedTask, Relabelling, Relation
 from tableverse_factory.geometry.relations.relations import is_inside, relation_nearly_holds
 from tableverse_factory.stages.curate.appearance import can_roll
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import CARRIES, CONTENTS, classify_label
 
-TEMPLATE = "Pick up {x} and place it {relation} {y}"
-MAX_TRIES = 160
-"""Most triples tested: bounds the time in scenes where little is possible."""
-
+MAX_TRIES = 160  # most triples tested: bounds the time in scenes where little is possible
 _SMALL_REFERENCE = 1 / 3
 _CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
 _ORDER = (
@@ -25,22 +21,20 @@ Triple = tuple[int, Relation, int]
 
 
 def generate_tasks(
-    case: JudgeInput,
-    names: tuple[str, ...],
-    phrases: tuple[tuple[str, ...], ...],
-    masses_kg: tuple[float, ...],
-    limit: int,
+    case: JudgeInput, names: tuple[Relabelling, ...], masses_kg: tuple[float, ...], limit: int
 ) -> tuple[GeneratedTask, ...]:
     """Generate at most `limit` tasks, the relations in turn, each for the objects with the fewest tasks so far.
 
-    Args:
-        case: The scene.
-        names: Name of each object, from part F.
-        phrases: Distinguishing phrases of each object; one without any is part of no task.
-        masses_kg: Mass of each object.
-        limit: Most tasks.
+    Objects without distinguishing phrases are part of no task.
     """
-    open_triples = {relation: list(_list_plausible(case, names, phrases, masses_kg, relation)) for relation in _ORDER}
+    kinds = [classify_label(name.relabel_name) for name in names]
+    named = [index for index, name in enumerate(names) if name.distinguishing_phrases]
+    pickable = [x for x in named if not case.feasibility.explain_pick_refusal(x, masses_kg[x])]
+    candidates = [(x, y) for x in pickable for y in named if x != y]
+    open_triples = {
+        relation: [(x, relation, y) for x, y in candidates if _is_sensible(case, kinds, relation, x, y)]
+        for relation in _ORDER
+    }
     uses: Counter[int] = Counter()
     pairs: Counter[tuple[int, int]] = Counter()
     chosen: list[Triple] = []
@@ -57,33 +51,14 @@ def generate_tasks(
                 chosen.append(triple)
                 uses.update((triple[0], triple[2]))
                 pairs[triple[0], triple[2]] += 1
-                if relation in _CONTAINING:
-                    # In, into and inside ask for the same: once is enough.
-                    for same in _CONTAINING:
-                        pair = (triple[0], triple[2])
-                        open_triples[same] = [t for t in open_triples[same] if (t[0], t[2]) != pair]
-    return tuple(_build_task(triple, phrases) for triple in chosen)
-
-
-def _list_plausible(
-    case: JudgeInput,
-    names: tuple[str, ...],
-    phrases: tuple[tuple[str, ...], ...],
-    masses_kg: tuple[float, ...],
-    relation: Relation,
-) -> Iterator[Triple]:
-    """List triples worth testing: nameable, pickable, sensible in daily life, and clearly not satisfied already."""
-    kinds = [classify_label(name) for name in names]
-    indices = [index for index, own in enumerate(phrases) if own]
-    for x in indices:
-        if case.feasibility.explain_pick_refusal(x, masses_kg[x]):
-            continue
-        for y in indices:
-            if x != y and _is_sensible(case, kinds, relation, x, y):
-                yield (x, relation, y)
+                for same in _CONTAINING if relation in _CONTAINING else ():  # they ask for the same: once is enough
+                    left = open_triples[same]
+                    open_triples[same] = [t for t in left if (t[0], t[2]) != (triple[0], triple[2])]
+    return tuple(_build_task(triple, names) for triple in chosen)
 
 
 def _is_sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int, y: int) -> bool:
+    """Whether the task makes sense in daily life, and is clearly not done already."""
     item, reference = case.items[x], case.items[y]
     if relation_nearly_holds(relation, item.body, reference.body):
         return False
@@ -99,14 +74,8 @@ def _is_sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int,
     return float(reference.size.max()) >= _SMALL_REFERENCE * float(item.size.max())
 
 
-def _build_task(triple: Triple, phrases: tuple[tuple[str, ...], ...]) -> GeneratedTask:
+def _build_task(triple: Triple, names: tuple[Relabelling, ...]) -> GeneratedTask:
     x, relation, y = triple
-    instruction = TEMPLATE.format(x=phrases[x][0], relation=relation.value, y=phrases[y][0])
-    return GeneratedTask(
-        instruction=instruction,
-        X_id=x,
-        X_name=phrases[x][0],
-        Y_id=y,
-        Y_name=phrases[y][0],
-        relation=relation.value,
-    )
+    name_x, name_y = names[x].distinguishing_phrases[0], names[y].distinguishing_phrases[0]
+    instruction = f"Pick up {name_x} and place it {relation.value} {name_y}"
+    return GeneratedTask(instruction=instruction, X_id=x, X_name=name_x, Y_id=y, Y_name=name_y, relation=relation.value)

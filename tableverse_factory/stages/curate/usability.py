@@ -1,6 +1,6 @@
 """Part A by rules: whether the scene is usable for a table-top robot."""
 
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Literal
 
 import numpy as np
@@ -8,20 +8,15 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from schemas.curation import Usability
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.relations.relations import BodyFeatures, measure_outline_gap
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import is_non_tabletop
 
-WORKSPACE_M = 1.5
-"""Longest side of the layout that one arm covers: twice a Panda's reach less its base."""
-
-MIN_BAND_M = 0.10
-"""Narrowest band of bare table that separates groups: about the width of a gripper's hand."""
-
+WORKSPACE_M = 1.5  # longest side of the layout that one arm covers: twice a Panda's reach less its base
+MIN_BAND_M = 0.10  # narrowest band of bare table that separates groups: about the width of a gripper's hand
 MAX_TABLETOP_M = 1.2
-_CLEAR_STEP = 2.0
-"""Ratio of a gap between clusters to the next smaller gap."""
+_CLEAR_STEP = 2.0  # ratio of a gap between clusters to the next smaller gap
 
 
 def judge_usability(case: JudgeInput) -> Usability:
@@ -37,9 +32,7 @@ def judge_usability(case: JudgeInput) -> Usability:
     if misfits:
         codes.append("NON_TABLETOP_OBJECT")
     return Usability(
-        usable=not codes,
-        reason_codes=tuple(codes),
-        evidence_ids={"NON_TABLETOP_OBJECT": misfits} if misfits else {},
+        usable=not codes, reason_codes=tuple(codes), evidence_ids={"NON_TABLETOP_OBJECT": misfits} if misfits else {}
     )
 
 
@@ -71,22 +64,16 @@ def _measure_extent(bodies: tuple[BodyFeatures, ...]) -> float:
 
 
 def _span_tree(bodies: tuple[BodyFeatures, ...]) -> tuple[np.ndarray, np.ndarray]:
-    n = len(bodies)
-    gaps = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1, n):
-            gaps[i, j] = max(measure_outline_gap(bodies[i], bodies[j]), 1e-6)  # a sparse zero would be no edge
+    gaps = np.zeros((len(bodies), len(bodies)))
+    for (i, a), (j, b) in combinations(enumerate(bodies), 2):
+        gaps[i, j] = max(measure_outline_gap(a, b), 1e-6)  # a sparse zero would be no edge
     tree = minimum_spanning_tree(gaps).tocoo()
     return tree.data, np.stack([tree.row, tree.col], axis=1)
 
 
 def _find_cuts(gaps: np.ndarray) -> list[float]:
-    ordered = np.sort(gaps)[::-1]
-    cuts = [float(ordered[0])]
-    for wider, next_gap in pairwise(ordered[1:]):
-        if wider > _CLEAR_STEP * max(float(next_gap), 0.001):
-            cuts.append(float(wider))
-    return cuts
+    widest, *rest = np.sort(gaps)[::-1].tolist()
+    return [widest, *(wider for wider, narrower in pairwise(rest) if wider > _CLEAR_STEP * max(narrower, 0.001))]
 
 
 def _split_clusters(count: int, edges: np.ndarray) -> list[list[int]]:

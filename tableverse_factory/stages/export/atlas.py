@@ -8,31 +8,17 @@ from jaxtyping import Bool, Float64, Int64
 from schemas.geometry import Frozen, Points, TriangleMesh
 from tableverse_factory.geometry.math.aabb import aabb
 
-CELL = 4
-"""Side of the smallest square [texels]."""
-
-LEVELS = 5
-"""Number of sizes: squares have CELL · 2^k texels along a side, k below this."""
-
+CELL = 4  # side of the smallest square [texels]
+LEVELS = 5  # number of sizes: squares have CELL · 2^k texels along a side, k below this
+# Texels between a triangle and its square's border, and of a side lost to borders and the diagonal: filters then mix a
+# face with copies of its own edge. The smallest squares, of faces without detail, have no room for it.
 INSET, GUTTER = 1, 6
-"""Texels between a triangle and its square's border, and texels of a side lost to borders and the diagonal.
-
-Filters then mix a face with copies of its own edge. The smallest squares, of faces without detail, have no room for it.
-"""
-FINE_TEXELS = 1.5
-"""A face of at most this size [texels] shows all its detail in the smallest square, which has two along an edge."""
+FINE_TEXELS = 1.5  # a face of this size [texels] shows all its detail in the smallest square, with two along an edge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas(Frozen):
-    """Places of the faces in the texture.
-
-    Attributes:
-        side: Side of the texture [texels].
-        square: Side of the square of each face [texels]. Shape (m,).
-        corner: Column and row of the first texel of that square. Shape (m, 2).
-        second: Whether a face has the half of its square away from that texel. Shape (m,).
-    """
+    """Places of the faces in a texture: each face's square, its first texel (column, row), its half away from that."""
 
     side: int
     square: Int64[np.ndarray, " m"]
@@ -66,10 +52,7 @@ def lay_out_atlas(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"
 
 
 def list_triangle_texels(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 2"], Float64[np.ndarray, "t 3"]]:
-    """List texels (column, row) of one half of a square, and their barycentric weights in its face.
-
-    Beyond the face's edge, in the gutter, texels repeat the edge.
-    """
+    """List texels (column, row) of one half of a square, and their weights in its face; the gutter repeats the edge."""
     row, column = np.indices((square, square))
     half = (row + column >= square) == second
     i, j = column[half], row[half]
@@ -103,8 +86,7 @@ def _choose_levels(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     inner = np.maximum(np.sqrt(doubled), edges / 2) * texels_per_metre
     wanted = np.where(inner > FINE_TEXELS, inner + GUTTER, CELL)
-    doublings: Int64[np.ndarray, " m"] = np.ceil(np.log2(wanted / CELL)).astype(np.int64)
-    return np.asarray(np.clip(doublings, 0, LEVELS - 1))
+    return np.asarray(np.clip(np.ceil(np.log2(wanted / CELL)).astype(np.int64), 0, LEVELS - 1))
 
 
 def _sort_along_curve(points: Points) -> Int64[np.ndarray, " n"]:

@@ -27,14 +27,10 @@ from tableverse_factory.stages.export.rows import build_object_rows, build_scene
 from tableverse_factory.stages.export.tabletop import draw_tabletop_texture
 from tableverse_factory.stages.export.texture import bake_texture
 
-SETTLINGS = 3
-"""Most rounds of settling of a scene that still drifts."""
-
-MASS_STEP_KG = 1e-5
-"""Greatest difference of masses that needs no new settling [kg]: judges round masses."""
-
+SETTLINGS = 3  # most rounds of settling of a scene that still drifts
+MASS_STEP_KG = 1e-5  # greatest difference of masses that needs no new settling [kg]: judges round masses
+# Colours of meshes that come without.
 PALETTE = ((196, 102, 92), (98, 140, 184), (128, 166, 104), (214, 170, 88), (150, 120, 170), (92, 160, 158))
-"""Colours of meshes that come without."""
 
 
 def export(
@@ -75,9 +71,12 @@ class _CertifiedFiles:
 def _build_bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
     layout = scene.settled.rectified
     masses = {verdict.object_id: verdict.mass_kg for verdict in scene.assessment.objects}
-    pictures = _load_projectors(layout)
+    objects, evidence = layout.placed.objects, layout.placed.evidence
+    pictures: Sequence[ColorProjector | None] = [None] * len(objects)
+    if evidence is not None:
+        pictures = load_projectors(evidence, [item.pose for item in objects], [item.scale for item in objects])
     bodies = []
-    for index, (item, pieces) in enumerate(zip(layout.placed.objects, layout.pieces, strict=True)):
+    for index, (item, pieces) in enumerate(zip(objects, layout.pieces, strict=True)):
         if item.object_id not in masses:
             raise TableverseError(f"{scene.scene_id}: the assessment has no mass for {item.object_id}")
         pose = scene.settled.poses[index]
@@ -87,28 +86,18 @@ def _build_bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
     return tuple(bodies)
 
 
-def _load_projectors(layout: RectifiedLayout) -> Sequence[ColorProjector | None]:
-    objects, evidence = layout.placed.objects, layout.placed.evidence
-    if evidence is None:
-        return [None] * len(objects)
-    return load_projectors(evidence, [item.pose for item in objects], [item.scale for item in objects])
-
-
 def _settle_and_certify(
     scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, tabletop: TableTexture, config: Config
 ) -> _CertifiedFiles:
     """Write the scene and settle it until the certificate finds it at rest, at most `SETTLINGS` times."""
-    layout, step = scene.settled.rectified, config.settle.timestep_s
-    history = _build_history(layout)
+    layout, step, limit = scene.settled.rectified, config.settle.timestep_s, config.settle.max_time_s
+    history, seen = _build_history(layout), layout.placed.evidence
+    view = None if seen is None else PosedCamera(seen.camera, seen.camera_to_table)
     rests = all(map(_has_settled_mass, layout.placed.objects, bodies))
     for attempt in range(SETTLINGS):
         if not rests:
-            bodies, _ = bring_to_rest(
-                bodies, slab, timestep_s=step, max_time_s=config.settle.max_time_s, gentle=attempt > 0
-            )
-        files = make_scene_files(
-            bodies, slab, model_name=scene.scene_id, timestep_s=step, view=_build_camera(layout), tabletop=tabletop
-        )
+            bodies, _ = bring_to_rest(bodies, slab, timestep_s=step, max_time_s=limit, gentle=attempt > 0)
+        files = make_scene_files(bodies, slab, model_name=scene.scene_id, timestep_s=step, view=view, tabletop=tabletop)
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
@@ -131,11 +120,6 @@ def _build_history(layout: RectifiedLayout) -> PoseHistory:
     )
 
 
-def _build_camera(layout: RectifiedLayout) -> PosedCamera | None:
-    evidence = layout.placed.evidence
-    return None if evidence is None else PosedCamera(evidence.camera, evidence.camera_to_table)
-
-
 def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | None:
     certificate, measured = written.certificate, written.measured
     if measured.warnings:
@@ -143,17 +127,11 @@ def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | No
     if certificate.fell:
         return Dropped("object_fell", f"{', '.join(certificate.fell[:10])} fell")
     if not certificate.at_rest:
-        return Dropped(
-            "not_at_rest",
-            f"drift {certificate.drift_m * 1e3:.2f} mm, {np.degrees(certificate.drift_rad):.2f} deg "
-            f"in 5 s: {', '.join(measured.moved[:10])}",
-        )
+        drift = f"drift {certificate.drift_m * 1e3:.2f} mm, {np.degrees(certificate.drift_rad):.2f} deg"
+        return Dropped("not_at_rest", f"{drift} in 5 s: {', '.join(measured.moved[:10])}")
     if certificate.colliding:
-        return Dropped(
-            "colliding",
-            f"deeper than {epsilon_m * 1e3:g} mm: pieces {measured.pieces[0] * 1e3:.2f} mm ({measured.pieces[1]}), "
-            f"meshes {measured.meshes[0] * 1e3:.2f} mm ({measured.meshes[1]})",
-        )
+        pieces, meshes = (f"{depth * 1e3:.2f} mm ({pair})" for depth, pair in (measured.pieces, measured.meshes))
+        return Dropped("colliding", f"deeper than {epsilon_m * 1e3:g} mm: pieces {pieces}, meshes {meshes}")
     return None
 
 

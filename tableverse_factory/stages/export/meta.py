@@ -21,11 +21,7 @@ def build_meta_json(
 ) -> bytes:
     """Build the file with sorted keys and shortest exact floats, so that equal scenes give equal bytes.
 
-    Args:
-        scene: The scene.
-        bodies: The exported bodies, in the order of the objects.
-        certificate: Measurements on the exported XML.
-        files: All other files of the scene, whose digests are kept.
+    It keeps the digests of `files`, all other files of the scene.
     """
     placed = scene.settled.rectified.placed
     evidence = placed.evidence
@@ -72,11 +68,7 @@ def _describe_objects(
             "mesh_licence": item.mesh_licence,
             "fit_residual_m": item.fit_residual_m,
             "mask_value": value,
-            "poses": {
-                "placed": item.pose if item.copy_of is None else None,
-                "rectified": before,
-                "settled": body.pose,
-            },
+            "poses": {"placed": item.pose if item.copy_of is None else None, "rectified": before, "settled": body.pose},
             "pieces": _describe_pieces(pieces, item.scale, body),
             "appearance": _describe_appearance(item.mesh),
             "inertia_from": body.properties.source,

@@ -14,25 +14,14 @@ from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 
-LEAST_FACING = 0.2
-"""Least cosine between normal and line of sight; pixels of steeper faces are too stretched."""
-
-BORDER_PIXELS = 2
-"""Width of the outline whose pixels mix the object with its background [px]."""
-
-SAME_SURFACE = 0.004
-"""A point is visible if the first surface on its line of sight is nearer by at most this share of the distance."""
+LEAST_FACING = 0.2  # least cosine between normal and line of sight; pixels of steeper faces are too stretched
+BORDER_PIXELS = 2  # width of the outline whose pixels mix the object with its background [px]
+SAME_SURFACE = 0.004  # share of the distance by which the first surface on the line to a visible point may be nearer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColorProjector(Frozen):
-    """The picture, relative to one object.
-
-    Attributes:
-        color: Shape (h, w, 3) sRGB.
-        own: Pixels that show this object alone.
-        object_to_camera: Pose of the mesh's own frame, at `scale`, in the camera frame.
-    """
+    """The picture, relative to one object; `own` are the pixels that show it alone, its mesh is at `scale`."""
 
     color: Picture
     own: Mask
@@ -68,11 +57,7 @@ def project_colors(
 ) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
     """Find which points of the mesh's surface the picture shows, and their sRGB there.
 
-    Args:
-        photograph: The picture, prepared for this object.
-        mesh: Mesh in its own frame, before scale.
-        points: Points on its surface, same frame. Shape (n, 3).
-        faces: Index of the face each point lies on. Shape (n,).
+    Points are in the mesh's own frame, before scale, shape (n, 3); `faces` are those they lie on, shape (n,).
     """
     pose, scale = photograph.object_to_camera, photograph.scale
     placed = transform_points(pose, mesh.vertices, scale)

@@ -51,7 +51,6 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, 
 
 
 def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
-    """Describe the model that found the objects and the remarks on its answer; empty where no model was asked."""
     if record is None:
         return {}
     return {
@@ -62,7 +61,6 @@ def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
 
 
 def _describe_judge(verdict: Assessment) -> dict[str, Any]:
-    """Describe the judge's own answer, its origin, and how far the rules agree."""
     origin, agreement = verdict.origin, verdict.agreement
     columns: dict[str, Any] = {
         "answered_usable": verdict.answered_usable,
@@ -121,10 +119,7 @@ def _describe_name(item: PlacedObject, verdict: ObjectAssessment) -> dict[str, A
 def _describe_body(body: SceneBody) -> dict[str, Any]:
     columns = ("size_x_m", "size_y_m", "size_z_m", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
     values = (*aabb_size(body.mesh.vertices), *body.pose.position, *body.pose.quaternion_wxyz)
-    return {
-        **_pick(body.properties, "mass_kg", "volume_m3"),
-        **dict(zip(columns, map(float, values), strict=True)),
-    }
+    return {**_pick(body.properties, "mass_kg", "volume_m3"), **dict(zip(columns, map(float, values), strict=True))}
 
 
 def _describe_mesh(item: PlacedObject, pieces: ConvexPieces, body: SceneBody) -> dict[str, Any]:

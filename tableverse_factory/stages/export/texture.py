@@ -18,23 +18,15 @@ from tableverse_factory.stages.export.atlas import Atlas, find_corner_texels, la
 from tableverse_factory.stages.export.projected_color import ColorProjector, project_colors
 
 SMALL_SIDE, LARGE_SIDE = 256, 512
-COARSER = 0.8
-"""Factor of the density after each try that does not fit."""
+COARSER = 0.8  # factor of the density after each try that does not fit
+SMALL_TRIES, LARGE_TRIES = 4, 24  # small: down to half the picture's density; large: until the atlas fits
 
-SMALL_TRIES, LARGE_TRIES = 4, 24
-"""Tries by size: the small texture down to half the picture's density, the large one until the atlas fits."""
-
+# Maps faces and barycentric weights of points on them to sRGB.
 Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
-"""Maps faces and barycentric weights of points on them to sRGB."""
 
 
 def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appearance | None:
-    """Bake the mesh's own texture, else one from its vertex colours and the picture; None without colours.
-
-    Args:
-        mesh: Mesh in its own frame, before scale.
-        photograph: The picture of the object, or None.
-    """
+    """Bake the mesh's own texture, else one from its vertex colours and the picture; None without colours."""
     if mesh.texture is not None:
         return Appearance.at_corners(encode_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
     if mesh.vertex_colors is None:
@@ -73,9 +65,8 @@ def _paint(
 ) -> Float64[np.ndarray, "n 3"]:
     corners = mesh.faces[faces]
     assert mesh.vertex_colors is not None  # noqa: S101 - bake asks first
-    colors: Float64[np.ndarray, "n 3"] = np.einsum(
-        "nk,nkd->nd", weights, mesh.vertex_colors[corners].astype(np.float64)
-    )
+    own = mesh.vertex_colors[corners].astype(np.float64)
+    colors: Float64[np.ndarray, "n 3"] = np.einsum("nk,nkd->nd", weights, own)
     if photograph is not None:
         worth = np.flatnonzero(shown[faces])
         points: Points = np.einsum("nk,nkd->nd", weights[worth], mesh.vertices[corners[worth]])
