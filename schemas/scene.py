@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.curation import Assessment
 from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
@@ -102,7 +102,7 @@ class ExportedScene(Frozen):
     Attributes:
         files: Tar members, sorted by name, without the scene's folder: `scene.xml`, `assets/…`, `meta.json`,
             `observation/…`, `trajectories/…`.
-        scene_row: Columns of scenes/ that the scene itself determines (`schemas.arrow.SCENES`).
+        scene_row: Columns of scenes/ that the scene itself determines (`schemas.tables.SCENES`).
         trajectory_rows: Rows of trajectories/; none in builds without trajectories.
     """
 

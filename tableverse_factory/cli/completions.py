@@ -34,7 +34,7 @@ def complete_config_keys(context: Context, incomplete: str) -> list[str]:
 
 def complete_columns(context: Context, incomplete: str) -> list[str]:
     """List the columns of the table, after those that are already typed."""
-    from schemas.arrow import TABLES
+    from schemas.tables import TABLES
 
     table = str(context.params.get("table") or "scenes")
     written, comma, last = incomplete.rpartition(",")

@@ -7,7 +7,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.arrow import SCENES
+from schemas.tables import SCENES
 from schemas.outcome import ModelCost
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import sanitize_line

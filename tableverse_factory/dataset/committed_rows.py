@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from schemas.arrow import STORED_TABLES
+from schemas.tables import STORED_TABLES
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.core.storage.parquet import read_table

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from upath import UPath
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, atomic_file, list_sizes, read_whole, remove_folder

@@ -14,7 +14,7 @@ import pyarrow.fs
 import pyarrow.parquet as pq
 from fsspec.implementations.local import LocalFileSystem
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage.files import resolve_filesystem
 from tableverse_factory.core.storage.parquet import make_arrow_filesystem, read_remote_table
@@ -119,22 +119,22 @@ class Dataset:
 
     @cached_property
     def scenes(self) -> ds.Dataset:
-        """A row per scene, including dropped and failed ones (`schemas.arrow.SCENES`)."""
+        """A row per scene, including dropped and failed ones (`schemas.tables.SCENES`)."""
         return self.table("scenes")
 
     @cached_property
     def objects(self) -> ds.Dataset:
-        """A row per object of the finished scenes (`schemas.arrow.OBJECTS`)."""
+        """A row per object of the finished scenes (`schemas.tables.OBJECTS`)."""
         return self.table("objects")
 
     @cached_property
     def tasks(self) -> ds.Dataset:
-        """A row per task, including refused ones (`schemas.arrow.TASKS`)."""
+        """A row per task, including refused ones (`schemas.tables.TASKS`)."""
         return self.table("tasks")
 
     @cached_property
     def trajectories(self) -> ds.Dataset:
-        """A row per task that was tried (`schemas.arrow.TRAJECTORIES`); empty in builds without trajectories."""
+        """A row per task that was tried (`schemas.tables.TRAJECTORIES`); empty in builds without trajectories."""
         return self.table("trajectories")
 
     def table(self, name: str) -> ds.Dataset:

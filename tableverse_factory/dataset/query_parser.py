@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from tableverse_factory.core.errors import QueryError
 from tableverse_factory.dataset.query_lexer import Token, make_query_error, tokenize, unquote
 

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 
 import pyarrow as pa
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names

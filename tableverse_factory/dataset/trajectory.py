@@ -17,7 +17,7 @@ class Trajectory:
     """How one task of a scene was tried.
 
     Attributes:
-        row: Its row of trajectories/ (`schemas.arrow.TRAJECTORIES`).
+        row: Its row of trajectories/ (`schemas.tables.TRAJECTORIES`).
     """
 
     row: Mapping[str, Any]

@@ -10,7 +10,7 @@ from urllib.parse import unquote, urlsplit, urlunsplit
 
 import pyarrow as pa
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
 from tableverse_factory.core.storage.files import StoragePath, atomic_file, list_names, open_stream, write_atomic

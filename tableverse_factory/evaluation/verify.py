@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow.compute as pc
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.config import TrajectoriesConfig
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map

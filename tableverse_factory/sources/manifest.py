@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from schemas.arrow import MANIFEST
+from schemas.tables import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
 from schemas.identity import content_hash

@@ -8,7 +8,7 @@ import mujoco
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.arrow import OBJECTS
+from schemas.tables import OBJECTS
 from schemas.config import Config
 from tableverse_factory.core.config import fingerprint_config, load_config
 from tests.helpers.captures_on_disk import write_capture, write_picture

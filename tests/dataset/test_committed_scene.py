@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import BuildError

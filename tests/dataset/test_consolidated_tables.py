@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.arrow import OBJECTS, SCENES, TABLES, TASKS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TABLES, TASKS, TRAJECTORIES
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import ROW_GROUP, build_table, encode_parquet

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import InputError
 from tests.helpers.small_dataset import TETRAHEDRON, scene_files, write_small_dataset

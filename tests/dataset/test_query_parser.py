@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import QueryError
 from tableverse_factory.dataset.query_parser import MAX_CHARS, MAX_CHOICES, check_columns, parse_filter
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.geometry import Camera, Pose
 from schemas.scene import ExportedScene
 from tableverse_factory.cli.main import app

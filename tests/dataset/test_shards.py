@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.arrow import OBJECTS
+from schemas.tables import OBJECTS
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import atomic_file, write_atomic

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.config import Config
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.cli.main import app

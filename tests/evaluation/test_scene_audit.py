@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.config import Config
 from schemas.outcome import Done
 from schemas.scene import ExportedScene

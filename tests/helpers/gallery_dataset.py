@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import trimesh
 from PIL import Image
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.mesh.meshes import from_trimesh

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.outcome import Done

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet

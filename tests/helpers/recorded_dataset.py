@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TRAJECTORIES
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from schemas.arrow import MANIFEST
+from schemas.tables import MANIFEST
 from schemas.detection import MAX_DETECTIONS, Detections
 from schemas.layout import MAX_OBJECTS, Layout
 from schemas.manifest import ImageRow

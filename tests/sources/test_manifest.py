@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.arrow import MANIFEST
+from schemas.tables import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.arrow import OBJECTS, SCENES, TASKS, TIMINGS
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.core.errors import BuildError, InputError
 from tests.helpers.builds import build, crowd, digests, finish, kill, scenes, start, wait_until, write_manifest
 from workers.plan.invalidate import reopen_scenes

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import ray
 import ray.data
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from typing import Any, BinaryIO
 
-from schemas.arrow import STORED_TABLES
+from schemas.tables import STORED_TABLES
 from schemas.codec import decode
 from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Int64
 
-from schemas.arrow import SCENES
+from schemas.tables import SCENES
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.text import sanitize_line

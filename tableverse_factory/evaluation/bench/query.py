@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Dataset, open_dataset

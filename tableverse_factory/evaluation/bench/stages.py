@@ -11,7 +11,7 @@ from typing import Any, Literal
 import mujoco
 from threadpoolctl import threadpool_limits
 
-from schemas.arrow import OBJECTS, SCENES, TASKS
+from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow

@@ -1,4 +1,4 @@
-"""Rows of one scene for the tables of `schemas.arrow`."""
+"""Rows of one scene for the tables of `schemas.tables`."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.config import Config
 from schemas.geometry import Pose
 from schemas.outcome import Done

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from schemas.arrow import SCENES
+from schemas.tables import SCENES
 from schemas.config import Config, CurateConfig, ObserveConfig
 from schemas.outcome import ModelCost
 from tableverse_factory.cli.status import status

@@ -6,7 +6,7 @@ import re
 import pyarrow as pa
 import pytest
 
-from schemas.arrow import MANIFEST, TABLES, TIMINGS
+from schemas.tables import MANIFEST, TABLES, TIMINGS
 from tests.helpers.paths import ROOT
 
 PAGE = ROOT / "docs" / "formats.md"

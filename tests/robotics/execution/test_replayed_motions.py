@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
 from tableverse_factory.core.errors import ConfigError, InputError

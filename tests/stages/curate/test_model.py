@@ -8,7 +8,7 @@ import math
 import pytest
 from PIL import Image
 
-from schemas.arrow import SCENES, TASKS
+from schemas.tables import SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config, CurateConfig
 from schemas.curation import Assessment, Relation

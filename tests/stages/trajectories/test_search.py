@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.arrow import TRAJECTORIES
+from schemas.tables import TRAJECTORIES
 from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.geometry import Pose

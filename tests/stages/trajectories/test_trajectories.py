@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from schemas.arrow import TRAJECTORIES
+from schemas.tables import TRAJECTORIES
 from schemas.codec import encode
 from schemas.config import Config
 from schemas.curation import TaskAssessment

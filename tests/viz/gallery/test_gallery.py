@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tableverse_factory.viz.gallery.pages import Site

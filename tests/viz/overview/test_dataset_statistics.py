@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from schemas.arrow import TABLES
+from schemas.tables import TABLES
 from tableverse_factory import open_dataset
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from schemas.arrow import SCENES
+from schemas.tables import SCENES
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.detection import Detections
