@@ -10,8 +10,7 @@ from trimesh.visual.material import PBRMaterial
 
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
-from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
-from tableverse_factory.geometry.math.transforms import homogeneous_matrix, matrix_from_pose
+from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP, homogeneous_matrix, matrix_from_pose
 
 ROUGHNESS = 0.8
 

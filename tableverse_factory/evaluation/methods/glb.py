@@ -9,8 +9,7 @@ import trimesh
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.delivery.formats.model_contents import VisualMesh, is_table
 from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene
-from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
-from tableverse_factory.geometry.math.transforms import homogeneous_matrix, identity_pose
+from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP, homogeneous_matrix, identity_pose
 from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
 from tableverse_factory.geometry.mesh.meshes import MAX_FACES, MAX_FILE_BYTES, MAX_PIXELS, check_mesh
 from tableverse_factory.physics.mjcf.scenery import Rgb

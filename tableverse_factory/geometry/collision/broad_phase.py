@@ -56,13 +56,11 @@ def find_separating_slab(a: Points, b: Points) -> OverlapSlab:
 
 
 def crop_to_half_space(mesh: TriangleMesh, normal: Vector3, high: float) -> TriangleMesh | None:
-    """Simplify a closed mesh outside a half-space; inside, `x @ normal < high`, it bounds the same volume.
+    """Simplify a closed mesh of one shell outside a half-space; in it, `x @ normal < high`, the volume is the same.
 
     Vertices of faces that do not reach into the half-space collapse into one point far beyond it. As the complement of
     a half-space is convex, the collapsed faces stay beyond. The point lies off all planes of the mesh: manifold3d takes
-    faces folded within a plane for degenerate and mends them wrongly.
-
-    The mesh has one shell. None where more than `MAX_CROPPED_SHARE` of its vertices are in the half-space.
+    faces folded within a plane for degenerate and mends them wrongly. None beyond `MAX_CROPPED_SHARE`.
     """
     along = mesh.vertices @ normal
     inside = along < high

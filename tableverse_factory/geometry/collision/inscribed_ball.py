@@ -20,9 +20,8 @@ def find_largest_ball(mesh: TriangleMesh, at_least: float, at_most: float) -> fl
     """Find the diameter of the largest ball inside a closed mesh that touches it in the middle of a face [m].
 
     Shrinking balls (Ma, Bae and Choi 2012): each touches its face from inside and starts too large. The surface point
-    nearest to its centre is put on the ball, until the centre is inside and no point is in the ball.
-
-    No ball inside is larger than `at_most` [m]; 0 where all are at most `at_least` [m].
+    nearest to its centre is put on the ball, until the centre is inside and no point is in the ball. No ball inside is
+    larger than `at_most` [m]; 0 where all are at most `at_least` [m].
     """
     low, high = aabb(mesh.vertices)
     size = float((high - low).max())

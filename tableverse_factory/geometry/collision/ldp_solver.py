@@ -42,8 +42,7 @@ def solve_least_motion(rows: Rows, bounds: Bounds) -> Values | None:
     count = rows.shape[1]
     if not len(rows) or (bounds <= 0.0).all():
         return np.zeros(count)
-    target = np.zeros(count + 1)
-    target[count] = 1.0
+    target = np.append(np.zeros(count), 1.0)
     try:
         dual, _ = nnls(np.vstack([rows.T, bounds]), target, maxiter=ITERATIONS_PER_UNKNOWN * (count + 1))
     except RuntimeError as error:  # scipy's: too many iterations

@@ -1,8 +1,7 @@
 """Linear sweeps: how far a body must move along a direction until it is clear of everything (paper equation (2)).
 
 For convex A and B the distance between A + d v and B is a convex function of d, so the d at which they are nearer than
-a margin form one interval. A tangent of a convex function never crosses it: Newton's steps from outside (conservative
-advancement) reach an end of the interval without passing it. No step size is chosen anywhere.
+a margin form one interval. Newton's steps from outside (conservative advancement) reach its ends without passing them.
 """
 
 import heapq
@@ -23,10 +22,7 @@ MAX_STEPS = 200  # of Newton; three to six are usual. Stopping early leaves more
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingSolid:
-    """An object during rectification: its pieces where they were placed in the table frame, and how far it moved [m].
-
-    Its mesh may stick out of the pieces by `uncovered_m`.
-    """
+    """An object's pieces as they were placed, its offset since, and how far its mesh may stick out of them [m]."""
 
     solids: Solids
     offset: Vector3

@@ -7,7 +7,7 @@ import manifold3d
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import ConvexPieces, Points, Pose, TriangleMesh
+from schemas.geometry import ConvexPieces, Pose, TriangleMesh
 from tableverse_factory.geometry.collision.inscribed_ball import find_largest_ball
 from tableverse_factory.geometry.collision.solids import find_near_pieces, place_pieces
 from tableverse_factory.geometry.math.transforms import rotation_matrix
@@ -21,10 +21,7 @@ THIN_M = 1e-4  # thinner overlaps are not examined further: objects at rest shar
 def measure_piece_penetrations(
     pieces: Sequence[ConvexPieces], poses: Sequence[Pose], scales: Sequence[float]
 ) -> list[PairDepth]:
-    """Measure every pair of objects whose convex pieces overlap.
-
-    The depth of a pair is that of its deepest pair of pieces: the shortest translation that separates them (EPA).
-    """
+    """Measure every pair of objects whose convex pieces overlap, by the depth of its deepest pair of pieces (EPA)."""
     solids = [place_pieces(p, pose, scale) for p, pose, scale in zip(pieces, poses, scales, strict=True)]
     found = []
     for i, j in combinations(range(len(solids)), 2):
@@ -73,15 +70,11 @@ def measure_thickness(region: manifold3d.Manifold) -> float:
     if volume <= 0.0 or area <= 0.0:
         return 0.0
     mesh = solid_to_mesh(region)
-    mean, narrowest = 6.0 * volume / area, _measure_narrowest_extent(mesh.vertices)
+    try:
+        normals = ConvexHull(mesh.vertices - mesh.vertices.mean(axis=0)).equations[:, :3]
+    except QhullError:  # flat to rounding: no thickness
+        return 0.0
+    mean, narrowest = 6.0 * volume / area, float(np.ptp(mesh.vertices @ normals.T, axis=0).min())
     if mean >= narrowest or narrowest <= THIN_M:
         return narrowest
     return max(mean, find_largest_ball(mesh, mean, narrowest))
-
-
-def _measure_narrowest_extent(points: Points) -> float:
-    try:
-        normals = ConvexHull(points - points.mean(axis=0)).equations[:, :3]
-    except QhullError:  # flat to rounding: no thickness
-        return 0.0
-    return float(np.ptp(points @ normals.T, axis=0).min())

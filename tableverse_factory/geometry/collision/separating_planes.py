@@ -1,9 +1,8 @@
 """Separating planes of convex pieces: collision-free layouts as linear constraints on motions.
 
 Two convex pieces are apart if one lies beyond the other along some direction n. For a fixed n this is linear in their
-translations, so a translation that satisfies the row of each pair ends free, not only to first order. For rotations it
-holds to first order, at each of the corners nearest to the plane. n comes from the nearest points where the two are
-apart and from the shortest way out where they overlap (coal's EPA); the distance along it is measured on the corners.
+translations, exactly; in rotations to first order, at each of the corners nearest to the plane. n comes from the
+nearest points where the two are apart, and from the shortest way out where they overlap (coal's EPA).
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,7 @@ from tableverse_factory.geometry.collision.linear_sweep import GJK_TOLERANCE
 from tableverse_factory.geometry.collision.solids import Solids, make_convex_shape
 from tableverse_factory.geometry.math.transforms import cross_matrix
 
-SIDEWAYS_STRETCH = 6.0  # with z stretched this much, the shortest way out is a sideways one wherever there is any
+SIDEWAYS_STRETCH = np.array([1.0, 1.0, 6.0])  # so stretched, the shortest way out is sideways wherever there is any
 CORNER_DEPTH_M = 0.003  # corners this much further from a plane than the nearest may become the nearest in one step
 SINGLE_CORNER_M = 0.006  # with more room than this, one corner is watched: one step goes less far [m]
 MAX_CORNERS = 4  # watched corners of either piece
@@ -36,20 +35,16 @@ class PosedPieces:
         self.least: Vector3 = self.low.min(axis=0)
         self.most: Vector3 = self.high.max(axis=0)
 
-    def stretched(self, piece: int, factors: Vector3) -> coal.Convex:
-        """Scale each axis of a piece where it is."""
-        return make_convex_shape(self.corners[piece] * factors, self.solids.faces[piece])
+    def stretched(self, piece: int) -> coal.Convex:
+        """Stretch a piece where it is."""
+        return make_convex_shape(self.corners[piece] * SIDEWAYS_STRETCH, self.solids.faces[piece])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeparatingPlane:
-    """A direction along which a piece of body a must stay beyond a piece of body b.
+    """A unit direction from b to a, along which a piece of body a must stay beyond one of b, with distance to spare.
 
-    Attributes:
-        direction: Unit vector, from b to a.
-        spare_m: Distance along it beyond the required one [m]; negative where they are too near.
-        points: Corners near the plane, those of b lifted to it. Shape (k, 3) [m].
-        spares_m: `spare_m` at each of these corners. Shape (k,).
+    `points` are the corners near the plane (k, 3) [m], those of b lifted to it; `spares_m` (k,) are theirs.
     """
 
     direction: Vector3
@@ -66,7 +61,6 @@ class PlaneFinder:
         self._request.gjk_tolerance = GJK_TOLERANCE
         self._result = coal.DistanceResult()
         self._still = coal.Transform3s()
-        self._factors = np.array([1.0, 1.0, SIDEWAYS_STRETCH])
 
     def planes(
         self, a: PosedPieces, b: PosedPieces, margin_m: float, reach_m: float, rise: float
@@ -95,9 +89,9 @@ class PlaneFinder:
         if rise:
             return np.array([0.0, 0.0, rise]) if rise * shortest[2] < -MIN_RISE else shortest
         self._result.clear()
-        first, second = a.stretched(i, self._factors), b.stretched(j, self._factors)
+        first, second = a.stretched(i), b.stretched(j)
         coal.distance(first, self._still, second, self._still, self._request, self._result)
-        direction: Vector3 = -np.array(self._result.normal) * self._factors
+        direction: Vector3 = -np.array(self._result.normal) * SIDEWAYS_STRETCH
         direction /= np.linalg.norm(direction)
         return direction
 

@@ -23,9 +23,8 @@ class PieceCache:
 
     def __init__(self, folder: Path, config: RectifyConfig) -> None:
         self._files = DiskCache(folder / "pieces", ".arrow")
-        self._parameters = (
-            f"{config.decomposition} {config.volume_error!r} {config.max_pieces} {_get_versions()}".encode()
-        )
+        settings = f"{config.decomposition} {config.volume_error!r} {config.max_pieces}"
+        self._parameters = f"{settings} {_get_versions()}".encode()
 
     def key(self, shape: TriangleMesh) -> str:
         """Hash the triangles and the parameters."""

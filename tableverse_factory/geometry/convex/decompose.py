@@ -1,7 +1,4 @@
-"""Convex decomposition of meshes, for collision.
-
-The shape is normalised first, so that a mesh at another scale or place has the same pieces and the same cache entry.
-"""
+"""Convex decomposition of meshes; shapes are normalised first, so that scale and place change no cache entry."""
 
 from dataclasses import replace
 from pathlib import Path

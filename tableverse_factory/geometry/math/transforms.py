@@ -1,8 +1,13 @@
-"""Rotations and rigid motions: quaternions wxyz, active, right-handed."""
+"""Rotations and rigid motions: quaternions wxyz, active, right-handed; conventions of axes."""
 
 import numpy as np
 
 from schemas.geometry import Matrix3, Matrix4, Points, Pose, Quaternion, Vector3
+
+# Rotation from y up (glTF) to z up; its transpose goes back.
+Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+# Half a turn about x, wxyz: from cameras that look along +z with y down to cameras that look along -z with y up.
+OPENCV_TO_OPENGL = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def identity_pose() -> Pose:

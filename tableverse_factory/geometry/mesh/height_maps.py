@@ -1,8 +1,7 @@
 """Height maps: a body seen from above and from below, on a grid that all bodies of a scene share.
 
 For placement: how low a body can be dropped, what it then rests on, and where a vessel has room. A cell is as high as
-its highest ray, vertex or sharp edge, so a rim thinner than a cell closes; a knife-sharp one of two slanted walls may
-not.
+its highest ray, vertex or sharp edge: a rim thinner than a cell closes, but perhaps not a sharp one of slanted walls.
 """
 
 from dataclasses import dataclass, replace
@@ -67,8 +66,7 @@ class HeightMap(Frozen):
 class Cavity(Frozen):
     """Room in a vessel that opens upwards, as water would fill it up to `rim_z`, where it would spill [m].
 
-    `cells` are the water's surface on the vessel's own map, `opening` one cell more all around: contents may touch the
-    wall.
+    `cells` are the water's surface on the vessel's own map; `opening` is wider by one cell: contents may touch walls.
     """
 
     cells: CellMask
@@ -99,10 +97,9 @@ def compute_height_map(mesh: TriangleMesh, caster: RaycastingScene, cell: float 
 
 def _cast_columns(caster: RaycastingScene, steps: list[np.ndarray], from_z: float, direction: float) -> np.ndarray:
     """Measure along vertical rays from the plane `from_z` to the mesh, inf where they miss."""
-    x, y = np.meshgrid(*steps, indexing="ij")
-    rays = pack_rays(np.stack([x.ravel(), y.ravel(), np.full(x.size, from_z)], axis=1), np.array([0.0, 0.0, direction]))
-    hits = caster.cast_rays(rays, nthreads=1)["t_hit"].numpy()
-    return hits.astype(np.float64).reshape(x.shape)
+    origins = np.stack(np.meshgrid(*steps, from_z, indexing="ij"), axis=-1)[:, :, 0]
+    rays = pack_rays(origins, np.array([0.0, 0.0, direction]))
+    return caster.cast_rays(rays, nthreads=1)["t_hit"].numpy().astype(np.float64)
 
 
 def _add_edges(mesh: TriangleMesh, first: np.ndarray, cell: float, top: Heights, bottom: Heights) -> None:

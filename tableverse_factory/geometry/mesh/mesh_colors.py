@@ -121,8 +121,7 @@ def _make_vertex_colors(mesh: trimesh.Trimesh, paint: _Paint | None) -> Colors:
 def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | None]) -> Texture:
     """Stack all pictures into an atlas and map each part's uv coordinates to its own.
 
-    Coordinates that wrap around are brought back into the picture face by face; a face over several repetitions shows
-    one.
+    Coordinates that wrap around are brought back face by face; a face over several repetitions shows one.
     """
     pictures = [
         _round_to_bytes(_make_vertex_colors(part.mesh, None).mean(axis=0)).reshape(1, 1, 3)

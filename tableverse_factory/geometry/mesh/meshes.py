@@ -13,8 +13,7 @@ from PIL import Image
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb, aabb_size
-from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
-from tableverse_factory.geometry.math.transforms import transform_points
+from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP, transform_points
 from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
 from tableverse_factory.geometry.mesh.plain_obj import read_plain_obj
 
@@ -60,32 +59,27 @@ def read_mesh(
 
 
 class _MemoryResolver(trimesh.resolvers.Resolver):  # type: ignore[misc]
-    """Files in memory, the only ones that trimesh may read."""
+    """Files in memory, the only ones that trimesh may read, whatever the folder; none is written."""
 
     def __init__(self, files: Mapping[str, bytes]) -> None:
         self._files = files
 
     def get(self, name: str) -> bytes:
-        """Return a file."""
         if name not in self._files:
             raise FileNotFoundError(name)
         return self._files[name]
 
     def keys(self) -> Iterable[str]:
-        """List the names."""
         return self._files.keys()
 
     def write(self, name: str, data: bytes) -> None:  # noqa: ARG002
-        """Refuse to write."""
         raise PermissionError(name)
 
     def namespaced(self, namespace: str) -> "_MemoryResolver":  # noqa: ARG002
-        """Return the same files for any folder."""
         return self
 
 
 def _collect_parts(scene: trimesh.Scene) -> list[MaterialPart]:
-    """Collect the scene's meshes with their node transforms."""
     placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     parts = [MaterialPart(scene.geometry[name], matrix) for matrix, name in placed]
     parts = [part for part in parts if isinstance(part.mesh, trimesh.Trimesh) and len(part.mesh.faces)]

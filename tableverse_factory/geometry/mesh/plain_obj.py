@@ -57,7 +57,6 @@ def _table(text: bytes, letter: bytes, kind: pa.DataType) -> np.ndarray | None:
 
 
 def _by_arrow(text: bytes, kind: pa.DataType) -> np.ndarray | None:
-    """Parse it as CSV with blanks between the columns, the first of which is the letter."""
     count = text.partition(b"\n")[0].rstrip(b"\r").count(b" ")
     if count > _MOST_NUMBERS:
         return None

@@ -72,11 +72,6 @@ def _orient_faces(mesh: TriangleMesh) -> TriangleMesh:
     return from_trimesh(tidied)
 
 
-def _fill_holes(mesh: TriangleMesh) -> TriangleMesh:
-    oriented = _orient_faces(mesh)
-    return _cap_holes(oriented) if len(oriented.faces) <= MAX_FACES_STITCHED else oriented
-
-
 def _tidy(mesh: TriangleMesh) -> trimesh.Trimesh:
     loose = to_trimesh(mesh)
     loose.merge_vertices()
@@ -87,6 +82,8 @@ def _tidy(mesh: TriangleMesh) -> trimesh.Trimesh:
 
 def _cap_holes(mesh: TriangleMesh) -> TriangleMesh:
     """Close each boundary loop by a fan around its centre, if all fans together are small."""
+    if len(mesh.faces) > MAX_FACES_STITCHED:
+        return mesh
     vertices, faces = [mesh.vertices], [mesh.faces]
     cap_area = 0.0
     for loop in _find_boundary_loops(mesh):
@@ -126,6 +123,6 @@ def _find_boundary_loops(mesh: TriangleMesh) -> list[Int64[np.ndarray, " n"]]:
 _REPAIRS: tuple[tuple[str, Callable[[TriangleMesh], TriangleMesh]], ...] = (
     ("merged", lambda mesh: from_trimesh(_tidy(mesh))),
     ("oriented", _orient_faces),
-    ("filled", _fill_holes),
+    ("filled", lambda mesh: _cap_holes(_orient_faces(mesh))),
     ("remeshed", remesh),
 )

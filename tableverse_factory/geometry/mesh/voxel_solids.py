@@ -87,8 +87,13 @@ def simplify_solid(solid: manifold3d.Manifold, max_faces: int, tolerance: float)
     result = solid.simplify(tolerance)
     if result.num_tri() <= max_faces:
         return result
+    mesh = solid_to_mesh(result)
+    vertices, faces = o3d.utility.Vector3dVector(mesh.vertices.copy()), o3d.utility.Vector3iVector(mesh.faces.copy())
+    # Quadric error decimation (Garland and Heckbert, SIGGRAPH 1997).
+    raw = o3d.geometry.TriangleMesh(vertices, faces).simplify_quadric_decimation(max_faces)
+    left = np.asarray(raw.triangles, dtype=np.int32).copy()
     try:
-        return to_manifold(_decimate(from_manifold(result), max_faces))
+        return to_manifold(TriangleMesh(np.asarray(raw.vertices).copy(), left))
     except GeometryError:
         for _ in range(12):
             tolerance *= 1.5
@@ -96,11 +101,3 @@ def simplify_solid(solid: manifold3d.Manifold, max_faces: int, tolerance: float)
             if result.num_tri() <= max_faces:
                 break
         return result
-
-
-def _decimate(mesh: TriangleMesh, max_faces: int) -> TriangleMesh:
-    """Quadric error decimation (Garland and Heckbert, SIGGRAPH 1997)."""
-    raw = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices.copy()), o3d.utility.Vector3iVector(mesh.faces.copy())
-    ).simplify_quadric_decimation(max_faces)
-    return TriangleMesh(np.asarray(raw.vertices).copy(), np.asarray(raw.triangles, dtype=np.int32).copy())

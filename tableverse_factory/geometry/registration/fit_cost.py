@@ -26,10 +26,7 @@ BELOW_TABLE_M = 0.003
 def compute_chamfer_costs(
     mesh: SampledMesh, view: PartialView, fits: Sequence[Fit], points: Points
 ) -> Float64[np.ndarray, " n"]:
-    """Chamfer distance of each of one or more fits for a partial view, and what an unusual stand costs [m].
-
-    `points` are those of the view that count (n, 3) [m].
-    """
+    """Chamfer distance of one or more fits from those points of a view that count, and the price of odd stands [m]."""
     turns, sizes = np.stack([fit.rotation for fit in fits]), np.stack([fit.size for fit in fits])
     shifts = np.stack([fit.shift for fit in fits])
     overall = sizes.mean(axis=1)

@@ -199,8 +199,7 @@ def _make_prior(fit: Fit, kept: Vector3, proportions_std: float) -> tuple[Matrix
     mean = np.full((3, 3), 1.0 / 3.0)
     sizes = (np.eye(3) - mean) / proportions_std**2 + mean / SCALE_STD**2
     prior = np.zeros((9, 9))
-    # A round object has no heading: a weak prior keeps it in place.
-    prior[:6, :6] = np.diag([1.0] * 3 + [1e2] * 3)
+    prior[:6, :6] = np.diag([1.0] * 3 + [1e2] * 3)  # a round object has no heading: a weak prior keeps it in place
     prior[6:, 6:] = sizes
     return prior, np.concatenate([np.zeros(6), sizes @ np.log(kept / fit.size)])
 

@@ -21,6 +21,10 @@ TIPPED_STEP = float(np.deg2rad(15.0))
 MAX_STARTS, MAX_UPRIGHT_STARTS = 7, 3  # in all, and of them those on the mesh's own lower face at first
 APART_RAD, OTHER_SIZE = 0.3, 0.1
 
+# Rotations that put each of the six faces of a box down, the mesh's own first, and the axis then upright.
+_X_DOWN, _Y_DOWN = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+_OWN_DOWN, _TOP_DOWN = np.eye(3), np.diag([1.0, -1.0, -1.0])
+_DOWN_ROTATIONS = ((_OWN_DOWN, 2), (_TOP_DOWN, 2), (_X_DOWN, 0), (_X_DOWN.T, 0), (_Y_DOWN, 1), (_Y_DOWN.T, 1))
 _Spread = tuple[Vector3, Vector3, Vector3, float]  # 1 % and 99 % quantiles of the observed points, mean and top [m]
 
 
@@ -39,7 +43,7 @@ def find_initial_poses(mesh: SampledMesh, view: PartialView, folds: Sequence[int
 def _generate_guesses(mesh: SampledMesh, view: PartialView, folds: Sequence[int]) -> Iterator[Fit]:
     low, high = np.quantile(view.points, (0.01, 0.99), axis=0)
     spread = low, high, view.points.mean(axis=0), float(np.quantile(view.points[:, 2], 0.995))
-    for index, (down, axis) in enumerate(_list_down_rotations()):
+    for index, (down, axis) in enumerate(_DOWN_ROTATIONS):
         step = TIPPED_STEP if index else HEADING_STEP
         for heading in _list_headings(folds[axis], step):
             yield from _place_standing(mesh, view, spread, rotation_about_axis(2, heading) @ down)
@@ -137,10 +141,3 @@ def _drop_similar(fits: list[Fit], count: int) -> list[Fit]:
         if len(chosen) == count:
             break
     return chosen
-
-
-def _list_down_rotations() -> list[tuple[Matrix3, int]]:
-    """List rotations that put each of the six faces of a box down, the mesh's own first, and the axis then upright."""
-    x, y = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    flip = np.diag([1.0, -1.0, -1.0])
-    return [(np.eye(3), 2), (flip, 2), (x, 0), (x.T, 0), (y, 1), (y.T, 1)]

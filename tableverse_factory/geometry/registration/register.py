@@ -1,8 +1,4 @@
-"""Registration of a mesh without pose or size to the points of one view (paper section 3.1).
-
-Coarse: `initial_poses`, the best of all headings of each face that can be down, by `fit_cost`. Fine: `icp`, from these
-to some of the points, and from the best of them to more.
-"""
+"""Registration of a mesh without pose or size to the points of one view, from coarse to fine (paper section 3.1)."""
 
 from dataclasses import dataclass, replace
 

@@ -25,7 +25,6 @@ def count_heading_folds(samples: Points, tree: cKDTree, axis: int = 2) -> int:
 
 
 def _measure_misfit(asked: Points, tree: cKDTree, axis: int, turn: float) -> float:
-    """Root mean square distance from the rotated points to the samples."""
     return float(np.sqrt((tree.query(asked @ rotation_about_axis(axis, turn).T)[0] ** 2).mean()))
 
 

@@ -38,10 +38,7 @@ class Grips(Frozen):
 
 
 def find_antipodal_grips(mesh: TriangleMesh, caster: RaycastingScene, max_width: float) -> Grips:
-    """Find pairs between which a gripper that opens to `max_width` [m] can close on a mesh as it stands.
-
-    The caster holds the same mesh.
-    """
+    """Find pairs between which a gripper that opens to `max_width` [m] can close on a mesh, which the caster holds."""
     points, inward = sample_inward_normals(mesh, _SAMPLES)
     sign = compute_outward_sign(mesh)
     inward = sign * inward

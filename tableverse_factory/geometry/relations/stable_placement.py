@@ -119,7 +119,6 @@ def find_placement(
 
 
 def _list_targets(relation: Relation, x: BodyFeatures, y: BodyFeatures) -> Iterator[np.ndarray]:
-    """Generate targets for the middle of `x` [m]."""
     middle = (y.low + y.high)[:2] / 2
     if relation in _INTO:
         if y.cavity is not None:
@@ -159,10 +158,7 @@ def drop_body(
     scene: SupportSurface,
     heights: Heights,
 ) -> BodyFeatures | None:
-    """Lower a body, moved by whole cells, until it touches; None where it may not stand in the relation to `y`.
-
-    `heights` are those of the scene without the body.
-    """
+    """Lower a body, moved by whole cells, until it touches `heights`, of the scene without it; None if not allowed."""
     here = x.heights.shifted(cells, 0.0)
     window = scene.window_of(here)
     if min(window[0].start, window[1].start) < 0 or window[0].stop > heights.shape[0]:

@@ -33,10 +33,9 @@ def meshes_touch(a: MovingSolid, mesh_a: TriangleMesh, b: MovingSolid, mesh_b: T
 
 
 def find_mesh_support(meshes: Sequence[TriangleMesh]) -> Pairs:
-    """Find pairs of meshes that touch, the contact's normal pointing up from one into the other.
+    """Find pairs of meshes in the table frame that touch, the contact's normal pointing up from one into the other.
 
     The normal is the mean over all points of either surface within `REACH_M` of the other, the nearest counting most.
-    Meshes are as they stand in the table frame.
     """
     boxes = [aabb(mesh.vertices) for mesh in meshes]
     samples = [sample_surface(mesh, SAMPLES)[0] for mesh in meshes]

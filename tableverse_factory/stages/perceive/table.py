@@ -11,12 +11,12 @@ from schemas.objects import Table
 from schemas.observation import Observation
 from schemas.outcome import Dropped
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.planes import (
     Plane,
     Points2,
     compute_convex_outline,
     find_dominant_planes,
+    fit_min_rectangle,
     fit_shared_normal,
     is_inside_outline,
     measure_depth_inside,

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
 from tableverse_factory.geometry.math.planes import (
     Plane,
     compute_convex_outline,
     find_dominant_planes,
+    fit_min_rectangle,
     fit_plane,
     is_inside_outline,
     measure_depth_inside,

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
 from tableverse_factory.geometry.mesh.meshes import to_trimesh
 from tableverse_factory.geometry.mesh.voxel_solids import (

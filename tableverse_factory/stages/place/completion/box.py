@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from scipy.optimize import minimize
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import quaternion_about_z, rotation_matrix
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
@@ -17,8 +17,7 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 MIN_SIDE_M = 0.003
 CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
-PRIOR_M = 2e-4
-"""Weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]."""
+PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

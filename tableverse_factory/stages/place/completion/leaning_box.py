@@ -5,7 +5,7 @@ from jaxtyping import Float64
 from scipy.optimize import minimize
 
 from schemas.geometry import Matrix3, Points, Pose, Vector3
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     normalize_quaternion,
@@ -19,10 +19,8 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 NORMALS = 400
 AGREE_COS = 0.965
 MIN_SECOND_SHARE = 0.08
-THICKNESS_M = 0.008
-"""Initial length of a hidden side [m]."""
-SINK_WEIGHT = 0.2
-"""Weight of corners below the support, against the misfit of rays."""
+THICKNESS_M = 0.008  # initial length of a hidden side [m]
+SINK_WEIGHT = 0.2  # weight of corners below the support, against the misfit of rays
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 

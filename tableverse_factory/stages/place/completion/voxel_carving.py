@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.min_rectangle import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     invert_pose,
     multiply_quaternions,
@@ -39,15 +39,13 @@ COLUMN_CELLS = 50_000
 CELLS_UP = 30
 PIXELS_A_CELL = 1.5
 EMPTY_M = 0.0005
-TORN_SHARE = 0.1
-"""Least volume share of a second part that counts."""
+TORN_SHARE = 0.1  # least volume share of a second part that counts
 MIN_STEP_M = 0.0008
 SMOOTHING_CELLS = 0.8
 MAX_FACES = 3000
 TURN_POINTS = 800
 WORST_TURN_M = 0.01
-SLACK = 0.05
-"""Weight of distance from free space against depth in it, in the search for the axis of the half turn."""
+SLACK = 0.05  # weight of distance from free space against depth in it, in the search for the axis of the half turn
 
 
 def fit_own_frame(view: ObjectView) -> tuple[Pose, Vector3, Vector3]:

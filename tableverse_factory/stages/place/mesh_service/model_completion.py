@@ -12,7 +12,7 @@ from schemas.identity import content_hash
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb
-from tableverse_factory.geometry.math.axes import Y_UP_TO_Z_UP
+from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP
 from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid
 from tableverse_factory.geometry.mesh.voxel_solids import find_largest_part, from_manifold, simplify_solid
@@ -21,12 +21,9 @@ from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.mesh_service.client import MeshAnswer, MeshClient, MeshFile, MeshQuery, RgbdImage
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
-MAX_FACES = 4000
-"""Maximum number of faces of a completed mesh."""
-MAX_INPUT_FACES = 2_000_000
-"""Maximum number of faces of a mesh that is accepted."""
-TOLERANCE = 5e-4
-"""Initial tolerance of simplification, as a share of the longest side."""
+MAX_FACES = 4000  # maximum number of faces of a completed mesh
+MAX_INPUT_FACES = 2_000_000  # maximum number of faces of a mesh that is accepted
+TOLERANCE = 5e-4  # initial tolerance of simplification, as a share of the longest side
 _SEEDS = 2**31
 
 
