@@ -1,7 +1,6 @@
 """Relax clusters of touching objects independently of one another, which limits the cost."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 from tableverse_factory.core.errors import SolverError
@@ -16,28 +15,13 @@ Cluster = tuple[int, ...]  # indices of parts, ascending
 LINK_M = 0.01  # objects with a gap of at most this are in one cluster from the start [m]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RelaxedLayout:
-    """A layout after its clusters were relaxed.
+def relax_layout(
+    parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float
+) -> tuple[list[RigidPart], set[int]]:
+    """Find the least motion of every cluster, where those that would meet are joined; standing parts are upright.
 
-    Attributes:
-        parts: Moved; those of an unsolved cluster where they were.
-        unsolved: Parts of clusters whose least motion is too much work or was not found.
-    """
-
-    parts: tuple[RigidPart, ...]
-    unsolved: frozenset[int]
-
-
-def relax_layout(parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float) -> RelaxedLayout:
-    """Find the least motion of every cluster; clusters that would meet are joined.
-
-    All share one budget, the smallest first, so that a heap does not use up what the others need.
-
-    Args:
-        parts: Those that stand are upright and on the table.
-        support: Support relations.
-        clearance_m: The least gap [m].
+    All share one budget, the smallest first, so that a heap does not use up what the others need. Returns the parts,
+    and which of them have not been moved because the least motion of their cluster is too much work or was not found.
     """
     pairs = set(support.pairs) | _find_near_pairs(parts, [(i,) for i in range(len(parts))], LINK_M)
     allowance = SolverBudget()
@@ -54,16 +38,13 @@ def relax_layout(parts: Sequence[RigidPart], support: SupportRelation, clearance
                     moved[i] = part
         met = _find_near_pairs(moved, solved, clearance_m)
         if not met:
-            return RelaxedLayout(
-                tuple(moved), frozenset(range(len(parts))) - {i for cluster in solved for i in cluster}
-            )
+            return moved, set(range(len(parts))) - {i for cluster in solved for i in cluster}
         pairs |= met
 
 
 def _relax_cluster(
     parts: Sequence[RigidPart], cluster: Cluster, support: SupportRelation, clearance_m: float, allowance: SolverBudget
 ) -> list[RigidPart] | None:
-    """Relax the parts of a cluster; None where there is no solution."""
     own = [parts[i] for i in cluster]
     if len(own) == 1:
         return own
@@ -74,5 +55,4 @@ def _relax_cluster(
 
 
 def _find_near_pairs(parts: Sequence[RigidPart], clusters: Sequence[Cluster], reach_m: float) -> set[tuple[int, int]]:
-    """Find pairs of parts of different clusters that are nearer than a reach."""
     return {(i, j) for a, b in combinations(clusters, 2) for i in a for j in b if are_near(parts[i], parts[j], reach_m)}

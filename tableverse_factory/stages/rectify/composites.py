@@ -13,7 +13,7 @@ import numpy as np
 from schemas.config import Config
 from schemas.geometry import ConvexPieces, Pose
 from schemas.identity import MAX_STEM_CHARS, content_hash, find_name_clashes
-from schemas.objects import Evidence, PlacedObject, PlacedObjects
+from schemas.objects import PlacedObject, PlacedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.geometry.mesh.meshes import place_mesh
@@ -26,12 +26,9 @@ from tableverse_factory.stages.rectify.fill_container import ContainerFilling, f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AssembledLayout:
-    """A layout with filled containers.
+    """Objects with filled containers: copies follow their original, those that do not fit are left out.
 
-    Attributes:
-        placed: The objects, copies after their representative, without those that do not fit.
-        pieces: Of each object.
-        poses: Of each object, in the table frame; only contents have moved.
+    Each has its pieces and its pose in the table frame; only contents have moved.
     """
 
     placed: PlacedObjects
@@ -54,8 +51,6 @@ def assemble_composites(
 
 
 class _Assembly:
-    """State of the assembly over all containers of a scene."""
-
     def __init__(
         self, objects: Sequence[PlacedObject], pieces: Sequence[ConvexPieces], config: Config, rng: np.random.Generator
     ) -> None:
@@ -66,10 +61,11 @@ class _Assembly:
         self._left_out: dict[str, str] = {}
         self._config, self._rng = config, rng
         self._budget = SimulationBudget()
-        self._limit = config.rectify.max_contents
+        limit = config.rectify.max_contents
         seen = sorted(o.object_id for o in objects if o.contained_in is not None)
-        self._beyond = frozenset(seen[self._limit :])
-        self._room_for_copies = max(self._limit - len(seen), 0)
+        self._beyond = frozenset(seen[limit:])
+        self._room_for_copies = max(limit - len(seen), 0)
+        self._too_many = f"there are more than {limit} things in containers"
 
     def fill(self, root: str) -> None:
         """Assemble the composite around its outermost container, level by level."""
@@ -93,7 +89,7 @@ class _Assembly:
         self._poses.update((name, member.pose) for name, member in filling.members.items())
 
     def result(self, item: PlacedObjects) -> AssembledLayout:
-        """Make the resulting layout, in the order of `item`."""
+        """List the objects in the order of `item`, and the copies that no container takes as left out."""
         for name, uncounted in self._uncounted.items():
             if uncounted and name in self._poses and self._objects[name].contained_in is None:
                 self._miss(name, 2, uncounted + 1, "no container says where they are")
@@ -103,11 +99,13 @@ class _Assembly:
                 copies[thing.copy_of].append(name)
         order = [name for o in item.objects for name in (o.object_id, *copies[o.object_id]) if name in self._poses]
         objects = tuple(self._objects[name] for name in order)
-        evidence = None if item.evidence is None else _extend_evidence(item.evidence, item.objects, objects)
+        evidence = item.evidence
+        if evidence is not None:  # copies have the pixels of their original
+            pixels = {o.object_id: value for o, value in zip(item.objects, evidence.object_pixels, strict=True)}
+            evidence = replace(evidence, object_pixels=tuple(pixels[o.copy_of or o.object_id] for o in objects))
         placed = replace(item, objects=objects, evidence=evidence, left_out=(*item.left_out, *self._left_out.items()))
-        return AssembledLayout(
-            placed, tuple(map(self._pieces.__getitem__, order)), tuple(map(self._poses.__getitem__, order))
-        )
+        pieces, poses = tuple(self._pieces[name] for name in order), tuple(self._poses[name] for name in order)
+        return AssembledLayout(placed, pieces, poses)
 
     def _put(self, filling: ContainerFilling, name: str, holder: HollowVessel) -> bool:
         """Drop a seen content; returns whether it is in."""
@@ -118,7 +116,7 @@ class _Assembly:
             self._leave(name, str(error))
             return False
         if name in self._beyond:
-            self._leave(name, f"there are more than {self._limit} things in containers")
+            self._leave(name, self._too_many)
         elif filling.put(member, holder):
             return True
         elif not self._budget.may_drop:
@@ -134,7 +132,7 @@ class _Assembly:
         container = original.item.contained_in or ""
         for number in range(2, last + 1):
             if self._room_for_copies == 0:
-                self._miss(name, number, last, f"there are more than {self._limit} things in containers")
+                self._miss(name, number, last, self._too_many)
                 return
             copy_id = _make_copy_id(name, number, self._objects)
             thing = replace(self._objects[name], object_id=copy_id, copy_of=name)
@@ -153,7 +151,8 @@ class _Assembly:
     def _contents(self, container: str) -> list[str]:
         """List the seen contents of a container, the lowest first: others may lie on them."""
         inside = [o for o in self._objects.values() if o.contained_in == container and o.copy_of is None]
-        return [o.object_id for o in sorted(inside, key=lambda o: (_measure_lowest_m(o), o.object_id))]
+        lowest = {o.object_id: place_mesh(o.mesh, o.pose, o.scale).vertices[:, 2].min() for o in inside}
+        return sorted(lowest, key=lambda name: (lowest[name], name))
 
     def _leave(self, name: str, reason: str) -> None:
         """Leave an object out, with all that it contains."""
@@ -174,7 +173,7 @@ class _Assembly:
 def break_containment_cycles(objects: Sequence[PlacedObject]) -> tuple[PlacedObject, ...]:
     """Remove references to missing containers, and break containment cycles at the largest container."""
     holder = {o.object_id: o.contained_in for o in objects}
-    size = {o.object_id: (_compute_box_volume(o), o.object_id) for o in objects}
+    size = {o.object_id: (np.prod(aabb_size(o.mesh.vertices)) * o.scale**3, o.object_id) for o in objects}
     for name in sorted(holder):
         chain: list[str] = []
         at: str | None = name
@@ -196,17 +195,3 @@ def _make_copy_id(name: str, number: int, taken: Collection[str]) -> str:
     if len(plain) <= MAX_STEM_CHARS and plain not in find_name_clashes([*taken, plain]):
         return plain
     return f"copy-{content_hash(plain.encode())[:16]}"
-
-
-def _extend_evidence(evidence: Evidence, before: Sequence[PlacedObject], after: Sequence[PlacedObject]) -> Evidence:
-    """Extend the evidence to copies, which have the pixels of their original."""
-    pixels = {o.object_id: value for o, value in zip(before, evidence.object_pixels, strict=True)}
-    return replace(evidence, object_pixels=tuple(pixels[o.copy_of or o.object_id] for o in after))
-
-
-def _measure_lowest_m(item: PlacedObject) -> float:
-    return float(place_mesh(item.mesh, item.pose, item.scale).vertices[:, 2].min())
-
-
-def _compute_box_volume(item: PlacedObject) -> float:
-    return float(np.prod(aabb_size(item.mesh.vertices)) * item.scale**3)

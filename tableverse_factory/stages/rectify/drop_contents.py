@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from schemas.geometry import ConvexPieces, Frozen, Points, Pose, Quaternion, TriangleMesh, Vector3
+from schemas.geometry import ConvexPieces, Frozen, Points, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, MovingSolid
 from tableverse_factory.geometry.collision.solids import place_pieces
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     normalize_quaternion,
@@ -24,8 +25,7 @@ from tableverse_factory.stages.rectify.budget import SimulationBudget
 from tableverse_factory.stages.rectify.vertical import UP
 
 HEADINGS = 8  # sideways directions in which an object that overlaps is pushed clear; as many again point halfway up
-TILT_STEPS = (0.0, 0.15, 0.3, 0.5)
-"""Shares by which a long object is turned upright, where pushing alone would move it far."""
+TILT_STEPS = (0.15, 0.3, 0.5)  # shares by which a long object is turned upright, where pushing would move it far
 LONG_RATIO = 2.5
 METRES_PER_RAD = 0.05  # cost of turning an object against pushing it
 DRAWS = 16  # random poses tried for one fall; the one that starts lowest is taken
@@ -33,13 +33,7 @@ DRAWS = 16  # random poses tried for one fall; the one that starts lowest is tak
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompositeMember(Frozen):
-    """One object of a composite.
-
-    Attributes:
-        item: As it was placed.
-        pieces: Its convex pieces.
-        body: Its simulation body, at the current pose.
-    """
+    """One object of a composite: as it was placed, its pieces, and its simulation body at the current pose."""
 
     item: PlacedObject
     pieces: ConvexPieces
@@ -80,19 +74,14 @@ class Surroundings:
     """Fixed bodies from which a falling one keeps a clearance [m]; each search is charged to the budget."""
 
     def __init__(self, fixed: Sequence[MovingSolid], clearance_m: float, budget: SimulationBudget) -> None:
-        self._fixed, self._clearance_m, self._budget = fixed, clearance_m, budget
+        self._fixed, self._clearance_m, self.budget = fixed, clearance_m, budget
         self._pieces = sum(len(body.solids.starts) for body in fixed)
 
     def freed(self, member: CompositeMember, direction: Vector3) -> tuple[CompositeMember, float]:
         """Push an object clear in a direction (unit vector); returns it and the distance [m]."""
-        self._budget.comparisons -= len(member.body.hulls) * self._pieces
+        self.budget.comparisons -= len(member.body.hulls) * self._pieces
         way = LinearSweep(direction).find_first_clear([member.solid], self._fixed, self._clearance_m)
         return member.at(translate_pose(member.pose, way * direction)), way
-
-    @property
-    def affordable(self) -> bool:
-        """Whether the budget allows another search."""
-        return self._budget.may_drop
 
 
 def find_seen_starts(member: CompositeMember, around: Surroundings, holder: HollowVessel) -> Iterator[CompositeMember]:
@@ -103,7 +92,7 @@ def find_seen_starts(member: CompositeMember, around: Surroundings, holder: Holl
     found: list[tuple[float, int, CompositeMember]] = []
     for turned, angle in _tilt_upright(member):
         for direction in _list_push_directions():
-            if not around.affordable:
+            if not around.budget.may_drop:
                 break
             moved, way = around.freed(turned, direction)
             found.append((way + METRES_PER_RAD * angle, len(found), moved))
@@ -125,7 +114,7 @@ def draw_random_start(
     """
     draws = [_draw_start(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
     raised = [around.freed(start, UP)[0] for start in draws]
-    return min(raised, key=_sum_heights)
+    return min(raised, key=lambda member: sum(corner[2] for corner in aabb(member.corners)))
 
 
 def _draw_start(
@@ -139,8 +128,7 @@ def _draw_start(
     heading = quaternion_about_z(float(rng.uniform(0.0, 2 * np.pi)))
     turn = free if anyhow else multiply_quaternions(heading, member.pose.quaternion_wxyz)
     turned = member.at(Pose(np.zeros(3), normalize_quaternion(turn)))
-    corners = turned.corners
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = aabb(turned.corners)
     middle = (low + high) / 2
     return turned.at(Pose(np.array([*(at - middle[:2]), holder.floor_z - low[2]]), turned.pose.quaternion_wxyz))
 
@@ -158,8 +146,9 @@ def _tilt_upright(member: CompositeMember) -> Iterator[tuple[CompositeMember, fl
     across = np.cross(axis, UP)
     if np.linalg.norm(across) < 1e-6:
         return
-    for share in TILT_STEPS[1:]:
-        turn = _quaternion_about(across / np.linalg.norm(across), share * tilt)
+    for share in TILT_STEPS:
+        half = share * tilt / 2
+        turn = np.concatenate([[np.cos(half)], np.sin(half) * (across / np.linalg.norm(across))])
         pose = member.pose
         position = rotation_matrix(turn) @ (pose.position - middle) + middle
         turned = Pose(position, normalize_quaternion(multiply_quaternions(turn, pose.quaternion_wxyz)))
@@ -170,12 +159,3 @@ def _list_push_directions() -> list[np.ndarray]:
     angles = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
     level = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
     return [UP, *level, *((flat + UP) / np.sqrt(2.0) for flat in level)]
-
-
-def _quaternion_about(axis: np.ndarray, angle: float) -> Quaternion:
-    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-
-
-def _sum_heights(member: CompositeMember) -> float:
-    heights = member.corners[:, 2]
-    return float(heights.min() + heights.max())

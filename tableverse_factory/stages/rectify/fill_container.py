@@ -35,8 +35,7 @@ class ContainerFilling:
         self.members: dict[str, CompositeMember] = {root.item.object_id: root}
         self._root = root.item.object_id
         self._rectify, self._timestep_s = config.rectify, config.settle.timestep_s
-        self._rng = rng
-        self._budget = budget
+        self._rng, self._budget = rng, budget
 
     def holder(self, container_id: str) -> HollowVessel:
         """Make the container at its current pose."""

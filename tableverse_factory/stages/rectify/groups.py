@@ -1,6 +1,7 @@
 """Phase 1: group objects that move as one, and put the groups on the table (paper section 3.2)."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -9,8 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from tableverse_factory.geometry.collision.linear_sweep import are_within
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_box, compute_breadth, compute_overlap_ratio
 
-Entity = tuple[int, ...]
-"""Indices of an object and what it contains, the outermost container first: a composite moves as one."""
+Entity = tuple[int, ...]  # an object and what it contains, the outermost container first: a composite moves as one
 Group = tuple[Entity, ...]  # entities that stand over one another: they move sideways as one
 
 RATIO_TOLERANCE = 1e-9
@@ -38,10 +38,9 @@ def form_groups(
     boxes = [compute_box([parts[i] for i in entity]) for entity in composites]
     pairs = [
         (a, b)
-        for a in range(len(boxes))
-        for b in range(a + 1, len(boxes))
+        for a, b in combinations(range(len(boxes)), 2)
         if compute_overlap_ratio(boxes[a], boxes[b]) >= ratio - RATIO_TOLERANCE
-        and _in_contact(parts, composites[a], composites[b], contact_m)
+        and any(are_within(parts[i].body, parts[j].body, contact_m) for i in composites[a] for j in composites[b])
     ]
     return [tuple(composites[k] for k in members) for members in connect_components(pairs, len(boxes))]
 
@@ -71,10 +70,6 @@ def connect_components(pairs: Sequence[tuple[int, int]], count: int) -> list[tup
     for i, component in enumerate(label.tolist()):
         members.setdefault(component, []).append(i)
     return [tuple(found) for found in members.values()]
-
-
-def _in_contact(parts: Sequence[RigidPart], a: Entity, b: Entity, contact_m: float) -> bool:
-    return any(are_within(parts[i].body, parts[j].body, contact_m) for i in a for j in b)
 
 
 def _rank_in_entity(parts: Sequence[RigidPart], holder: Sequence[int], i: int) -> tuple[int, int, str]:

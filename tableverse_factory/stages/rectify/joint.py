@@ -2,17 +2,18 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.spatial import ConvexHull, QhullError
 
 from schemas.config import RectifyConfig
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
-from tableverse_factory.stages.rectify.clusters import RelaxedLayout, relax_layout
+from tableverse_factory.stages.rectify.clusters import relax_layout
 from tableverse_factory.stages.rectify.fault_check import LET_DOWN_M, is_faultless
 from tableverse_factory.stages.rectify.groups import Group, connect_components, form_entities, ground_groups
 from tableverse_factory.stages.rectify.lccr import RectificationResult
-from tableverse_factory.stages.rectify.levelling import level_part
 from tableverse_factory.stages.rectify.quarter_turn_symmetry import (
     apply_motion,
     count_quarter_turns,
@@ -21,14 +22,14 @@ from tableverse_factory.stages.rectify.quarter_turn_symmetry import (
 from tableverse_factory.stages.rectify.radial import compute_azimuths, order_radially, spread_groups
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, follow_body, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import SupportRelation, read_support
-from tableverse_factory.stages.rectify.vertical import UP, lift_contents
+from tableverse_factory.stages.rectify.vertical import UP, lift_contents, lift_in_turn
 
 Azimuths = Float64[np.ndarray, " n"]
 
 AT_REST_M = 1e-6  # lowering ends with a motion smaller than this [m]
 MAX_NOISE_M = 0.025  # where no part moves further, noise explains it, and the radial method is not tried [m]
-SAME_WAY_RAD = 1e-4
-"""Azimuths that differ by less are equal, so that rounding errors do not order a row of objects [rad]."""
+SAME_WAY_RAD = 1e-4  # azimuths that differ by less are equal, so that rounding errors do not order a row [rad]
+DOWN = np.array([0.0, 0.0, -1.0])
 MAX_TILT_RAD = np.radians(4.0)  # standing parts are levelled by at most this; more is no noise
 
 
@@ -78,24 +79,20 @@ def _rectify_bodies(
     if faultless:
         return list(bodies), ordered, "joint"
     upright = [
-        _put_on_table(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)
+        _stand_on_table(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)
     ]
-    near = relax_layout(upright, support, clearance)
-    start = [bodies[i] if i in near.unsolved else part for i, part in enumerate(near.parts)]
+    near, unsolved = relax_layout(upright, support, clearance)
+    method = "radial" if len(unsolved) == len(near) else "partly radial" if unsolved else "joint"
+    start = [bodies[i] if i in unsolved else part for i, part in enumerate(near)]
     moved = _remove_overlaps(start, support, ordered, clearance)
     kept = is_order_kept(compute_azimuths(bodies, ordered), compute_azimuths(moved, ordered))
-    if kept and _measure_furthest(bodies, moved) <= MAX_NOISE_M:
-        return moved, ordered, _name_method(near)
+    ways = _measure_distances(bodies, moved)
+    if kept and ways.max() <= MAX_NOISE_M:
+        return moved, ordered, method
     outward = _remove_overlaps(bodies, support, ordered, clearance)
-    if kept and _measure_motion(bodies, moved) <= _measure_motion(bodies, outward):
-        return moved, ordered, _name_method(near)
+    if kept and (ways**2).sum() <= (_measure_distances(bodies, outward) ** 2).sum():
+        return moved, ordered, method
     return outward, ordered, "radial"
-
-
-def _name_method(near: RelaxedLayout) -> str:
-    if len(near.unsolved) == len(near.parts):
-        return "radial"
-    return "partly radial" if near.unsolved else "joint"
 
 
 def is_order_kept(before: Azimuths, after: Azimuths) -> bool:
@@ -112,7 +109,8 @@ def is_order_kept(before: Azimuths, after: Azimuths) -> bool:
     ways = np.cumsum(np.concatenate([[False], _compute_turns(around)[:-1] > SAME_WAY_RAD]))
     for way in np.unique(ways):
         mine = np.flatnonzero(ways == way)
-        ended[mine] = ended[mine][np.argsort(_wrap_angles(ended[mine] - ended[mine[0]]), kind="stable")]
+        away = np.mod(ended[mine] - ended[mine[0]] + np.pi, 2 * np.pi) - np.pi
+        ended[mine] = ended[mine][np.argsort(away, kind="stable")]
     return bool(_compute_turns(ended).sum() < 3 * np.pi)
 
 
@@ -122,26 +120,26 @@ def _compute_turns(angles: Azimuths) -> Azimuths:
     return np.maximum(np.mod(steps + SAME_WAY_RAD, 2 * np.pi) - SAME_WAY_RAD, 0.0)
 
 
-def _wrap_angles(angles: Azimuths) -> Azimuths:
-    return np.mod(angles + np.pi, 2 * np.pi) - np.pi
-
-
-def _measure_furthest(before: Sequence[RigidPart], after: Sequence[RigidPart]) -> float:
-    return float(_measure_distances(before, after).max())
-
-
-def _measure_motion(before: Sequence[RigidPart], after: Sequence[RigidPart]) -> float:
-    return float((_measure_distances(before, after) ** 2).sum())
-
-
 def _measure_distances(before: Sequence[RigidPart], after: Sequence[RigidPart]) -> Float64[np.ndarray, " n"]:
     """Measure how far each part has been moved [m]."""
     ways = np.array([b.body.offset - a.body.offset for a, b in zip(before, after, strict=True)])
     return np.linalg.norm(ways, axis=1)
 
 
-def _put_on_table(part: RigidPart) -> RigidPart:
-    flat = level_part(part, MAX_TILT_RAD)
+def _stand_on_table(part: RigidPart) -> RigidPart:
+    """Put a part on the table on the hull face on which it would rest, if that takes a turn within `MAX_TILT_RAD`.
+
+    Of the downward faces within that angle it is the one nearest to the centre of mass, which is then lowest.
+    """
+    flat = part
+    with suppress(QhullError):  # of a flat part
+        planes = ConvexHull(part.body.solids.points).equations
+        within = planes[planes[:, :3] @ DOWN >= np.cos(MAX_TILT_RAD)]
+        if len(within):
+            normal = within[np.argmin(-(within[:, :3] @ part.mass_center + within[:, 3])), :3]
+            axis = np.cross(normal, DOWN)
+            sine = float(np.linalg.norm(axis))
+            flat = part.turned(axis / sine * np.arctan2(sine, float(normal @ DOWN))) if sine > 0.0 else part
     return flat.moved(-flat.lowest_now_m * UP)
 
 
@@ -149,42 +147,26 @@ def _remove_overlaps(
     parts: Sequence[RigidPart], support: SupportRelation, ordered: Sequence[Group], clearance_m: float
 ) -> list[RigidPart]:
     """Remove remaining overlaps exactly: upward within a tree, outward between trees; then lower all parts."""
-    raised = _lift_parts(parts, support, ordered, clearance_m)
+    raised, order = list(parts), order_upward(parts, support)
+    for group in ordered:
+        lift_in_turn(raised, [(i,) for i in order if (i,) in group], [], clearance_m)
     return _lower_parts(spread_groups(ground_groups(raised, ordered), ordered, clearance_m), support, clearance_m)
 
 
-def _lift_parts(
-    parts: Sequence[RigidPart], support: SupportRelation, groups: Sequence[Group], clearance_m: float
-) -> list[RigidPart]:
-    """Lift parts, carriers first, clear of those before them in their tree."""
-    ray, lifted = LinearSweep(UP), list(parts)
-    order = order_upward(parts, support)
-    for group in groups:
-        settled: list[int] = []
-        for i in (i for i in order if (i,) in group):
-            height = ray.find_first_clear([lifted[i].body], [lifted[k].body for k in settled], clearance_m)
-            lifted[i] = lifted[i].moved(height * UP)
-            settled.append(i)
-    return lifted
-
-
 def _lower_parts(parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float) -> list[RigidPart]:
-    """Lower parts until none sinks any more: one lowered late may have carried one lowered early."""
-    lowered = list(parts)
-    for _ in parts:
-        before, lowered = lowered, _lower_once(lowered, support, clearance_m)
-        if _measure_furthest(before, lowered) < AT_REST_M:
-            break
-    return lowered
+    """Lower each part, carriers first, onto the table or another part, until none sinks any more.
 
-
-def _lower_once(parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float) -> list[RigidPart]:
-    """Lower each part once, carriers first, until it meets the table or another part."""
+    That takes several rounds where one lowered late has carried one lowered early.
+    """
     ray, lowered = LinearSweep(-UP), list(parts)
-    for i in order_upward(parts, support):
-        others = [part.body for k, part in enumerate(lowered) if k != i]
-        depth = ray.room([lowered[i].body], others, clearance_m - LET_DOWN_M, lowered[i].lowest_now_m)
-        lowered[i] = lowered[i].moved(-depth * UP)
+    for _ in parts:
+        before = list(lowered)
+        for i in order_upward(before, support):
+            others = [part.body for k, part in enumerate(lowered) if k != i]
+            depth = ray.room([lowered[i].body], others, clearance_m - LET_DOWN_M, lowered[i].lowest_now_m)
+            lowered[i] = lowered[i].moved(-depth * UP)
+        if _measure_distances(before, lowered).max() < AT_REST_M:
+            break
     return lowered
 
 

@@ -12,18 +12,17 @@ from tableverse_factory.stages.rectify.radial import order_radially, spread_grou
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.vertical import disentangle, lift_contents
 
+# Phase 2: parts, ordered groups and clearance [m] to moved parts.
 SpreadFunction = Callable[[Sequence[RigidPart], Sequence[Group], float], list[RigidPart]]
-"""Phase 2: parts, ordered groups and clearance [m] to moved parts."""
 
 HANGING_M = 1e-9  # A group whose lowest vertex is higher than this hangs in the air
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RectificationResult:
-    """Result of a rectification.
+    """Moved parts, in the order in which they were given, and how they were moved.
 
     Attributes:
-        parts: As given, moved; same order.
         groups: Indices into `parts`; the root first, then in the order of their distance from it.
         method: `lccr`, `joint`, or `partly radial` and `radial` where no joint least motion was found.
     """
@@ -36,14 +35,9 @@ class RectificationResult:
 def rectify_lccr(
     parts: Sequence[RigidPart], config: RectifyConfig, spread: SpreadFunction = spread_groups
 ) -> RectificationResult:
-    """Move parts until none is nearer to another than the clearance.
+    """Move parts until none is nearer to another than the clearance, with the exact solution of phase 2 by default.
 
     The result depends on ids and geometry, not on the order of `parts`. A faultless layout is left unchanged.
-
-    Args:
-        parts: The objects.
-        config: Of the stage.
-        spread: Phase 2; the exact solution by default.
     """
     order = sorted(range(len(parts)), key=lambda i: parts[i].object_id)
     given = [parts[i] for i in order]
@@ -52,18 +46,14 @@ def rectify_lccr(
     filled = given if faultless else lift_contents(given, composites, config.clearance_m)
     groups = form_groups(filled, composites, config.overlap_ratio, config.contact_m)
     ordered = order_radially(filled, groups)
-    free = filled if faultless else _separate_groups(filled, ordered, config.clearance_m, spread)
+    if not faultless:
+        apart = spread(ground_groups(filled, ordered), ordered, config.clearance_m)
+        filled = separate_stacks(apart, ordered, config.clearance_m)
     back = {i: k for k, i in enumerate(order)}
     return RectificationResult(
-        tuple(free[back[i]] for i in range(len(parts))),
+        tuple(filled[back[i]] for i in range(len(parts))),
         tuple(tuple(tuple(order[i] for i in entity) for entity in members) for members in ordered),
     )
-
-
-def _separate_groups(
-    parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float, spread: SpreadFunction
-) -> list[RigidPart]:
-    return separate_stacks(spread(ground_groups(parts, ordered), ordered, clearance_m), ordered, clearance_m)
 
 
 def separate_stacks(apart: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:

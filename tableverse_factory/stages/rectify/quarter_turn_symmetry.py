@@ -39,7 +39,6 @@ def apply_motion(part: RigidPart, before: RigidPart, after: RigidPart, quarters:
     back = quaternion_about_z(-np.pi / 2 * quarters)
     if after.turned_by is not before.turned_by:
         there = multiply_quaternions(after.turned_by, conjugate_quaternion(before.turned_by))
-        part = part.turned_by_quaternion(
-            multiply_quaternions(multiply_quaternions(back, there), conjugate_quaternion(back))
-        )
+        turn = multiply_quaternions(multiply_quaternions(back, there), conjugate_quaternion(back))
+        part = part.turned_by_quaternion(turn)
     return part.moved(rotation_matrix(back) @ (after.mass_center_now - before.mass_center_now))

@@ -10,8 +10,7 @@ from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
 from tableverse_factory.stages.rectify.groups import Group
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_center
 
-COINCIDENT_M = 1e-9
-"""Centres nearer than this have no direction between them, and distances that differ by less are a tie."""
+COINCIDENT_M = 1e-9  # nearer centres have no direction between them; distances that differ by less are a tie [m]
 
 
 def order_radially(parts: Sequence[RigidPart], groups: Sequence[Group]) -> list[Group]:
@@ -31,14 +30,13 @@ def order_radially(parts: Sequence[RigidPart], groups: Sequence[Group]) -> list[
 def spread_groups(parts: Sequence[RigidPart], ordered: Sequence[Group], clearance_m: float) -> list[RigidPart]:
     """Move each group but the first outward by the least distance that clears it of all groups before it."""
     moved = list(parts)
-    anchors = list(list_members(moved, ordered[0]))
+    anchors = list_members(moved, ordered[0])
     origin = compute_center(anchors)
     for group in ordered[1:]:
         mine = list_members(moved, group)
         direction = compute_outward(mine, origin)
-        distance = LinearSweep(direction).find_first_clear(
-            [part.body for part in mine], [part.body for part in anchors], clearance_m
-        )
+        bodies, fixed = [part.body for part in mine], [part.body for part in anchors]
+        distance = LinearSweep(direction).find_first_clear(bodies, fixed, clearance_m)
         for entity in group:
             for i in entity:
                 moved[i] = moved[i].moved(distance * direction)

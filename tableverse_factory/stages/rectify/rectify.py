@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
 from schemas.config import Config, RectifyConfig
 from schemas.geometry import ConvexPieces
-from schemas.objects import Evidence, PlacedObject, PlacedObjects
+from schemas.objects import PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
 from tableverse_factory.core.errors import GeometryError
@@ -21,8 +22,7 @@ from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, make_rigid_part
 
 MAX_REASON_CHARS = 300
-SMALLEST_M = 0.001
-LARGEST_M = 5.0
+SMALLEST_M, LARGEST_M = 0.001, 5.0  # sides of plausible objects
 
 METHODS: dict[str, Callable[[Sequence[RigidPart], RectifyConfig], RectificationResult]] = {
     "lccr": rectify_lccr,
@@ -41,13 +41,13 @@ def rectify(
     refused: dict[str, str] = {}
     for placed in item.objects:
         try:
-            check_size(placed)
+            _check_size(placed)
             decomposed[placed.object_id] = decompose(placed.mesh, config.rectify, services.cache_dir)
         except GeometryError as error:
             refused[placed.object_id] = str(error)[:MAX_REASON_CHARS]
     if not decomposed:
         return Dropped("no_usable_mesh", f"none of {len(item.objects)} meshes can be decomposed: {refused}")
-    kept = remove_objects(item, refused)
+    kept = _remove_objects(item, refused)
     pieces = tuple(decomposed[placed.object_id] for placed in kept.objects)
     depths = measure_piece_penetrations(pieces, [o.pose for o in kept.objects], [o.scale for o in kept.objects])
     filled = assemble_composites(kept, pieces, config, rng)
@@ -70,34 +70,22 @@ def rectify(
     )
 
 
-def check_size(placed: PlacedObject) -> None:
-    """Refuse objects of implausible size.
-
-    Raises:
-        GeometryError: if the scaled mesh is smaller than 1 mm or larger than 5 m.
-    """
+def _check_size(placed: PlacedObject) -> None:
     size = placed.scale * float(aabb_size(placed.mesh.vertices).max())
     if not SMALLEST_M <= size <= LARGEST_M:
         raise GeometryError(f"the object is {size:.3g} m large; give objects of {SMALLEST_M} to {LARGEST_M} m")
 
 
-def remove_objects(item: PlacedObjects, refused: dict[str, str]) -> PlacedObjects:
+def _remove_objects(item: PlacedObjects, refused: dict[str, str]) -> PlacedObjects:
     """Remove refused objects, keeping the reasons; their contents stand on their own."""
     if not refused:
         return item
     keep = [placed.object_id not in refused for placed in item.objects]
-    return replace(
-        item,
-        objects=tuple(_release(placed, refused) for placed, kept in zip(item.objects, keep, strict=True) if kept),
-        evidence=None if item.evidence is None else _mask_evidence(item.evidence, keep),
-        left_out=(*item.left_out, *refused.items()),
+    objects = (
+        replace(placed, contained_in=None) if placed.contained_in in refused else placed
+        for placed in compress(item.objects, keep)
     )
-
-
-def _release(placed: PlacedObject, refused: dict[str, str]) -> PlacedObject:
-    return replace(placed, contained_in=None) if placed.contained_in in refused else placed
-
-
-def _mask_evidence(evidence: Evidence, keep: list[bool]) -> Evidence:
-    pixels = zip(evidence.object_pixels, keep, strict=True)
-    return replace(evidence, object_pixels=tuple(value for value, kept in pixels if kept))
+    evidence = item.evidence
+    if evidence is not None:
+        evidence = replace(evidence, object_pixels=tuple(compress(evidence.object_pixels, keep)))
+    return replace(item, objects=tuple(objects), evidence=evidence, left_out=(*item.left_out, *refused.items()))

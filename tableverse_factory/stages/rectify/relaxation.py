@@ -16,37 +16,29 @@ from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.support import ON_TABLE_M, SupportRelation
 from tableverse_factory.stages.rectify.untangle import release_parts
 
-State = Float64[np.ndarray, "n 6"]
-"""Of each part, its translation [m] and its rotation vector about its centre of mass [rad]."""
+State = Float64[np.ndarray, "n 6"]  # of each part, translation [m] and rotation vector about its centre of mass [rad]
+Planes = list[tuple[int, int, SeparatingPlane]]  # planes between two parts each
 Rows = Float64[np.ndarray, "m k"]
 Bounds = Float64[np.ndarray, " m"]
-Constraints = tuple[Rows, Bounds, Int64[np.ndarray, " m"]]
-"""`rows @ state >= bounds`, and which of them belong together."""
+Constraints = tuple[Rows, Bounds, Int64[np.ndarray, " m"]]  # `rows @ state >= bounds`, and which belong together
 
+# Motions of these sizes weigh the same, about the noise of registration; and the most along or about each axis in one
+# step, the trust region [m, rad].
 NOISE = np.array([0.007, 0.007, 0.003, np.radians(1.0), np.radians(1.0), np.radians(4.0)])
-"""Motions of these sizes weigh the same: about the noise of registration [m, rad]."""
 MAX_STEP = np.array([0.006] * 3 + [np.radians(2.0)] * 3)
-"""Trust region: the furthest that a part moves in one step along or about each axis [m, rad]."""
+# Pairs of pieces further apart are left out of a step [m]. Two parts may close 21 mm in one and collide: the next step
+# separates them, and after the last one the exact clean-up does.
 REACH_M = 0.012
-"""Pairs of pieces with more room than this between them are left out of a step [m].
-
-Two parts that both move as far as a step allows may close 21 mm and more and so collide; the next step separates them,
-and after the last one the exact clean-up does.
-"""
 WISHED_REACH_M = 0.025  # the same for a part and its carrier, which noise may have moved this far apart [m]
 STEPS, LAST_STEPS = 10, 5
-MAX_WORK = 3e9
-"""Budget of all steps of a layout, in constraints times the square of unknowns: thirty times that of ten objects in one
-place."""
+MAX_WORK = 3e9  # of all steps, in constraints times unknowns squared: thirty times that of ten objects in one place
 MAX_ENTRIES = 2e7  # corners near planes times unknowns of a step, at most: 160 MB; ten boxes in one place have 2e4
-MAX_WAYS_OUT = 5000
-"""Budget of ways out for a layout, in entangled pairs times parts: some seconds; a dozen objects have at most 800."""
+MAX_WAYS_OUT = 5000  # entangled pairs times parts of a layout: some seconds; a dozen objects have at most 800
 CONVERGED = 2e-5
 PATIENCE, STUCK_M = 4, 2e-4  # pairs that still overlap this much after this many steps are entangled [m]
 EXTRA_M = 2e-6  # added to the clearance, so that the exact clean-up has nothing to do [m]
 CONTACT_M = 0.0005  # deviation of a wished contact that costs as much as a motion by the noise [m]
-SOFTNESS = 0.05
-"""Remaining overlap, in `UNIT`, that costs as much as a motion by the noise, where the constraints contradict."""
+SOFTNESS = 0.05  # overlap left, in `UNIT`, that costs as much as a motion by the noise, where constraints contradict
 TILTS = (0.05, 0.15)  # the lowest points are searched in directions this far from straight down [rad]
 UPWARD = 0.3  # least vertical part of the normal of a wished contact
 UNIT = 1e-3  # unit of the constraints, so that all numbers are near one [m]
@@ -61,9 +53,9 @@ class SolverBudget:
 
 
 class Relaxation:
-    """Sequence of steps from the seen layout to the nearest collision-free one.
+    """Steps from the seen layout to the nearest collision-free one.
 
-    Each step minimises the motion from the seen layout, weighted by the noise, and the gaps of wished contacts, such
+    Each minimises the motion from the seen layout, weighted by the noise, and the gaps of wished contacts, such
     that every pair of pieces stays separated, no part is below the table, and each stays in its trust region.
     """
 
@@ -95,7 +87,12 @@ class Relaxation:
                 planes = self._planes(at)
                 if turning and step == PATIENCE:
                     at, planes = self._untangled(at, planes)
-                after, unsolved = self._tried(at, planes, free)
+                try:
+                    after, unsolved = self._step(at, planes, free), None
+                except WorkLimitError:
+                    raise
+                except SolverError as error:
+                    after, unsolved = at, error
                 violation = max((-plane.spare_m for _, _, plane in planes), default=0.0)
                 done = violation <= CONVERGED and np.abs(after - at).max() <= CONVERGED
                 at = after
@@ -105,31 +102,11 @@ class Relaxation:
             raise unsolved
         return self._placed(at)
 
-    def _tried(
-        self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]], free: Bool[np.ndarray, " n"]
-    ) -> tuple[State, SolverError | None]:
-        """Try a step; where it has no solution, return the same state and the error."""
-        corners = sum(len(plane.points) for _, _, plane in planes)
-        if corners * at.size > MAX_ENTRIES:
-            raise WorkLimitError(f"{corners} corners of {len(at)} parts are near planes")
-        try:
-            return self._step(at, planes, free), None
-        except WorkLimitError:
-            raise
-        except SolverError as error:
-            return at, error
-
     def _placed(self, at: State) -> list[RigidPart]:
         return [part.turned(state[3:]).moved(state[:3]) for part, state in zip(self._parts, at, strict=True)]
 
-    def _untangled(
-        self, at: State, planes: list[tuple[int, int, SeparatingPlane]]
-    ) -> tuple[State, list[tuple[int, int, SeparatingPlane]]]:
-        """Move entangled parts the shortest way out; returns the state and its planes.
-
-        Raises:
-            WorkLimitError: if too much is entangled.
-        """
+    def _untangled(self, at: State, planes: Planes) -> tuple[State, Planes]:
+        """Move entangled parts the shortest way out; returns the state and its planes."""
         stuck = sorted({(i, j) for i, j, plane in planes if plane.spare_m < -STUCK_M})
         if not stuck:
             return at, planes
@@ -148,9 +125,9 @@ class Relaxation:
             free[:, 3:] = False
         return free.ravel()
 
-    def _planes(self, at: State) -> list[tuple[int, int, SeparatingPlane]]:
+    def _planes(self, at: State) -> Planes:
         stances = [self._stance(i, state) for i, state in enumerate(at)]
-        found: list[tuple[int, int, SeparatingPlane]] = []
+        found: Planes = []
         for i, j in combinations(range(len(stances)), 2):
             spare = self._parts[i].body.uncovered_m + self._parts[j].body.uncovered_m
             margin = max(self._clearance + spare, MIN_MARGIN_M)
@@ -166,14 +143,14 @@ class Relaxation:
         body, pivot = self._parts[i].body, self._pivots[i]
         return PosedPieces(body.solids, rotation, rotation @ (body.offset - pivot) + pivot + state[:3])
 
-    def _step(
-        self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]], free: Bool[np.ndarray, " n"]
-    ) -> State:
+    def _step(self, at: State, planes: Planes, free: Bool[np.ndarray, " n"]) -> State:
         """Find the state nearest to the seen layout that all linearised planes allow."""
-        blocks = [self._apart(at, planes), self._on_table(at), self._trusted(at)]
-        rows = np.concatenate([rows for rows, _, _ in blocks]) / UNIT
-        bounds = np.concatenate([bounds for _, bounds, _ in blocks]) / UNIT
-        owners = np.concatenate([owners for _, _, owners in blocks])
+        corners = sum(len(plane.points) for _, _, plane in planes)
+        if corners * at.size > MAX_ENTRIES:
+            raise WorkLimitError(f"{corners} corners of {len(at)} parts are near planes")
+        blocks = zip(self._apart_and_on_table(at, planes), self._trusted(at), strict=True)
+        rows, bounds, owners = (np.concatenate(block) for block in blocks)
+        rows, bounds = rows / UNIT, bounds / UNIT
         wishes, wished = self._wishes(at, planes)
         fixed = at.ravel()[~free]
         bounds, wished = bounds - rows[:, ~free] @ fixed, wished - wishes[:, ~free] @ fixed
@@ -183,16 +160,14 @@ class Relaxation:
         state[free] = self._noise[free] * motion
         return state.reshape(-1, 6)
 
-    def _apart(self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]]) -> Constraints:
-        """Make the constraints of the planes, grouped by pairs of parts."""
-        rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    def _apart_and_on_table(self, at: State, planes: Planes) -> Constraints:
+        """Make the constraints of the planes, grouped by pairs of parts, and that no part sinks into the table."""
+        blocks: list[tuple[Bounds, Rows, int]] = []
         for i, j, plane in planes:
             near = plane.spares_m <= REACH_M
-            block = self._moves(at, i, j, plane, near)
-            rows.append(block)
-            bounds.append(block @ at.ravel() - plane.spares_m[near])
-            owners.append(np.full(len(block), i * len(at) + j))
-        return np.concatenate(rows), np.concatenate(bounds), np.concatenate(owners)
+            blocks.append((plane.spares_m[near], self._moves(at, i, j, plane, near), i * len(at) + j))
+        blocks += [(*self._heights(at, i, points), i * len(at) + i) for i, points in self._lowest.items()]
+        return _linearize(at, blocks)
 
     def _moves(self, at: State, i: int, j: int, plane: SeparatingPlane, which: Bool[np.ndarray, " k"]) -> Rows:
         """Derivatives of the separation at corners of a plane by the motions of both bodies."""
@@ -205,16 +180,6 @@ class Relaxation:
             rows[:, 6 * k + 3 : 6 * k + 6] = sign * arm @ turn
         return rows
 
-    def _on_table(self, at: State) -> Constraints:
-        """Make the constraints that no part sinks into the table."""
-        rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
-        for i, points in self._lowest.items():
-            heights, block = self._heights(at, i, points)
-            rows.append(block)
-            bounds.append(block @ at.ravel() - heights)
-            owners.append(np.full(len(block), i * len(at) + i))
-        return np.concatenate(rows), np.concatenate(bounds), np.concatenate(owners)
-
     def _heights(self, at: State, i: int, points: Float64[np.ndarray, "k 3"]) -> tuple[Bounds, Rows]:
         """Heights of points of a part above the table, and their derivatives."""
         rotation = rotation_matrix(quaternion_from_rotation_vector(at[i, 3:]))
@@ -225,31 +190,36 @@ class Relaxation:
         return arm[:, 2] + self._pivots[i, 2] + at[i, 2], rows
 
     def _trusted(self, at: State) -> Constraints:
-        """Make the constraints of the trust region."""
         rows = np.concatenate([np.eye(at.size), -np.eye(at.size)])
         return rows, rows @ at.ravel() - np.tile(MAX_STEP, 2 * len(at)), np.full(len(rows), -1, dtype=np.int64)
 
-    def _wishes(self, at: State, planes: Sequence[tuple[int, int, SeparatingPlane]]) -> tuple[Rows, Bounds]:
+    def _wishes(self, at: State, planes: Planes) -> tuple[Rows, Bounds]:
         """Make the wishes that carried parts touch their carriers."""
-        rows, wished = [np.zeros((0, at.size))], [np.zeros(0)]
+        blocks: list[tuple[Bounds, Rows, int]] = []
         best: dict[tuple[int, int], SeparatingPlane] = {}
         for i, j, plane in planes:
             if plane.direction[2] * self._support.rise(i, j) > UPWARD:
-                known = best.get((i, j))
-                if known is None or plane.spare_m < known.spare_m:
-                    best[(i, j)] = plane
+                best[(i, j)] = min(best.get((i, j), plane), plane, key=lambda found: found.spare_m)
         for (i, j), plane in best.items():
             first = plane.spares_m == plane.spares_m.min()
-            block = self._moves(at, i, j, plane, first)[:1]
-            rows.append(block / CONTACT_M)
-            wished.append((block @ at.ravel() - plane.spare_m) / CONTACT_M)
+            blocks.append((np.array([plane.spare_m]), self._moves(at, i, j, plane, first)[:1], -1))
         for i, points in self._lowest.items():
             if self._parts[i].lowest_now_m < ON_TABLE_M:
-                heights, block = self._heights(at, i, points)
+                heights, rows = self._heights(at, i, points)
                 least = [int(np.argmin(heights))]
-                rows.append(block[least] / CONTACT_M)
-                wished.append((block[least] @ at.ravel() - heights[least]) / CONTACT_M)
-        return np.concatenate(rows), np.concatenate(wished)
+                blocks.append((heights[least], rows[least], -1))
+        rows, wished, _ = _linearize(at, blocks)
+        return rows / CONTACT_M, wished / CONTACT_M
+
+
+def _linearize(at: State, blocks: Sequence[tuple[Bounds, Rows, int]]) -> Constraints:
+    """Make the constraints that values stay positive, of their current ones, their derivatives and their owners."""
+    rows, bounds, owners = [np.zeros((0, at.size))], [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
+    for values, block, owner in blocks:
+        rows.append(block)
+        bounds.append(block @ at.ravel() - values)
+        owners.append(np.full(len(block), owner))
+    return np.concatenate(rows), np.concatenate(bounds), np.concatenate(owners)
 
 
 def _find_lowest_points(part: RigidPart) -> Float64[np.ndarray, "k 3"]:

@@ -28,7 +28,7 @@ Vector2 = Float64[np.ndarray, "2"]
 Box2 = Float64[np.ndarray, "2 2"]  # lowest and highest corner, seen from above [m]
 
 FOOTPRINT_STEP_M2 = 1e-10
-LEAST_VOLUME_M3 = 1e-18
+LEAST_VOLUME_M3 = 1e-18  # of a piece, so that no part weighs nothing
 
 
 class _Measures(TypedDict):
@@ -38,20 +38,18 @@ class _Measures(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidPart:
-    """One object, where it is now.
+    """One object: where it was placed, turned by `turned_by` since, and moved by `body.offset`, which only `_now` adds.
 
     Attributes:
         object_id: Decides ties, so that the order of a file does not matter.
-        container_id: The object that holds it, or None.
-        body: Its pieces and their translation.
-        box: Top-view box of the mesh where it was placed [m].
-        lowest_m: Height of the lowest vertex of mesh and pieces where it was placed [m].
+        box: Top-view box of the mesh [m].
+        lowest_m: Height of the lowest vertex of mesh and pieces [m].
         footprint_m2: Area of the convex hull of its pieces seen from above, where it was placed [m²].
         heading: Its own x axis seen from above (y where x is upright), unit length.
-        mass_center: Centre of mass of its pieces where it was placed [m].
+        mass_center: Centre of mass of its pieces [m].
         volume_m3: Of its pieces, overlaps counted twice [m³].
-        vertices: Of its mesh where it was placed. Shape (n, 3) [m].
-        turned_by: Rotation about its centre of mass since it was placed; all values above include it.
+        vertices: Of its mesh. Shape (n, 3) [m].
+        turned_by: Rotation about its centre of mass.
     """
 
     object_id: str
@@ -131,14 +129,15 @@ def make_rigid_part(item: PlacedObject, pieces: ConvexPieces) -> RigidPart:
     """Make the part of a placed object."""
     solids = place_pieces(pieces, item.pose, item.scale)
     vertices = place_mesh(item.mesh, item.pose, item.scale).vertices
-    volume, center = _volume_and_center(pieces)
+    volumes, centers = compute_volumes_and_centers(pieces.hulls, LEAST_VOLUME_M3)
+    center = np.average(centers, axis=0, weights=volumes)  # in the mesh's own frame
     return RigidPart(
         object_id=item.object_id,
         container_id=item.contained_in,
         body=MovingSolid(solids, np.zeros(3), item.scale * pieces.uncovered_m),
         heading=_compute_heading(rotation_matrix(item.pose.quaternion_wxyz)),
         mass_center=transform_points(item.pose, center[None], item.scale)[0],
-        volume_m3=volume * item.scale**3,
+        volume_m3=float(volumes.sum()) * item.scale**3,
         footprint_m2=_compute_hull_area(solids.points[:, :2]),
         vertices=vertices,
         turned_by=np.array([1.0, 0.0, 0.0, 0.0]),
@@ -198,13 +197,6 @@ def compute_breadth(parts: Sequence[RigidPart]) -> int:
     return round(max(part.footprint_m2 for part in parts) / FOOTPRINT_STEP_M2)
 
 
-def _volume_and_center(pieces: ConvexPieces) -> tuple[float, Vector3]:
-    """Compute volume (never 0) and centre of pieces, overlaps counted twice, in the mesh's own frame at scale 1."""
-    volumes, centers = compute_volumes_and_centers(pieces.hulls, LEAST_VOLUME_M3)
-    center: Vector3 = np.average(centers, axis=0, weights=volumes)
-    return float(volumes.sum()), center
-
-
 def _measure_extent(vertices: Points, solids: Solids) -> _Measures:
     low, high = aabb(vertices)
     return {"box": np.array([low[:2], high[:2]]), "lowest_m": float(min(low[2], solids.low[:, 2].min()))}
@@ -219,8 +211,7 @@ def _compute_hull_area(points: Points) -> float:
 
 def _compute_heading(rotation: Float64[np.ndarray, "3 3"]) -> Vector2:
     axes = rotation[:2, :2].T
-    axis = axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1]
-    return _normalize(axis)
+    return _normalize(axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1])
 
 
 def _normalize(axis: Vector2) -> Vector2:

@@ -13,14 +13,12 @@ from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, are_
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, Vector2
 
 TILT_NOISE_DEG = 3.0  # an object is as good as upright if it would stand when tilted by up to this
-BASIN_DEG = 6.0
-"""Tilted by this much, a standing object has its centre of mass higher than for some tilt within the noise."""
+BASIN_DEG = 6.0  # so far tilted, a standing object has its centre of mass higher than for some tilt within the noise
 BASIN_TOLERANCE_M = 2e-4  # round objects stand in any direction: their centre of mass must not sink by more than this
 ON_TABLE_M = 0.008  # an object whose lowest vertex is higher than this does not stand on the table
 
 VERTICAL_NOISE_M = 0.012  # an object that must rise or sink by no more than this to lie upon another may lie upon it
-STEEP_NOISE_M = 0.025
-"""The same at steep edges, which turn sideways noise into height, if the opposite order is twice as far."""
+STEEP_NOISE_M = 0.025  # so at steep edges, which turn sideways noise into height, if the opposite is twice as far
 NEEDY_REACH = 1.5  # factor on the contact distance for an object that could not stand alone
 LEANING_REACH_M = 0.02  # noise may have moved an object this far from the one it leans on
 
@@ -31,9 +29,8 @@ Outline = Float64[np.ndarray, "n 3"]  # half planes (normal, offset) around a fo
 class SupportRelation:
     """Support relations of a layout.
 
-    Attributes:
-        pairs: (upper, lower): the lower part carries or contains the upper one, or is leant on by it.
-        standing: Whether the table alone carries each part.
+    In each pair (upper, lower) the lower part carries or contains the upper one, or is leant on by it. The table alone
+    carries standing parts.
     """
 
     pairs: frozenset[tuple[int, int]]
@@ -75,8 +72,6 @@ def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelatio
 
 
 class _Reader:
-    """Properties of parts that decide about pairs."""
-
     def __init__(self, parts: Sequence[RigidPart]) -> None:
         self._parts = parts
         self._falls = [_find_fall_direction(part) for part in parts]

@@ -15,7 +15,7 @@ def lift_contents(parts: Sequence[RigidPart], composites: Sequence[Entity], clea
     """Lift the contents of each composite, one after the other, out of their container and of one another."""
     lifted = list(parts)
     for entity in composites:
-        _raise_in_turn(lifted, [(i,) for i in entity], [], clearance_m)
+        lift_in_turn(lifted, [(i,) for i in entity], [], clearance_m)
     return lifted
 
 
@@ -24,33 +24,23 @@ def disentangle(
 ) -> list[RigidPart]:
     """Lift entities of smaller footprint until they are disjoint from the broader ones of their group.
 
-    Args:
-        parts: All parts.
-        groups: Indices into `parts`.
-        clearance_m: The gap that counts as disjoint [m].
-        against_all: Also keep clear of the other groups, under whose overhang a part might rise.
+    With `against_all` they also keep clear of the other groups, under whose overhang a part might rise.
     """
     lifted = list(parts)
     for group in groups:
         own = {i for entity in group for i in entity}
         others = [i for i in range(len(parts)) if i not in own] if against_all else []
-        _raise_in_turn(lifted, order_by_footprint(parts, group), others, clearance_m)
+        lift_in_turn(lifted, sorted(group, key=lambda entity: _rank_by_footprint(parts, entity)), others, clearance_m)
     return lifted
 
 
-def order_by_footprint(parts: Sequence[RigidPart], group: Group) -> list[Entity]:
-    """Order the entities of a group, the broadest first; ties go by object id."""
-
-    def rank(entity: Entity) -> tuple[int, str]:
-        own = [parts[i] for i in entity]
-        return -compute_breadth(own), min(part.object_id for part in own)
-
-    return sorted(group, key=rank)
+def _rank_by_footprint(parts: Sequence[RigidPart], entity: Entity) -> tuple[int, str]:
+    own = [parts[i] for i in entity]
+    return -compute_breadth(own), min(part.object_id for part in own)
 
 
-def _raise_in_turn(
-    parts: list[RigidPart], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float
-) -> None:
+def lift_in_turn(parts: list[RigidPart], order: Sequence[Entity], obstacles: Sequence[int], clearance_m: float) -> None:
+    """Lift all entities but the first, in place, clear of those before them and of the obstacles."""
     ray = LinearSweep(UP)
     settled = list(order[0])
     for entity in order[1:]:
