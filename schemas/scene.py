@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.curation import Assessment
 from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
 from schemas.rows import normalize_row
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,8 +7,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from schemas.tables import SCENES
 from schemas.outcome import ModelCost
+from schemas.tables import SCENES
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.card_yaml import make_front_matter

@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from upath import UPath
 
-from schemas.tables import TABLES
 from schemas.identity import content_hash
+from schemas.tables import TABLES
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, atomic_file, list_sizes, read_whole, remove_folder
 from tableverse_factory.core.storage.parquet import PARQUET_OPTIONS, ROW_GROUP

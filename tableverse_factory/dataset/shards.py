@@ -9,8 +9,8 @@ from typing import Any, BinaryIO
 
 import pyarrow as pa
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.trajectory_files import find_misfits

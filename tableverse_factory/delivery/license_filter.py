@@ -10,8 +10,8 @@ from urllib.parse import unquote, urlsplit, urlunsplit
 
 import pyarrow as pa
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from schemas.identity import content_hash
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
 from tableverse_factory.core.storage.files import StoragePath, atomic_file, list_names, open_stream, write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet, read_table

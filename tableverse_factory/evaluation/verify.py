@@ -7,8 +7,8 @@ from typing import Any
 
 import pyarrow.compute as pc
 
-from schemas.tables import TABLES
 from schemas.config import TrajectoriesConfig
+from schemas.tables import TABLES
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import Dataset, open_dataset

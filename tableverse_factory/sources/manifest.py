@@ -4,11 +4,11 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from schemas.tables import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
 from schemas.identity import content_hash
 from schemas.manifest import ImageRow, SceneKind
+from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import BuildError, GeometryError, InputError
 from tableverse_factory.core.storage.files import StoragePath, parse_path, write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet

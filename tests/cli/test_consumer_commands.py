@@ -8,8 +8,8 @@ import mujoco
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.tables import OBJECTS
 from schemas.config import Config
+from schemas.tables import OBJECTS
 from tableverse_factory.core.config import fingerprint_config, load_config
 from tests.helpers.captures_on_disk import write_capture, write_picture
 from tests.helpers.small_dataset import scene_files, write_small_dataset

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.scene import ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet

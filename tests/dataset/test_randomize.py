@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from schemas.tables import TABLES
 from schemas.geometry import Camera, Pose
 from schemas.scene import ExportedScene
+from schemas.tables import TABLES
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.png import encode_png

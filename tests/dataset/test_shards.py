@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.tables import OBJECTS
 from schemas.scene import Certificate, ExportedScene
+from schemas.tables import OBJECTS
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import atomic_file, write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet

@@ -7,9 +7,9 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.config import Config
 from schemas.scene import Certificate, ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import write_atomic

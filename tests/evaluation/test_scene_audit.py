@@ -8,10 +8,10 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from schemas.tables import TABLES
 from schemas.config import Config
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
+from schemas.tables import TABLES
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet

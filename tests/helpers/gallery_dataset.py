@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import trimesh
 from PIL import Image
 
-from schemas.tables import TABLES
 from schemas.geometry import Camera, Pose, TriangleMesh
+from schemas.tables import TABLES
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.slab import Slab

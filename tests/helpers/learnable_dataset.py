@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.trajectories import Motion
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.core.storage.files import write_atomic

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from schemas.scene import Certificate, ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shard_plan import Plan, write_plan

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import trimesh
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.scene import Certificate, ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shards import TarShard, shard_path

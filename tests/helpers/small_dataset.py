@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.scene import Certificate, ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shards import TarShard, shard_path

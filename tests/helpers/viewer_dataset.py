@@ -7,8 +7,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from schemas.scene import Certificate, ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.dataset import Scene, open_dataset

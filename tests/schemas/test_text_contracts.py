@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from schemas.tables import MANIFEST
 from schemas.detection import MAX_DETECTIONS, Detections
 from schemas.layout import MAX_OBJECTS, Layout
 from schemas.manifest import ImageRow
+from schemas.tables import MANIFEST
 from tableverse_factory.core.text import describe_validation_error
 
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.tables import MANIFEST
 from schemas.config import ObserveConfig
 from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
+from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout, write_picture

@@ -18,11 +18,11 @@ import pyarrow.parquet as pq
 import ray
 import ray.data
 
-from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shards import TarShard, check_exported, tar_sort_key

@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from typing import Any, BinaryIO
 
-from schemas.tables import STORED_TABLES
 from schemas.codec import decode
 from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene
+from schemas.tables import STORED_TABLES
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import (

@@ -11,12 +11,12 @@ from typing import Any, Literal
 import mujoco
 from threadpoolctl import threadpool_limits
 
-from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
+from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.memoize import clear_caches
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import write_atomic

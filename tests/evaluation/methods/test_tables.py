@@ -12,11 +12,11 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from schemas.tables import TABLES
 from schemas.config import Config
 from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene, SettledScene
+from schemas.tables import TABLES
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shards import TarShard

@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from schemas.tables import SCENES
 from schemas.config import Config, CurateConfig, ObserveConfig
 from schemas.outcome import ModelCost
+from schemas.tables import SCENES
 from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.parquet import build_table

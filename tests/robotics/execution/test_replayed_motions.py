@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.tables import TABLES
 from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
+from schemas.tables import TABLES
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.shards import TarShard

@@ -8,12 +8,12 @@ import math
 import pytest
 from PIL import Image
 
-from schemas.tables import SCENES, TASKS
 from schemas.codec import decode, encode
 from schemas.config import Config, CurateConfig
 from schemas.curation import Assessment, Relation
 from schemas.outcome import Done, Dropped, ModelCost
 from schemas.scene import Certificate
+from schemas.tables import SCENES, TASKS
 from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.tables import TRAJECTORIES
 from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.geometry import Pose
 from schemas.outcome import Done
 from schemas.scene import ExportedScene
+from schemas.tables import TRAJECTORIES
 from schemas.trajectories import Placement
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
 from tableverse_factory.models.services import Services

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from schemas.tables import TRAJECTORIES
 from schemas.codec import encode
 from schemas.config import Config
 from schemas.curation import TaskAssessment
 from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
+from schemas.tables import TRAJECTORIES
 from schemas.trajectories import Grasps
 from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
 from tableverse_factory.models.services import Services

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from schemas.tables import SCENES
 from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.detection import Detections
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
 from schemas.scene import Certificate
+from schemas.tables import SCENES
 from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError, ModelError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table
