@@ -138,11 +138,9 @@ class _FileSearch:
         bases = self._bases()
         known = {path.name for path in self.files}  # `strippath` may leave only the name
         for value in self.references:
-            if PurePosixPath(value).name not in known and not any(self._holds(base / value) for base in bases):
+            paths = (Path(os.path.realpath(os.path.normpath(base / value))) for base in bases)
+            if PurePosixPath(value).name not in known and not any(path.is_relative_to(self.root) for path in paths):
                 raise self._outside(sanitize_line(value, 80))
-
-    def _holds(self, path: Path) -> bool:
-        return Path(os.path.realpath(os.path.normpath(path))).is_relative_to(self.root)
 
     def _outside(self, called: str) -> InputError:
         return InputError(

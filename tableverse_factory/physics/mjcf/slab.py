@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float64
@@ -33,8 +34,8 @@ def fit_slab(table: Table, meshes: Sequence[TriangleMesh], poses: Sequence[Pose]
     """Widen the table's rectangle until every object stands `OBJECT_MARGIN_M` inside its edges."""
     low, high = -table.half_size_xy, np.array(table.half_size_xy)
     for mesh, pose, scale in zip(meshes, poses, scales, strict=True):
-        corners = transform_points(pose, _list_box_corners(mesh), scale)[:, :2]
-        along = _rotate_to_slab(corners - table.center_xy, table.yaw)
+        corners = np.array([*product(*zip(*aabb(mesh.vertices), strict=True))])
+        along = _rotate_to_slab(transform_points(pose, corners, scale)[:, :2] - table.center_xy, table.yaw)
         low = np.minimum(low, along.min(axis=0) - OBJECT_MARGIN_M)
         high = np.maximum(high, along.max(axis=0) + OBJECT_MARGIN_M)
     middle = _rotate_to_slab(((low + high) / 2)[None], -table.yaw)[0]
@@ -44,8 +45,3 @@ def fit_slab(table: Table, meshes: Sequence[TriangleMesh], poses: Sequence[Pose]
 def _rotate_to_slab(points_xy: Float64[np.ndarray, "n 2"], yaw: float) -> Float64[np.ndarray, "n 2"]:
     c, s = np.cos(yaw), np.sin(yaw)
     return points_xy @ np.array([[c, -s], [s, c]])
-
-
-def _list_box_corners(mesh: TriangleMesh) -> Points:
-    low, high = aabb(mesh.vertices)
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

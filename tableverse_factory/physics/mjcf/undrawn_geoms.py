@@ -19,20 +19,13 @@ def find_undrawn_geoms(
 
     `data` holds the positions of the geoms.
     """
-    corners = _compute_box_corners(model, data, drawn)
+    index = np.array(drawn, dtype=int)
+    middle, half = np.split(model.geom_aabb[index], 2, axis=1)
+    local = middle[:, None] + half[:, None] * _CORNERS  # of each geom's own box
+    turn = data.geom_xmat[index].reshape(-1, 3, 3)
+    corners = np.einsum("nij,nkj->nki", turn, local) + data.geom_xpos[index][:, None]
     rest = (geom for geom in solid if geom not in drawn)
     return [geom for geom in rest if _measure_filled_share(model, data, geom, corners) < MIN_DRAWN_SHARE]
-
-
-def _compute_box_corners(
-    model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int]
-) -> Float64[np.ndarray, "n 8 3"]:
-    """Compute the corners of the geoms' own boxes in the world [m]."""
-    index = np.array(geoms, dtype=int)
-    middle, half = np.split(model.geom_aabb[index], 2, axis=1)
-    local = middle[:, None] + half[:, None] * _CORNERS
-    turn = data.geom_xmat[index].reshape(-1, 3, 3)
-    return np.einsum("nij,nkj->nki", turn, local) + data.geom_xpos[index][:, None]
 
 
 def _measure_filled_share(

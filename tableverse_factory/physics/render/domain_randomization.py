@@ -18,16 +18,12 @@ from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
 
 MAX_XML_BYTES = 64 * 1024 * 1024
 CAMERA = "observation"
-CAMERA_SHIFT_M = 0.03
-CAMERA_TURN_RAD = float(np.deg2rad(2.0))
-CAMERA_ZOOM = 0.04
-"""Bounds of the camera's shift along each axis, rotation about each, and change of the field of view in proportion."""
-
-LIGHT_ELEVATION_RAD = (float(np.deg2rad(35.0)), float(np.deg2rad(80.0)))
-LIGHT_STRENGTH = (0.55, 1.1)
-LIGHT_WARMTH = 0.12
-"""Bounds of a light: elevation over the table, relative strength, and how much more red and less blue."""
-
+CAMERA_SHIFT_M = 0.03  # most shift of the camera along each axis
+CAMERA_TURN_RAD = float(np.deg2rad(2.0))  # and rotation about each
+CAMERA_ZOOM = 0.04  # and change of the field of view in proportion
+LIGHT_ELEVATION_RAD = (float(np.deg2rad(35.0)), float(np.deg2rad(80.0)))  # bounds over the table
+LIGHT_STRENGTH = (0.55, 1.1)  # bounds of the relative strength
+LIGHT_WARMTH = 0.12  # bound of how much more red and less blue
 _OTHER_ORIENTATIONS = ("euler", "axisangle", "xyaxes", "zaxis", "target")
 
 
@@ -41,12 +37,9 @@ def randomize_appearance(
 ) -> dict[str, bytes]:
     """Randomize the appearance of a scene; returns new files and leaves the given ones.
 
-    Args:
-        files: `scene.xml` and its assets.
-        table_png: Texture repeated over the table; None keeps the present one.
-        tile_m: Length of table that the picture covers [m].
-        lights: Seed for position, strength and warmth of every light, or None.
-        camera: Seed for the pose of the camera `observation`, which is added where it is missing, or None.
+    `table_png` is repeated over the table every `tile_m` [m]; None keeps the present texture. `lights` is a seed for
+    position, strength and warmth of every light, `camera` one for the pose of the camera `observation`, which is added
+    where it is missing.
 
     Raises:
         InputError: `bad_mjcf` if `scene.xml` is absent or no MJCF, or has no table to change.
@@ -92,7 +85,6 @@ def _decode_text(data: bytes) -> str:
 
 
 def _cover_table(root: ET.Element, tile_m: float) -> None:
-    """Give the table's geom a material of its own, the texture repeated as often as it fits."""
     _, geom = _find_table(root)
     half = _numbers(geom.get("size", ""))
     asset = find_or_add_child(root, "asset")
@@ -167,7 +159,6 @@ def _add_camera(root: ET.Element, world: ET.Element, rng: np.random.Generator) -
 
 
 def _find_table(root: ET.Element) -> tuple[ET.Element, ET.Element]:
-    """Find the table's body and its box."""
     for body in root.iter("body"):
         geom = next((g for g in body.findall("geom") if g.get("type") == "box"), None)
         if body.get("name") == TABLE and geom is not None and len(_numbers(geom.get("size", ""))) == 3:

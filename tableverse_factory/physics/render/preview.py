@@ -42,15 +42,14 @@ class PreviewRenderer:
         away = np.einsum("hwk,hwk->hw", normals, rays[..., 3:]) > 0.0
         facing = normals @ _TOWARDS_LIGHT
         facing = np.maximum(np.where(away, -facing, facing), 0.0)
-        lit = self._lit(rays, answer["t_hit"].numpy(), ids)
-        light = _AMBIENT + _KEY * facing * lit
+        light = _AMBIENT + _KEY * facing * self._lit(rays, answer["t_hit"].numpy(), ids)
         picture = self._colored(ids, answer) * light[..., None]
         picture[ids < 0] = _BACKGROUND
         return np.clip(picture, 0.0, 255.0).astype(np.uint8), ids
 
     def _lit(self, rays: Float32[np.ndarray, "h w 6"], depth: np.ndarray, ids: IdImage) -> np.ndarray:
         """Compute the share of light that reaches the surface, less in shadow. Shape (h, w)."""
-        coarse = (slice(None, None, _COARSE), slice(None, None, _COARSE))
+        coarse = np.s_[::_COARSE, ::_COARSE]
         seen = ids[coarse] >= 0
         start = rays[coarse][seen]
         away = depth[coarse][seen][:, None] - np.float32(_OFFSET_M)
@@ -68,10 +67,8 @@ class PreviewRenderer:
         colors: Float32[np.ndarray, "h w 3"] = plain[ids]
         triangles, uv = answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
         for index, mesh in enumerate(self._parts):
-            if mesh.texture is None and mesh.vertex_colors is None:
-                continue
             here = np.nonzero(ids == index)
-            if not len(here[0]):
+            if not len(here[0]) or (mesh.texture is None and mesh.vertex_colors is None):
                 continue
             faces, inside = triangles[here], uv[here]
             weights = np.stack([1.0 - inside.sum(axis=1), inside[:, 0], inside[:, 1]], axis=1)

@@ -9,19 +9,15 @@ from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 
-SURFACE_OFFSET_M = 1e-4
-"""Rays that leave a surface start this far off it: less than any wall, more than float32's error at a metre."""
+SURFACE_OFFSET_M = 1e-4  # start of rays that leave a surface: less than any wall, more than float32's error at a metre
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hits(Frozen):
-    """Hits of a camera's rays, in pixel order (row by row).
+    """Hits of a camera's rays, in the order of pixels of the flattened picture: the mesh (`part`), face and point hit.
 
     Attributes:
-        pixels: Index of the pixel in the flattened picture. Shape (n,).
         depth: Distance along the optical axis [m]. Shape (n,), float32.
-        part: Index of the mesh that is hit. Shape (n,), int32.
-        triangles: Index of its face. Shape (n,).
         weights: Barycentric weights of the face's corners. Shape (n, 3), float32.
         points: World positions [m]. Shape (n, 3).
         normals: Unit normals of the faces, towards the eye. Shape (n, 3), float32.
@@ -65,12 +61,7 @@ class Raycaster:
         )
 
     def blocked(self, hits: Hits, directions: np.ndarray) -> np.ndarray:
-        """Test whether a mesh blocks each hit in its direction. Shape (n,), bool.
-
-        Args:
-            hits: Where the rays start.
-            directions: One for all, shape (3,), or one each, shape (n, 3), in the world frame.
-        """
+        """Whether a mesh blocks each hit in its world direction: one for all, (3,), or one each, (n, 3). Shape (n,)."""
         rays = pack_rays(hits.points + hits.normals * np.float32(SURFACE_OFFSET_M), directions)
         return self._caster.test_occlusions(rays, nthreads=1).numpy()
 

@@ -17,8 +17,7 @@ from tableverse_factory.physics.render.raycast import Hits, Raycaster
 
 Rgb = tuple[float, float, float]
 Pattern = Callable[[Points], Float64[np.ndarray, "n 3"]]  # world positions [m] to sRGB in 0–255, point by point
-Paint = Rgb | Pattern | None
-"""One sRGB colour in 0–255, a pattern, or None: the mesh's own texture or vertex colours, else grey."""
+Paint = Rgb | Pattern | None  # sRGB in 0–255, a pattern, or None: the mesh's own texture or vertex colours, else grey
 
 _GREY: Rgb = (178.0, 178.0, 184.0)
 GAMMA = 2.2
@@ -28,14 +27,11 @@ _GOLDEN_ANGLE = float(np.pi * (3.0 - np.sqrt(5.0)))
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """Light in linear RGB, 1.0 being a white surface at full exposure.
+    """Light in linear RGB, 1.0 being a white surface at full exposure: a key light, sky from +z, ground from -z.
 
     Attributes:
         key_direction: From the scene towards the key light, any length.
-        key: Radiance of the key light on a surface that faces it.
         key_radius: Half the angle under which the key light is seen [rad]: softens shadows.
-        sky: Ambient light from +z.
-        ground: Ambient light from -z.
         gloss: Strength of the highlight of the key light, 0 for matt.
         background: sRGB in 0–255 where nothing is hit.
     """
@@ -54,10 +50,9 @@ class Rendering(Frozen):
     """Images of a pinhole camera.
 
     Attributes:
-        color: Shape (h, w, 3) sRGB.
-        depth: Shape (h, w) float32, distance along the optical axis [m]; 0 where nothing is hit.
-        ids: Shape (h, w) int32, index of the part that is seen; -1 where nothing is hit.
-        normals: Shape (h, w, 3) float32, unit normals of the faces in the world frame, towards the eye; 0 on a miss.
+        depth: Distance along the optical axis [m]; 0 where nothing is hit.
+        ids: Index of the part that is seen; -1 where nothing is hit.
+        normals: Unit normals of the faces in the world frame, towards the eye; 0 where nothing is hit.
     """
 
     color: Picture
@@ -67,15 +62,10 @@ class Rendering(Frozen):
 
 
 def look_at(eye: Vector3, target: Vector3, up: Vector3 | None = None) -> Pose:
-    """The camera-to-world pose (OpenCV axes: x right, y down, z forward) of an eye that looks at a target.
+    """The camera-to-world pose (OpenCV axes: x right, y down, z forward) of an eye that looks at a target [m].
 
-    Args:
-        eye: Position of the camera [m]. Shape (3,).
-        target: A point on the optical axis [m]. Shape (3,).
-        up: World direction that points up in the picture; +z by default. Looking along it, +y is used instead.
-
-    Raises:
-        ValueError: if eye and target coincide.
+    `up` points up in the picture, +z by default; looking along it, +y is used instead. ValueError if the points
+    coincide.
     """
     eye = np.asarray(eye, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - eye
@@ -86,7 +76,7 @@ def look_at(eye: Vector3, target: Vector3, up: Vector3 | None = None) -> Pose:
     upward = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, dtype=np.float64)
     right = np.cross(forward, upward)
     if float(np.linalg.norm(right)) < 1e-6 * float(np.linalg.norm(upward)):
-        right = np.cross(forward, np.array([0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0]))
+        right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right = right / np.linalg.norm(right)
     return Pose(eye, quaternion_from_matrix(np.stack([right, np.cross(forward, right), forward], axis=1)))
 
@@ -167,7 +157,9 @@ def _render_view(
         offset = ((index % samples + 0.5) / samples - 0.5, (index // samples + 0.5) / samples - 0.5)
         hits = center if samples == 1 else caster.cast(camera, camera_to_world, offset)
         seen = np.broadcast_to(srgb_to_linear(np.array(lighting.background)), linear.shape).copy()
-        seen[hits.pixels] = _shade(surfaces, hits, camera_to_world.position, lighting, key_light, sky_light)
+        normals, albedo = surfaces.at(hits)
+        ambient, direct = compute_light(hits.points, normals, albedo, camera_to_world.position, lighting)
+        seen[hits.pixels] = ambient * sky_light[hits.pixels, None] + direct * key_light[hits.pixels, None]
         linear += seen
     color = np.rint(255.0 * np.clip(linear / samples**2, 0.0, 1.0) ** (1 / GAMMA)).astype(np.uint8)
     depth, ids = np.zeros(linear.shape[0], dtype=np.float32), np.full(linear.shape[0], -1, dtype=np.int32)
@@ -228,28 +220,12 @@ def _sample_texture(texture: Texture, triangles: np.ndarray, weights: np.ndarray
     return (1.0 - down) * upper + down * lower
 
 
-def _shade(
-    surfaces: Surfaces, hits: Hits, eye: Vector3, lighting: Lighting, key_light: np.ndarray, sky_light: np.ndarray
-) -> np.ndarray:
-    normals, albedo = surfaces.at(hits)
-    ambient, direct = compute_light(hits.points, normals, albedo, eye, lighting)
-    return ambient * sky_light[hits.pixels, None] + direct * key_light[hits.pixels, None]
-
-
 def compute_light(
     points: Points, normals: np.ndarray, albedo: np.ndarray, eye: Vector3, lighting: Lighting
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute linear colours of surface points under an open sky and an unoccluded key light.
+    """Compute linear colours that the open sky and the unoccluded key light give surface points. Both (n, 3).
 
-    Args:
-        points: In the world frame [m]. Shape (n, 3).
-        normals: Unit normals towards the eye. Shape (n, 3).
-        albedo: Linear colours of the surface. Shape (n, 3).
-        eye: Position of the camera [m]. Shape (3,).
-        lighting: Key light and sky.
-
-    Returns:
-        The contributions of the sky and of the key light, before occlusion. Both (n, 3).
+    `points` and `eye` are in the world frame [m]; `normals` have length 1, towards the eye; `albedo` is linear.
     """
     to_light = _normalize(np.array(lighting.key_direction))
     facing = np.maximum(normals @ to_light, 0.0)[:, None]
@@ -257,9 +233,8 @@ def compute_light(
     key = np.array(lighting.key)
     half = _normalize(_normalize(eye - points) + to_light)
     shine = lighting.gloss * np.maximum(_dot(normals, half), 0.0)[:, None] ** 48 * (facing > 0.0)
-    ambient: np.ndarray = albedo * (up * np.array(lighting.sky) + down * np.array(lighting.ground))
-    direct: np.ndarray = albedo * (facing * key) + shine * key
-    return ambient, direct
+    ambient = albedo * (up * np.array(lighting.sky) + down * np.array(lighting.ground))
+    return ambient, albedo * (facing * key) + shine * key
 
 
 def compute_light_maps(

@@ -4,23 +4,23 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose
+from schemas.geometry import Camera, IdImage, Picture, Points, Pose
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.physics.mjcf.scenery import Scenery
 from tableverse_factory.physics.render.preview import PreviewRenderer
 from tableverse_factory.physics.render.render import Rendering, look_at, render_views
 
+Box = tuple[float, float, float, float]  # left, top, right and bottom [px]
+
 FRONT_ELEVATION = float(np.deg2rad(38.0))
 FIELD_OF_VIEW = float(np.deg2rad(34.0))  # vertical, of the front and top views: narrow, so that heights compare
-
 SHEET_SIDE = 512  # of each view of a judge's sheet [px]: labels are legible, in a quarter of a second
-
 _MARGIN = 1.12
 _NEAREST_M = 0.15
 BOX_COLORS = ("#d1242f", "#0969da", "#1a7f37", "#8250df", "#bf3989", "#9a6700", "#0f766e", "#57606a")
@@ -28,13 +28,7 @@ BOX_COLORS = ("#d1242f", "#0969da", "#1a7f37", "#8250df", "#bf3989", "#9a6700", 
 
 @dataclass(frozen=True, slots=True)
 class RenderQuality:
-    """Quality of a picture.
-
-    Attributes:
-        samples: Side of the grid of samples in a pixel.
-        sky_rays: Ambient occlusion rays per pixel.
-        shadows: Whether the key light throws shadows.
-    """
+    """Quality of a picture, see `render`."""
 
     samples: int = 1
     sky_rays: int = 0
@@ -49,14 +43,8 @@ def render_pictures(
     scenery: Scenery, eyes: Sequence[PosedCamera], quality: RenderQuality = FAST
 ) -> tuple[Rendering, ...]:
     """Render the scene from each camera; shared data is prepared once."""
-    return render_views(
-        scenery.parts,
-        [(eye.camera, eye.camera_to_table) for eye in eyes],
-        paints=scenery.colors,
-        shadows=quality.shadows,
-        sky_rays=quality.sky_rays,
-        samples=quality.samples,
-    )
+    views = [(eye.camera, eye.camera_to_table) for eye in eyes]
+    return render_views(scenery.parts, views, paints=scenery.colors, **asdict(quality))
 
 
 def make_front_camera(
@@ -85,10 +73,7 @@ def resize_camera(camera: Camera, width: int) -> Camera:
 def draw_judge_sheet(scenery: Scenery, labels: Sequence[str], side: int = SHEET_SIDE) -> Picture:
     """Draw the front view on the left and the top view on the right, with boxes, numbers and labels.
 
-    Args:
-        scenery: Of the scene.
-        labels: Of each object, in the order of `scenery.names`; untrusted text, drawn and cut to fit.
-        side: Of each view [px].
+    `labels`, in the order of `scenery.names`, are untrusted text, drawn and cut to fit; a view has `side` [px].
     """
     sketcher = PreviewRenderer(scenery.parts, scenery.colors)
     views = []
@@ -98,47 +83,31 @@ def draw_judge_sheet(scenery: Scenery, labels: Sequence[str], side: int = SHEET_
     return np.concatenate(views, axis=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Tag(Frozen):
-    text: str
-    color: str
-    box: tuple[int, int, int, int]
-
-
 def draw_boxes(picture: Picture, ids: IdImage, labels: Sequence[str]) -> Picture:
     """Draw a 2D box around each visible part, and a tag `number: label` at its corner."""
     image = Image.fromarray(np.array(picture))
     draw = ImageDraw.Draw(image)
     font = ImageFont.load_default(size=max(12.0, picture.shape[0] / 48))
-    tags = [_make_tag(ids, number, label) for number, label in enumerate(labels)]
-    taken: list[tuple[float, float, float, float]] = []
-    for tag in (tag for tag in tags if tag is not None):
-        draw.rectangle(tag.box, outline=tag.color, width=2)
-    for tag in (tag for tag in tags if tag is not None):
-        place = _find_free_place(draw.textbbox((0, 0), tag.text, font=font), tag.box, image.size, taken)
+    boxes = {number: box for number in range(len(labels)) if (box := _find_box(ids, number))}
+    taken: list[Box] = []
+    for number, box in boxes.items():
+        draw.rectangle(box, outline=BOX_COLORS[number % len(BOX_COLORS)], width=2)
+    for number, box in boxes.items():
+        latin = labels[number].encode("latin-1", "replace").decode("latin-1")  # all that the built-in font has
+        text = f"{number}: {latin}" if len(latin) <= 28 else f"{number}: {latin[:25]}..."
+        place = _find_free_place(draw.textbbox((0, 0), text, font=font), box, image.size, taken)
         taken.append(place)
-        draw.rectangle(place, fill=tag.color)
-        draw.text((place[0] + 3, place[1] + 1), tag.text, fill="white", font=font)
+        draw.rectangle(place, fill=BOX_COLORS[number % len(BOX_COLORS)])
+        draw.text((place[0] + 3, place[1] + 1), text, fill="white", font=font)
     return np.asarray(image)
 
 
-def _make_tag(ids: IdImage, number: int, label: str) -> _Tag | None:
+def _find_box(ids: IdImage, number: int) -> Box | None:
     rows, columns = np.nonzero(ids == number)
-    if not len(rows):
-        return None
-    # The built-in font has Latin letters only.
-    latin = label.encode("latin-1", "replace").decode("latin-1")
-    text = f"{number}: {latin}" if len(latin) <= 28 else f"{number}: {latin[:25]}..."
-    box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max()))
-    return _Tag(text, BOX_COLORS[number % len(BOX_COLORS)], box)
+    return (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max())) if len(rows) else None
 
 
-def _find_free_place(
-    text: tuple[float, float, float, float],
-    box: tuple[int, int, int, int],
-    size: tuple[int, int],
-    taken: Sequence[tuple[float, float, float, float]],
-) -> tuple[float, float, float, float]:
+def _find_free_place(text: Box, box: Box, size: tuple[int, int], taken: Sequence[Box]) -> Box:
     """Find the place above, below, within or beside the box, in the picture, that covers least of other tags."""
     width, height = text[2] + 6, text[3] + 4
     left, top, right, bottom = box
@@ -146,14 +115,14 @@ def _find_free_place(
     rows = [top - height, bottom, top, bottom - height, top - 2 * height, bottom + height]
     corners = [(x, y) for y in rows for x in columns]
     corners += [(x, y) for y in (top, bottom - height) for x in (right, left - width)]
-    places = []
+    places: list[Box] = []
     for x, y in corners:
         x, y = min(max(x, 0), max(size[0] - width, 0)), min(max(y, 0), max(size[1] - height, 0))
         places.append((x, y, x + width, y + height))
     return min(places, key=lambda place: sum(_measure_overlap(place, other) for other in taken))
 
 
-def _measure_overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> float:
+def _measure_overlap(a: Box, b: Box) -> float:
     """Area that two rectangles share [px²]."""
     return max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
 
@@ -165,14 +134,7 @@ def _frame_objects(scenery: Scenery, orientation: Pose, width: int, height: int)
 
 
 def frame_points(points: Points, orientation: Pose, width: int, height: int) -> PosedCamera:
-    """Make the nearest camera of this orientation that sees all points, with a margin.
-
-    Args:
-        points: In the table frame [m]. Shape (n, 3).
-        orientation: Camera to table; its position is ignored.
-        width: Of the picture [px].
-        height: Of the picture [px].
-    """
+    """Make the nearest camera of this orientation (camera to table) that sees all points [m], with a margin."""
     focal = height / (2 * np.tan(FIELD_OF_VIEW / 2))
     camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     rotation = rotation_matrix(orientation.quaternion_wxyz)

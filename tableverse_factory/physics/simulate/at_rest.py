@@ -13,29 +13,19 @@ from tableverse_factory.geometry.math.transforms import normalize_quaternion, ro
 from tableverse_factory.physics.simulate.mujoco_sleep import allow_sleep
 
 SPEED_LIMIT = 0.01  # at rest every object moves slower than this, in m/s and in rad/s
-
 ACCELERATION_LIMIT = 0.5  # and changes its speed by less than this between samples, in m/s² and in rad/s²
-
 HOLD_S = 0.2  # time for which this must hold without a break [s]
-
 GENTLE_S = 0.4
 GENTLE_RATE = 40.0  # while settling gently, speed decays with this rate [1/s]: a free fall ends at 0.25 m/s
-
 STEPS_PER_SAMPLE = 5
 STEPS_PER_SLEEP_CHECK = 25  # steps between checks whether all bodies sleep
 
+# Velocities that every body is given before its drift is measured, and again `NUDGE_INTERVAL_S` later [m/s, rad/s].
+# Friction stops them within a step or two, but a body on its tip or edge falls, which would depend on rounding errors
+# otherwise. No direction across the table is at right angles to both.
 NUDGES = 1e-6 * np.array([[1.0, 1, 1, 1, 1, 1], [1, -1, 1, 1, -1, 1]])
-"""Velocities that every body is given before its drift is measured, and again `NUDGE_INTERVAL_S` later [m/s, rad/s].
-
-Friction stops them within a step or two, but a body on its tip or edge falls, which otherwise would depend on rounding
-errors. No direction across the table is at right angles to both.
-"""
-
 NUDGE_INTERVAL_S = 0.1  # sleep is allowed after it
-
-DRIFT_SLEEP_TOLERANCE = 1e-9
-"""Sleeping bodies would have moved by 5 nm in the certificate's 5 s; most settled ones stand at 1e-15."""
-
+DRIFT_SLEEP_TOLERANCE = 1e-9  # sleeping bodies would move by 5 nm in the certificate's 5 s; most stand at 1e-15
 UNSTABLE = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -48,12 +38,9 @@ UNSTABLE = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rest(Frozen):
-    """Outcome of a simulation.
+    """Outcome of a simulation, with the free bodies in the order of the model.
 
     Attributes:
-        at_rest: Whether rest was measured within the time.
-        time_s: Simulated time [s].
-        poses: Pose of each free body at the end, in the order of the model.
         speeds: Largest |qvel| component of each body within the last `HOLD_S` [m/s or rad/s].
         moving: Which bodies were faster, or changed their speed faster, than rest allows within that time.
         warnings: Names of MuJoCo's warnings that invalidate the result.
@@ -69,14 +56,9 @@ class Rest(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift(Frozen):
-    """Motion of each body over some further time.
+    """Motion of each body's centre of mass over some further time, its rotation, and the pose at the end.
 
-    Attributes:
-        distance_m: Displacement of each body's centre of mass [m].
-        sunk_m: How far each centre of mass went down [m]; negative where it rose.
-        angle_rad: Rotation of each body [rad].
-        poses: Where they are at the end.
-        warnings: As in `Rest`.
+    `sunk_m` is how far it went down, negative where it rose [m].
     """
 
     distance_m: Float64[np.ndarray, " n"]
@@ -97,7 +79,7 @@ def simulate_to_rest(
     """Step the model from its initial state until all free bodies are at rest, or `max_time_s` has passed.
 
     Args:
-        model: Its free bodies are observed, in its order.
+        model: Its free bodies are observed.
         max_time_s: Bound on simulated time [s].
         gentle: First sink with strong damping, so that small gaps close without a kick; then move freely.
         lost_below_m: The simulation ends early once the centre of mass of a body is lower than this [m].
@@ -108,8 +90,9 @@ def simulate_to_rest(
     if gentle:
         _settle_gently(model, data, min(GENTLE_S, max_time_s))
     velocity = data.qvel[dofs]
-    speeds = deque([_compute_speeds(velocity)], maxlen=_count_samples(model))
-    moving = deque([np.ones(len(bodies), dtype=bool)], maxlen=_count_samples(model))
+    samples = max(1, round(HOLD_S / (STEPS_PER_SAMPLE * float(model.opt.timestep))))  # of the speed within `HOLD_S`
+    speeds = deque([_compute_speeds(velocity)], maxlen=samples)
+    moving = deque([np.ones(len(bodies), dtype=bool)], maxlen=samples)
     held_since, resting, lost = data.time, False, False
     while data.time < max_time_s and not (resting or lost or _list_warnings(data)):
         mujoco.mj_step(model, data, nstep=STEPS_PER_SAMPLE)
@@ -153,18 +136,14 @@ def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
 
 def read_body_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int]) -> tuple[Pose, ...]:
     """Read the poses of free bodies from the generalised positions."""
-    starts = [_position_address(model, body) for body in bodies]
-    return tuple(
-        Pose(data.qpos[s : s + 3].copy(), normalize_quaternion(data.qpos[s + 3 : s + 7].copy())) for s in starts
-    )
+    rows = (data.qpos[start : start + 7].copy() for start in _list_position_indices(model, bodies))
+    return tuple(Pose(row[:3], normalize_quaternion(row[3:])) for row in rows)
 
 
 def set_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int], poses: Sequence[Pose]) -> None:
     """Set the poses of free bodies."""
-    for body, pose in zip(bodies, poses, strict=True):
-        start = _position_address(model, body)
-        data.qpos[start : start + 3] = pose.position
-        data.qpos[start + 3 : start + 7] = pose.quaternion_wxyz
+    for start, pose in zip(_list_position_indices(model, bodies), poses, strict=True):
+        data.qpos[start : start + 7] = [*pose.position, *pose.quaternion_wxyz]
 
 
 def make_quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
@@ -174,21 +153,16 @@ def make_quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def _list_velocity_indices(model: mujoco.MjModel, bodies: Sequence[int]) -> Int64[np.ndarray, "n 6"]:
-    first = np.array([int(model.body_dofadr[body]) for body in bodies], dtype=np.int64)
-    return first[:, None] + np.arange(6)
+    return model.body_dofadr[list(bodies)].astype(np.int64)[:, None] + np.arange(6)
 
 
-def _position_address(model: mujoco.MjModel, body: int) -> int:
-    return int(model.jnt_qposadr[model.body_jntadr[body]])
+def _list_position_indices(model: mujoco.MjModel, bodies: Sequence[int]) -> list[int]:
+    """List the first index of each free body's position and quaternion in `qpos`."""
+    return model.jnt_qposadr[model.body_jntadr[list(bodies)]].tolist()
 
 
 def _compute_speeds(velocity: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray, " n"]:
     return np.abs(velocity).max(axis=1, initial=0.0)
-
-
-def _count_samples(model: mujoco.MjModel) -> int:
-    """Count the samples of speed within `HOLD_S`."""
-    return max(1, round(HOLD_S / (STEPS_PER_SAMPLE * float(model.opt.timestep))))
 
 
 def _settle_gently(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:

@@ -7,7 +7,7 @@ from itertools import compress
 import mujoco
 import numpy as np
 
-from schemas.geometry import Pose, TriangleMesh
+from schemas.geometry import Pose
 from schemas.scene import Certificate
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh
@@ -26,17 +26,14 @@ Depth = tuple[float, str]  # depth of the deepest pair [m], and its names joined
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """Measurements of a MuJoCo model.
+    """Measurements of a MuJoCo model and its free bodies, by name.
 
     Attributes:
-        bodies: Names of the free bodies.
         pieces: Deepest contact between geoms in the initial state.
         meshes: Deepest shared volume between visible meshes in the initial state.
         drift_m: Largest displacement of a centre of mass over `DRIFT_TIME_S` [m].
-        drift_rad: Largest rotation over the same time [rad].
-        moved: Names of the bodies beyond the limits of drift.
-        fell: Names of the bodies that sank by more than `FALL_M`.
-        warnings: MuJoCo's warnings during the simulation.
+        moved: Bodies beyond the limits of drift.
+        fell: Bodies that sank by more than `FALL_M`.
         repaired: Geoms whose mesh had to be closed for the measurement, and how.
         end_poses: Where the bodies are after the drift time.
     """
@@ -68,26 +65,21 @@ def measure_model(model: mujoco.MjModel) -> Measurement:
 
 
 def certify(model: mujoco.MjModel, history: PoseHistory, epsilon_m: float) -> tuple[Certificate, Measurement]:
-    """Certify an exported scene from its compiled files.
-
-    Args:
-        model: Compiled from `scene.xml` and its assets.
-        history: Its earlier poses, which the XML does not hold.
-        epsilon_m: Depth below which a touch is no collision [m].
-    """
+    """Certify an exported scene from its compiled files; a touch less deep than `epsilon_m` [m] is no collision."""
     moving, still = load_bodies(model)
     now = _measure(model, moving, still)
     poses = read_body_poses(model, mujoco.MjData(model), find_free_bodies(model))
     before = [history.rectified.get(thing.name, pose) for thing, pose in zip(moving, poses, strict=True)]
-    shift = {
-        thing.name: _measure_displacement(thing.mesh, history.placed[thing.name], pose)
-        for thing, pose in zip(moving, poses, strict=True)
-        if thing.name in history.placed
-    }
+    shift = {}
+    for thing, pose in zip(moving, poses, strict=True):
+        if placed := history.placed.get(thing.name):
+            center = box_center(thing.mesh)[None]
+            moved = transform_points(pose, center) - transform_points(placed, center)
+            shift[thing.name] = float(np.linalg.norm(moved))
     certificate = Certificate(
         epsilon_m=epsilon_m,
         piece_penetration_before_m=find_deepest_contact(model, before)[0],
-        mesh_penetration_before_m=_find_deepest_overlap(find_deepest_overlaps(moving, before, still))[0],
+        mesh_penetration_before_m=_find_deepest_overlap(moving, before, still)[0],
         piece_penetration_m=now.pieces[0],
         mesh_penetration_m=now.meshes[0],
         drift_m=now.drift_m,
@@ -109,7 +101,7 @@ def _measure(model: mujoco.MjModel, moving: Sequence[ModelBody], still: ModelBod
     return Measurement(
         bodies=names,
         pieces=find_deepest_contact(model, poses),
-        meshes=_find_deepest_overlap(find_deepest_overlaps(moving, poses, still)),
+        meshes=_find_deepest_overlap(moving, poses, still),
         drift_m=float(drift.distance_m.max(initial=0.0)),
         drift_rad=float(drift.angle_rad.max(initial=0.0)),
         moved=tuple(compress(names, too_far)),
@@ -133,16 +125,9 @@ def find_deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
     return float(depths[worst]), " & ".join(body_name(model, int(root)) for root in roots[worst])
 
 
-def _find_deepest_overlap(overlaps: Sequence[tuple[str, str, float]]) -> Depth:
-    if not overlaps:
-        return 0.0, ""
-    a, b, depth = max(overlaps, key=lambda overlap: overlap[2])
-    return depth, f"{a} & {b}"
-
-
-def _measure_displacement(mesh: TriangleMesh, before: Pose, after: Pose) -> float:
-    center = box_center(mesh)[None]
-    return float(np.linalg.norm(transform_points(after, center) - transform_points(before, center)))
+def _find_deepest_overlap(moving: Sequence[ModelBody], poses: Sequence[Pose], still: ModelBody) -> Depth:
+    found = ((depth, f"{a} & {b}") for a, b, depth in find_deepest_overlaps(moving, poses, still))
+    return max(found, key=lambda overlap: overlap[0], default=(0.0, ""))
 
 
 def _find_spilled(

@@ -7,7 +7,6 @@ composite is then as free as rectification requires, and settling closes the gap
 from collections.abc import Sequence
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 
 from tableverse_factory.geometry.mesh.meshes import place_mesh
@@ -15,11 +14,9 @@ from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.mjcf.spec import TABLE, SceneBody, make_scene_spec
 from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 
+# Of contents that are shaken down: at the friction of everyday surfaces they bridge the void below.
 SLIPPERY_FRICTION, SLIPPERY_ROLLING_FRICTION = 0.1, 0.001
-"""Of contents that are shaken down: at the friction of everyday surfaces they bridge the void below."""
-
-LOST_BELOW_M = 0.05  # A body that sinks this far below all fixed ones has missed them
-
+LOST_BELOW_M = 0.05  # a body that sinks this far below all fixed ones has missed them
 _EMPTY_SLAB = Slab(np.zeros(2), np.ones(2), 0.0, (0, 0, 0))
 
 
@@ -32,7 +29,7 @@ def simulate_fall(
     max_time_s: float,
     slippery: bool = False,
 ) -> Rest:
-    """Let bodies fall, gently at first, until they rest on the fixed ones or on one another.
+    """Let bodies fall, gently at first, until they rest on the fixed ones or on one another; returns them in order.
 
     Args:
         fixed: Stand still where they are.
@@ -41,32 +38,18 @@ def simulate_fall(
         timestep_s: Step of the simulation [s].
         max_time_s: Bound on simulated time [s]; it also ends when a body misses the fixed ones.
         slippery: With almost no friction, as if the container were shaken.
-
-    Returns:
-        The outcome, with the poses of the falling bodies in their order.
     """
     if slippery:
         fixed, falling = [_make_slippery(body) for body in fixed], [_make_slippery(body) for body in falling]
-    spec = _make_spec(fixed, falling, gap_m, timestep_s)
-    return simulate_to_rest(spec.compile(), max_time_s, gentle=True, lost_below_m=_compute_lost_height(fixed))
-
-
-def _make_spec(
-    fixed: Sequence[SceneBody], falling: Sequence[SceneBody], gap_m: float, timestep_s: float
-) -> mujoco.MjSpec:
     spec, _ = make_scene_spec([*fixed, *falling], _EMPTY_SLAB, timestep_s=timestep_s, visuals=False)
     spec.delete(spec.body(TABLE))
     for body in fixed:
         spec.delete(spec.joint(body.object_id))
     for geom in spec.geoms:
         geom.margin = gap_m / 2
-    return spec
+    foot = min(float(place_mesh(body.mesh, body.pose).vertices[:, 2].min()) for body in fixed)
+    return simulate_to_rest(spec.compile(), max_time_s, gentle=True, lost_below_m=foot - LOST_BELOW_M)
 
 
 def _make_slippery(body: SceneBody) -> SceneBody:
     return replace(body, friction=SLIPPERY_FRICTION, rolling_friction=SLIPPERY_ROLLING_FRICTION)
-
-
-def _compute_lost_height(fixed: Sequence[SceneBody]) -> float:
-    foot = min(float(place_mesh(body.mesh, body.pose).vertices[:, 2].min()) for body in fixed)
-    return foot - LOST_BELOW_M

@@ -32,7 +32,6 @@ from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies
 
 _MIN_CROPPED_FACES = 500  # of fewer the whole solid is made
-
 _SEGMENTS = 48
 _PLANE_REACH_M = 50.0
 
@@ -41,11 +40,7 @@ class GeomSolid:
     """One geom in the frame of its body.
 
     A closed mesh is made a solid only when its box meets another's, and only as far as that other can reach, as making
-    solids is the most expensive step.
-
-    Attributes:
-        mesh: Visible shape.
-        repaired: How a mesh that is no closed solid was repaired, e.g. `obj_003: filled`, or empty.
+    solids is the most expensive step. `repaired` is empty, or how another mesh was closed, e.g. `obj_003: filled`.
     """
 
     def __init__(self, name: str, mesh: TriangleMesh) -> None:
@@ -67,9 +62,7 @@ class GeomSolid:
     @cached_property
     def is_plain(self) -> bool:
         """Whether the mesh bounds a solid by one surface, without repair."""
-        if self._solid is not None or not is_one_shell(self.mesh):
-            return False
-        return compute_signed_volume(self.mesh) > 0.0
+        return self._solid is None and is_one_shell(self.mesh) and compute_signed_volume(self.mesh) > 0.0
 
     @property
     def _is_flat(self) -> bool:
@@ -85,12 +78,7 @@ class GeomSolid:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelBody(Frozen):
-    """Geometry that moves as one: a free body with its children, or all static geometry.
-
-    Attributes:
-        name: Of the free body, `#7` where body 7 has none; `world` for static geometry.
-        parts: Visible shape, a part per geom, in the frame of the body.
-    """
+    """Geometry that moves as one, in the frame of the body: a free body with its children, or all static (`world`)."""
 
     name: str
     parts: tuple[GeomSolid, ...]
@@ -116,11 +104,9 @@ def load_bodies(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody
     mujoco.mj_kinematics(model, data)
     free = find_free_bodies(model)
     roots = model.body_rootid[model.geom_bodyid]
-    still = ~np.isin(roots, free)
-    moving = tuple(
-        _load_body(model, data, body_name(model, root), root, np.flatnonzero(roots == root)) for root in free
-    )
-    return moving, _load_body(model, data, "world", 0, np.flatnonzero(still))
+    own = ((body_name(model, root), root, np.flatnonzero(roots == root)) for root in free)
+    moving = tuple(_load_body(model, data, *body) for body in own)
+    return moving, _load_body(model, data, "world", 0, np.flatnonzero(~np.isin(roots, free)))
 
 
 def body_name(model: mujoco.MjModel, body: int) -> str:

@@ -12,43 +12,31 @@ from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_spec, quantize_pose
 from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 
+# For a body that rocks forever on the rounded edge of a piece, kicked by contacts that jump between its ends. It is
+# written in the XML and in meta.json of the bodies that needed it.
 STEADIER_ROLLING_FRICTION = 0.02
-"""For a body that rocks forever on the rounded edge of a piece, kicked by contacts that jump between its ends. It is
-written in the XML and in meta.json of the bodies that needed it.
-"""
 
 
 def bring_to_rest(
     bodies: Sequence[SceneBody], slab: Slab, *, timestep_s: float, max_time_s: float, gentle: bool
 ) -> tuple[tuple[SceneBody, ...], Rest]:
-    """Simulate to rest; where the time is up before, again with more rolling friction for the restless bodies.
+    """Simulate to rest; where `max_time_s` is up before, again with more rolling friction for the restless bodies.
 
-    Args:
-        bodies: In the order of the answer.
-        slab: The table under them.
-        timestep_s: Step of the simulation [s].
-        max_time_s: Bound on the simulated time of each try [s].
-        gentle: As in `simulate_to_rest`.
-
-    Returns:
-        The bodies where they ended, and the outcome of the last try, with the time of both.
+    Returns the bodies where they ended, in their order, and the outcome of the last try, with the time of both.
     """
     ended, rest = _simulate(bodies, slab, timestep_s, max_time_s, gentle)
     if rest.at_rest or rest.warnings or find_fallen(ended, slab):
         return ended, rest
-    steady = increase_rolling_friction(
-        ended, {b.object_id for b, restless in zip(ended, rest.moving, strict=True) if restless}
-    )
+    restless = {body.object_id for body, moving in zip(ended, rest.moving, strict=True) if moving}
+    steady = increase_rolling_friction(ended, restless)
     ended, again = _simulate(steady, slab, timestep_s, max_time_s, gentle=False)
     return ended, replace(again, time_s=rest.time_s + again.time_s)
 
 
 def increase_rolling_friction(bodies: Sequence[SceneBody], restless: set[str]) -> tuple[SceneBody, ...]:
     """Give the named bodies `STEADIER_ROLLING_FRICTION`."""
-    return tuple(
-        replace(body, rolling_friction=STEADIER_ROLLING_FRICTION) if body.object_id in restless else body
-        for body in bodies
-    )
+    steady = STEADIER_ROLLING_FRICTION
+    return tuple(replace(b, rolling_friction=steady) if b.object_id in restless else b for b in bodies)
 
 
 def move_bodies(bodies: Sequence[SceneBody], poses: Sequence[Pose]) -> tuple[SceneBody, ...]:

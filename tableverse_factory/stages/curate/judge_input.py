@@ -25,15 +25,11 @@ _MAX_CELLS = 400  # most cells along the longer side of the layout: huge layouts
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedObject(Frozen):
-    """One object of the scene; judges count objects from 0 in the scene's order.
+    """One object of the scene, its mesh settled, in the table frame [m]; judges count from 0 in the scene's order.
 
-    Attributes:
-        mesh: Settled mesh, table frame [m].
-        size: Extents of the scaled mesh along its own axes [m].
-        volume_m3: Volume of the scaled mesh, or of its pieces where it is open [m³].
-        fit_residual_m: Median distance from the observed points to the mesh [m].
-        displacement_m: Distance of its centre from the placed one [m]; 0 for a copy, which has none.
-        colors: Surface share of each colour of `lexicon.COLORS`; empty where the mesh has no colours.
+    `size` [m] is along the mesh's own axes, `volume_m3` that of the pieces where the mesh is open, `fit_residual_m` the
+    median distance from the observed points, `displacement_m` that of the centre from the placed one (0 for a copy),
+    and `colors` the surface share of each of `lexicon.COLORS`, empty where the mesh has no colours.
     """
 
     object_id: str

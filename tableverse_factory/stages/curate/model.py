@@ -29,8 +29,7 @@ class ModelJudge:
 
     def judge(self, case: JudgeInput) -> Judgement:
         """Ask the model about the scene; raises as `ModelClient.ask`."""
-        prompt = build_judge_prompt([item.label for item in case.items])
-        schema = build_judge_schema(len(case.items))
+        prompt, schema = build_judge_prompt([item.label for item in case.items]), build_judge_schema(len(case.items))
         reply = self._client.ask_for(parse_judgement, prompt, [_encode_views(case)], schema)
         origin = AnswerOrigin(model=self._model, prompt_sha256=PROMPT_SHA256, rounds=reply.rounds)
         return Judgement(reply.value, reply.text, origin)

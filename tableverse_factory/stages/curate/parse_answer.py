@@ -1,6 +1,7 @@
 """Lenient parser of a judge's answer: whatever is unreadable is left out before the rest is validated."""
 
 import re
+from itertools import islice
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -47,7 +48,7 @@ def _is_valid(value: Any, kind: type[BaseModel]) -> bool:
 
 
 def _list_entries(value: Any) -> list[tuple[str, Any]]:
-    pairs = list(value.items())[:MAX_ENTRIES] if isinstance(value, dict) else []
+    pairs = islice(value.items(), MAX_ENTRIES) if isinstance(value, dict) else ()
     return [(key, entry) for key, entry in pairs if _ID.fullmatch(key)]
 
 

@@ -29,8 +29,7 @@ class RulesJudge:
 
     def answer(self, case: JudgeInput) -> JudgeAnswer:
         """Give the seven outputs (paper appendix B)."""
-        count = len(case.items)
-        ids = [str(index) for index in range(count)]
+        count, ids = len(case.items), [str(index) for index in range(len(case.items))]
         usability = judge_usability(case)
         confidence = tuple(estimate_label_confidence(item) for item in case.items)
         physical = tuple(estimate_physical_properties(item) for item in case.items)

@@ -51,8 +51,7 @@ def has_bad_geometry(item: JudgedObject) -> bool:
 def _score_diversity(names: tuple[str, ...]) -> int:
     """Score the numbers of objects and categories; below five objects no more points than objects."""
     categories = {name if is_generic(name) else find_head_noun(name) for name in names}
-    full = 0.6 * min(len(names) / _MANY_OBJECTS, 1.0) + 0.4 * min(len(categories) / _MANY_CATEGORIES, 1.0)
-    points = _to_points(full)
+    points = _to_points(0.6 * min(len(names) / _MANY_OBJECTS, 1.0) + 0.4 * min(len(categories) / _MANY_CATEGORIES, 1.0))
     return min(points, max(len(names), 1)) if len(names) < FEW_OBJECTS else points
 
 

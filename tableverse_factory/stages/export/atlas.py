@@ -18,7 +18,7 @@ FINE_TEXELS = 1.5  # a face of this size [texels] shows all its detail in the sm
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas(Frozen):
-    """Places of the faces in a texture: each face's square, its first texel (column, row), its half away from that."""
+    """Places of the faces in a texture [texels]: side and first texel (column, row) of a square, and `second` half."""
 
     side: int
     square: Int64[np.ndarray, " m"]
@@ -38,7 +38,6 @@ def lay_out_atlas(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"
     if int(pairs @ 4 ** np.arange(LEVELS)) > (side // CELL) ** 2:
         return None
     curve = _sort_along_curve(mesh.vertices[mesh.faces].mean(axis=1))
-    square = CELL << level
     corner = np.zeros((len(level), 2), dtype=np.int64)
     second = np.zeros(len(level), dtype=bool)
     start = 0
@@ -48,7 +47,7 @@ def lay_out_atlas(mesh: TriangleMesh, texels_per_metre: Float64[np.ndarray, " m"
         corner[faces] = CELL * _decode_morton(start + slots * 4**k)
         second[faces] = np.arange(len(faces)) % 2 == 1
         start += pairs[k] * 4**k
-    return Atlas(side, square, corner, second)
+    return Atlas(side, CELL << level, corner, second)
 
 
 def list_triangle_texels(square: int, second: bool) -> tuple[Int64[np.ndarray, "t 2"], Float64[np.ndarray, "t 3"]]:

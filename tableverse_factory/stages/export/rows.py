@@ -53,11 +53,9 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, 
 def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
     if record is None:
         return {}
-    return {
-        "detector_model": record.origin.model,
-        "detector_prompt_sha256": record.origin.prompt_sha256,
-        "detector_remarks": [f"{r.rule}:{r.where}" if r.where else r.rule for r in record.remarks],
-    }
+    remarks = [f"{r.rule}:{r.where}" if r.where else r.rule for r in record.remarks]
+    model, prompt = record.origin.model, record.origin.prompt_sha256
+    return {"detector_model": model, "detector_prompt_sha256": prompt, "detector_remarks": remarks}
 
 
 def _describe_judge(verdict: Assessment) -> dict[str, Any]:
