@@ -31,17 +31,14 @@ MAX_JOINTS = 64
 MAX_NAME_BYTES = 4096
 _MAX_NUMBER = 1e6  # bound of every length, angle, speed and time, checked before physics
 _MAX_HEADER_BYTES = 1024
-_HEADER = re.compile(
+_HEADER = re.compile(  # as numpy writes it; numpy's own reader evaluates a header as Python
     rb"\x93NUMPY\x01\x00..\{'descr': '([<|][a-zA-Z]\d)', 'fortran_order': (True|False), "
     rb"'shape': \(((?:\d{1,7},? ?){0,3})\), \} *\n",
     re.DOTALL,
 )
-"""As numpy writes it. numpy's own reader evaluates a header as Python."""
-
-_QUATERNION_TOLERANCE = 1e-3
-_TIME_TOLERANCE = 1e-3
+_QUATERNION_TOLERANCE, _TIME_TOLERANCE = 1e-3, 1e-3
 _DATE = (1980, 1, 1, 0, 0, 0)
-_ARRAYS = {
+_ARRAYS = {  # type and number of dimensions of every array, in the order of the file
     "format": ("|u1", 1),
     "robot": ("|u1", 1),
     "base": ("<f8", 1),
@@ -59,50 +56,31 @@ _ARRAYS = {
     "moved_ids": ("|u1", 1),
     "moved_poses": ("<f4", 3),
 }
-"""Type and number of dimensions of every array, in the order of the file."""
-
 _DECODED = frozenset({"format", "robot", "base", "step_s", "max_disturbed_m", "moved_ids"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording(Frozen):
-    """Executed motion, sample by sample.
+    """Executed motion, sampled when the arm's targets have just reached each command.
 
-    At each sample the arm's targets have just reached that sample's command. A failed motion ends soon after the sample
-    that decided.
-
-    Attributes:
-        robot: Name or file of the arm, as in the configuration.
-        base: The robot's base in the table frame; exact.
-        max_disturbed_m: Allowed displacement of other objects [m].
-        command: Targets of the joints [rad] and opening of the gripper [m], exact. Shape (t, j + 1).
-        phase: Index into `Phase`, ascending; the final wait for rest belongs to the last phase. Shape (t,).
-        time_s: Since the start [s]. Shape (t,).
-        qpos: Joints [rad] and fingers [m]. Shape (t, j + f).
-        qvel: Their speeds. Shape (t, j + f).
-        tcp: Position [m] and quaternion wxyz of the gripper frame in the table frame. Shape (t, 7).
-        object_pose: The same of the carried object's own frame. Shape (t, 7).
-        pads: Fingers that touch the object: 1 the first, 2 the second, 3 both. Shape (t,).
-        disturbed_m: Largest displacement of any other object so far [m]. Shape (t,).
-        moved_ids: The other objects that ever moved by more than 0.5 mm or 0.5°.
-        moved_poses: Their poses, as `object_pose`; all others stand as exported. Shape (t, m, 7).
+    A failed motion ends soon after the sample that decided. Objects that are not in `moved_ids` stand as exported.
     """
 
-    robot: str
-    base: Pose
+    robot: str  # name or file of the arm, as in the configuration
+    base: Pose  # of the robot in the table frame; exact
     step_s: float
-    max_disturbed_m: float
-    command: Float64[np.ndarray, "t k"]
-    phase: Int32[np.ndarray, " t"]
-    time_s: Float32[np.ndarray, " t"]
-    qpos: Float32[np.ndarray, "t m"]
-    qvel: Float32[np.ndarray, "t m"]
-    tcp: Float32[np.ndarray, "t 7"]
-    object_pose: Float32[np.ndarray, "t 7"]
-    pads: UInt8[np.ndarray, " t"]
-    disturbed_m: Float32[np.ndarray, " t"]
-    moved_ids: tuple[str, ...]
-    moved_poses: Float32[np.ndarray, "t m 7"]
+    max_disturbed_m: float  # allowed displacement of other objects
+    command: Float64[np.ndarray, "t k"]  # targets of the joints [rad] and opening of the gripper [m], exact
+    phase: Int32[np.ndarray, " t"]  # index into `Phase`, ascending; the last one includes the wait for rest
+    time_s: Float32[np.ndarray, " t"]  # since the start
+    qpos: Float32[np.ndarray, "t m"]  # joints [rad] and fingers [m]
+    qvel: Float32[np.ndarray, "t m"]  # their speeds
+    tcp: Float32[np.ndarray, "t 7"]  # gripper frame in the table frame: position [m], quaternion wxyz
+    object_pose: Float32[np.ndarray, "t 7"]  # the carried object's own frame, likewise
+    pads: UInt8[np.ndarray, " t"]  # fingers that touch the object: 1 the first, 2 the second, 3 both
+    disturbed_m: Float32[np.ndarray, " t"]  # largest displacement of any other object so far
+    moved_ids: tuple[str, ...]  # other objects that ever moved by more than 0.5 mm or 0.5°
+    moved_poses: Float32[np.ndarray, "t m 7"]  # their poses, as `object_pose`
 
     def __len__(self) -> int:
         return len(self.command)
@@ -206,15 +184,9 @@ def _check_shapes(found: dict[str, Any], length: int) -> None:
         raise ValueError(f"robot has {len(found['robot'])} bytes and base the shape {found['base'].shape}")
     if (moved := found["moved_poses"].shape[1]) > MAX_MOVED:
         raise ValueError(f"moved_poses: {moved} objects of at most {MAX_MOVED}")
-    shapes: dict[str, tuple[int, ...]] = {
-        "qpos": (length, moving),
-        "qvel": (length, moving),
-        "tcp": (length, 7),
-        "object_pose": (length, 7),
-        "moved_poses": (length, moved, 7),
-    }
-    for name in ("phase", "time_s", "pads", "disturbed_m", *shapes):
-        if found[name].shape != (expected := shapes.get(name, (length,))):
+    rows = {"qpos": (moving,), "qvel": (moving,), "tcp": (7,), "object_pose": (7,), "moved_poses": (moved, 7)}
+    for name in ("phase", "time_s", "pads", "disturbed_m", *rows):
+        if found[name].shape != (expected := (length, *rows.get(name, ()))):
             raise ValueError(f"{name}: shape {found[name].shape} instead of {expected}")
 
 

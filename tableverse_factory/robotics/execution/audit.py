@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from schemas.config import TrajectoriesConfig
-from tableverse_factory.core.errors import TableverseError
+from tableverse_factory.core.errors import InputError, TableverseError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.robotics.execution.arrays import decode_recording
 from tableverse_factory.robotics.execution.check_row import Row, find_row_mismatches
@@ -13,30 +13,20 @@ from tableverse_factory.robotics.execution.replay import Replay, ReplayDifferenc
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import Station
 
-OBJECT_TOLERANCE_M = 0.005
-OBJECT_TOLERANCE_RAD = 0.1
 # Tolerances for another machine's arithmetic; on the machine that made the trajectory a replay is equal
-ARM_TOLERANCE_RAD = 0.01
+OBJECT_TOLERANCE_M, OBJECT_TOLERANCE_RAD, ARM_TOLERANCE_RAD = 0.005, 0.1, 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryAudit:
-    """Findings about one trajectory with arrays.
-
-    Attributes:
-        success: As its row claims.
-        reproduced: Whether the replay ended in the same way, in success or not.
-        object_m: Largest distance of an object from its recorded position [m].
-        arm_rad: Largest distance of a joint from its recorded position [rad].
-        problems: One line each; empty if none.
-    """
+    """Findings about one trajectory with arrays."""
 
     task_id: str
-    success: bool
-    reproduced: bool
-    object_m: float | None
-    arm_rad: float | None
-    problems: tuple[str, ...]
+    success: bool  # as its row claims
+    reproduced: bool  # whether the replay ended in the same way, in success or not
+    object_m: float | None  # largest distance of an object from its recorded position
+    arm_rad: float | None  # largest distance of a joint from its recorded position
+    problems: tuple[str, ...]  # one line each; empty if none
 
 
 def audit_trajectories(
@@ -46,14 +36,10 @@ def audit_trajectories(
     tasks: Sequence[Row] | None = None,
     config: TrajectoriesConfig | None = None,
 ) -> tuple[TrajectoryAudit, ...]:
-    """Replay every trajectory of a scene that has arrays, or claims a success.
+    """Replay every row of trajectories/ of a scene that has arrays, or claims a success.
 
-    Args:
-        files: Of the scene by name.
-        rows: Of trajectories/, of this scene.
-        arm: The robot of trajectories whose robot came from a file.
-        tasks: Rows of tasks/ of the scene; None if unknown.
-        config: Configuration of the build; without it the bound on disturbances is taken from the arrays.
+    `arm` is the robot where it came from a file, `tasks` the scene's rows of tasks/, None if unknown. Without `config`,
+    that of the build, the bound on disturbances is taken from the arrays.
     """
     stations: dict[str, Station] = {}
     claimed = [row for row in rows if row.get("arrays") is not None or row.get("success")]
@@ -69,11 +55,9 @@ def _audit_trajectory(
     config: TrajectoriesConfig | None,
 ) -> TrajectoryAudit:
     task_id, success, name = str(row.get("task_id")), bool(row.get("success")), str(row.get("arrays"))
-    if name not in files:
-        return TrajectoryAudit(
-            task_id, success, False, None, None, (f"there is no {sanitize_line(name, 100)} to replay",)
-        )
     try:
+        if name not in files:
+            raise InputError(f"there is no {sanitize_line(name, 100)} to replay", "bad_arrays")
         saved = decode_recording(files[name], name)
         if saved.robot not in stations:
             given = arm is not None and saved.robot.endswith(".xml")
@@ -107,7 +91,7 @@ def _compare_outcome(row: Row, replay: Replay) -> Iterator[str]:
 
 
 def _compare_states(replay: Replay, found: ReplayDifference) -> Iterator[str]:
-    if strangers := replay.find_unknown_objects():
+    if strangers := [name for name in replay.saved.moved_ids if name not in replay.standing]:
         yield f"{strangers[0]} is recorded as moved, and is no other object of the scene"
     limits = (
         (found.object_m, OBJECT_TOLERANCE_M, f"an object is {1e3 * found.object_m:.1f} mm from where it was recorded"),

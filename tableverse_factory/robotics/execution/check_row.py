@@ -13,11 +13,7 @@ from tableverse_factory.robotics.execution.execute import MAX_SETTLE_S
 from tableverse_factory.robotics.execution.perturbations import PERTURBATIONS
 
 _TOLERANCE = 1e-9  # for values that are written both in the row and in the arrays
-_TASK_KEYS = ("x_id", "y_id", "relation", "instruction")
-_CONFIG_KEYS = ("robot", "planner", "grasp_model")
 _MEASURED_KEYS = ("duration_s", "lifted_m", "disturbed_m", "base_x_m", "base_y_m", "base_z_m", "base_yaw_rad")
-_FAILURE_KEYS = ("failed_phase", "reason", "detail")
-_STAGES = (1, 2, 3)
 Row = Mapping[str, Any]
 
 
@@ -37,13 +33,13 @@ def _check_task(row: Row, tasks: Sequence[Row]) -> Iterator[str]:
     if len(own) != 1 or not own[0].get("accepted"):
         yield f"its task stands in tasks/ {len(own)} times" if len(own) != 1 else "its task was refused"
         return
-    for key in _TASK_KEYS:
+    for key in ("x_id", "y_id", "relation", "instruction"):
         if row.get(key) != own[0].get(key):
             yield f"its row says {key} {_quote(row.get(key))}, its task {_quote(own[0].get(key))}"
 
 
 def _check_config(row: Row, saved: Recording, config: TrajectoriesConfig) -> Iterator[str]:
-    for key in _CONFIG_KEYS:
+    for key in ("robot", "planner", "grasp_model"):
         claimed, known = row.get(key), getattr(config, key)
         if _strip_folder(claimed) != _strip_folder(known):
             yield f"its row says {key} {_quote(claimed)}, run.json {_quote(known)}"
@@ -73,13 +69,9 @@ def _check_duration(row: Row, saved: Recording) -> Iterator[str]:
         return
     duration_s, last = float(row["duration_s"]), len(saved) - 1
     end = duration_s / saved.step_s
-    fits = np.isfinite(end) and abs(end - np.rint(end)) <= 1e-6 * max(1.0, end)
-    fits = (
-        fits
-        and end + round(MAX_SETTLE_S / saved.step_s) >= last - 1e-3
-        and (end <= last + 1e-3 or not row.get("success"))
-    )
-    if not fits:
+    whole = np.isfinite(end) and abs(end - np.rint(end)) <= 1e-6 * max(1.0, end)
+    waits = end + round(MAX_SETTLE_S / saved.step_s) >= last - 1e-3
+    if not (whole and waits and (end <= last + 1e-3 or not row.get("success"))):
         yield f"its row says that the motion takes {duration_s:.3f} s, its arrays hold {last * saved.step_s:.3f} s"
     elif (saved.command[int(np.rint(min(end, last))) :] != saved.command[-1]).any():
         yield f"its row says that the motion takes {duration_s:.3f} s, its arrays go on after that"
@@ -91,9 +83,9 @@ def _check_vocabulary(row: Row) -> Iterator[str]:
         yield "it succeeded, and survives says nothing" if success else "it failed, and survives something"
     elif survives is not None and survives != [name for name in PERTURBATIONS if name in survives]:
         yield f"survives is {_quote(survives)}, and there are {', '.join(PERTURBATIONS)}, each once, in this order"
-    if row.get("grasp_stage") not in _STAGES:
+    if row.get("grasp_stage") not in (1, 2, 3):
         yield f"grasp_stage is {_quote(row.get('grasp_stage'))}, and there are 1, 2 and 3"
-    if success and (said := [key for key in _FAILURE_KEYS if row.get(key) is not None]):
+    if success and (said := [key for key in ("failed_phase", "reason", "detail") if row.get(key) is not None]):
         yield f"it succeeded, and its row has a {said[0]}"
 
 

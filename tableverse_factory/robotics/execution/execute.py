@@ -41,9 +41,8 @@ def execute_and_check(station: Station, base: Pose, motion: Motion, goal: Goal) 
     if motion.duration_s + MAX_SETTLE_S <= MAX_DURATION_S:
         return execute_commands(station, base, commands, goal, round(MAX_SETTLE_S / motion.step_s))
     detail = f"it takes {motion.duration_s:.1f} s, and at most {MAX_DURATION_S - MAX_SETTLE_S:g} s are executed"
-    start = execute_commands(
-        station, base, ServoCommands(motion.step_s, commands.targets[:1], commands.phases[:1]), goal, 0
-    )
+    first = ServoCommands(motion.step_s, commands.targets[:1], commands.phases[:1])
+    start = execute_commands(station, base, first, goal, 0)
     return replace(start, verdict=Verdict(False, Phase.PRE_GRASP.value, TOO_LONG, detail))
 
 

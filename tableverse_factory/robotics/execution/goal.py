@@ -18,20 +18,14 @@ RESTING_RELATIONS = frozenset({Relation.ON, Relation.IN, Relation.INTO, Relation
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Goal(Frozen):
-    """Object X in a relation to object Y.
-
-    Attributes:
-        x: True mesh of X in its own frame, as exported [m].
-        y: The same of Y.
-        max_disturbed_m: Allowed displacement of any other object [m].
-    """
+    """Object X in a relation to object Y; `x` and `y` are their true meshes in their own frames, as exported [m]."""
 
     relation: Relation
     x_id: str
     y_id: str
     x: TriangleMesh
     y: TriangleMesh
-    max_disturbed_m: float
+    max_disturbed_m: float  # allowed displacement of any other object
 
     def holds(self, x_pose: Pose, y_pose: Pose) -> bool:
         """Test whether the relation holds between the true bodies at these poses in the table frame."""
@@ -43,12 +37,7 @@ class Goal(Frozen):
 
 
 def load_goal(files: Mapping[str, bytes], row: Mapping[str, Any], max_disturbed_m: float) -> Goal:
-    """Load the goal of a row of tasks/ or trajectories/ from the files of its exported scene.
-
-    Raises:
-        InputError: `bad_task` for an unknown relation or twice the same object; `bad_scene` if an object is missing.
-        GeometryError: if a mesh does not decode.
-    """
+    """Load the goal of a row of tasks/ or trajectories/, of any origin, from the files of its exported scene."""
     x_id, y_id, relation = (str(row.get(key)) for key in ("x_id", "y_id", "relation"))
     if relation not in set(Relation):
         raise InputError(

@@ -13,48 +13,29 @@ from tableverse_factory.robotics.robots.station import Station
 
 @dataclass(slots=True, eq=False)
 class StateSample:
-    """State in which the targets have just reached a sample's command; mutable for speed.
+    """State in which the targets have just reached a sample's command; mutable for speed."""
 
-    Attributes:
-        index: Of the sample; it counts on while the last command is repeated.
-        phase: Index into `Phase`.
-        command: Targets of the joints and the opening. Shape (k,).
-        qpos: Joints [rad] and fingers [m]. Shape (m,).
-        qvel: Their speeds. Shape (m,).
-        tcp: Gripper frame in the table frame: position, quaternion wxyz. Shape (7,).
-        pose: The carried object's own frame in the table frame. Shape (7,).
-        others: The same of each other object, in the order of `Rollout.others`. Shape (n, 7).
-        center: The carried object's center of mass [m].
-        velocity: Of the object's frame [m/s], then its spin [rad/s]. Shape (6,).
-        pads: Fingers that touch the object: 1 the first, 2 the second, 3 both.
-        moved_m: Displacement of each other object. Shape (n,) [m].
-        heights_m: Of their centers of mass. Shape (n,) [m].
-        arm_error_rad: Largest distance of a joint from its target.
-        warnings: Names of MuJoCo warnings that invalidate the simulation.
-    """
-
-    index: int
-    phase: int
-    command: Float64[np.ndarray, " k"]
-    qpos: Float64[np.ndarray, " m"]
-    qvel: Float64[np.ndarray, " m"]
-    tcp: Float64[np.ndarray, "7"]
-    pose: Float64[np.ndarray, "7"]
-    others: Float64[np.ndarray, "n 7"]
-    center: Vector3
-    velocity: Float64[np.ndarray, "6"]
-    pads: int
-    moved_m: Float64[np.ndarray, " n"]
-    heights_m: Float64[np.ndarray, " n"]
-    arm_error_rad: float
-    warnings: tuple[str, ...]
+    index: int  # counts on while the last command is repeated
+    phase: int  # index into `Phase`
+    command: Float64[np.ndarray, " k"]  # targets of the joints [rad] and the opening [m]
+    qpos: Float64[np.ndarray, " m"]  # joints [rad] and fingers [m]
+    qvel: Float64[np.ndarray, " m"]  # their speeds
+    tcp: Float64[np.ndarray, "7"]  # gripper frame in the table frame: position [m], quaternion wxyz
+    pose: Float64[np.ndarray, "7"]  # the carried object's own frame, likewise
+    others: Float64[np.ndarray, "n 7"]  # of each other object, in the order of `Rollout.others`
+    center: Vector3  # of mass of the carried object [m]
+    velocity: Float64[np.ndarray, "6"]  # of its frame [m/s], then its spin [rad/s]
+    pads: int  # fingers that touch the object: 1 the first, 2 the second, 3 both
+    moved_m: Float64[np.ndarray, " n"]  # displacement of each other object
+    heights_m: Float64[np.ndarray, " n"]  # of their centers of mass
+    arm_error_rad: float  # largest distance of a joint from its target
+    warnings: tuple[str, ...]  # MuJoCo warnings that invalidate the simulation
 
 
 class ExecutionMonitor:
-    """Monitor of a carried object, all others (`others`, in the order of the model), and the arm."""
+    """Monitor of a carried object, all others (`others`, in the order of the model), and the arm; `begin` it first."""
 
     def __init__(self, station: Station, x_id: str) -> None:
-        """Look up addresses of the carried object `x_id` and the rest; call `begin` before the first sample."""
         self.others = tuple(name for name in station.object_ids if name != x_id)
         self._station, self._model = station, station.model
         self._body = station.object_bodies[x_id]
@@ -68,7 +49,9 @@ class ExecutionMonitor:
     def begin(self, data: mujoco.MjData) -> None:
         """Store the reference state for displacements; positions in `data` must be computed."""
         self._start = (data.xipos[self._other_bodies].copy(), data.ximat[self._other_bodies].copy())
-        self._spread = self._compute_matter_spread()
+        inertia, mass = self._model.body_inertia[self._other_bodies], self._model.body_mass[self._other_bodies]
+        # Mean square distance of each other body's matter from its center, along principal axes [m²]. Shape (n, 3)
+        self._spread = (inertia.sum(axis=1, keepdims=True) / 2 - inertia) / mass[:, None]
 
     def find_touching(self, data: mujoco.MjData, object_id: str) -> tuple[str, ...]:
         """Find the uncarried objects that touch another object now."""
@@ -102,11 +85,6 @@ class ExecutionMonitor:
             arm_error_rad=float(np.abs(data.qpos[self._station.joint_qpos] - command[:-1]).max()),
             warnings=_list_warnings(data),
         )
-
-    def _compute_matter_spread(self) -> Float64[np.ndarray, "n 3"]:
-        """Compute the mean square distance of each other body's matter from its center, along principal axes [m²]."""
-        inertia, mass = self._model.body_inertia[self._other_bodies], self._model.body_mass[self._other_bodies]
-        return (inertia.sum(axis=1, keepdims=True) / 2 - inertia) / mass[:, None]
 
     def _list_touching_fingers(self, data: mujoco.MjData) -> int:
         pairs = data.contact.geom

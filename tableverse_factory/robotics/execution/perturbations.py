@@ -32,13 +32,13 @@ def _scale_mass(station: Station, body: int, factor: float) -> None:
     mujoco.mj_setConst(station.model, make_quiet_data(station.model))
 
 
+# Change and factor by name, as in the column `survives`
 PERTURBATIONS: Mapping[str, tuple[Callable[[Station, int, float], None], float]] = {
     "friction_halved": (_scale_friction, 0.5),
     "friction_doubled": (_scale_friction, 2.0),
     "mass_minus_30": (_scale_mass, 0.7),
     "mass_plus_30": (_scale_mass, 1.3),
 }
-"""Names, as in the column `survives`, with change and factor."""
 
 
 def perturb_station(station: Station, name: str, object_id: str) -> Station:

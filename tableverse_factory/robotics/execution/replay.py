@@ -11,7 +11,7 @@ from schemas.geometry import Frozen
 from schemas.trajectories import Verdict
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.robotics.execution.arrays import Recording, decode_recording
+from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.execution.execute import execute_commands
 from tableverse_factory.robotics.execution.goal import load_goal
 from tableverse_factory.robotics.execution.poses import compute_angles
@@ -23,42 +23,23 @@ from tableverse_factory.robotics.robots.station import Station
 
 @dataclass(frozen=True, slots=True)
 class ReplayDifference:
-    """Largest differences at any sample between recording and replay; 0 on the recording machine.
+    """Largest differences at any sample between recording and replay; 0 on the recording machine."""
 
-    Attributes:
-        object_m: Position of the carried or any other object [m].
-        object_rad: Their orientations [rad].
-        arm_rad: Joint positions [rad].
-        tcp_m: Position of the gripper [m].
-        disturbed_m: Largest displacement of any other object [m].
-    """
-
-    object_m: float
-    object_rad: float
-    arm_rad: float
-    tcp_m: float
-    disturbed_m: float
+    object_m: float  # position of the carried or any other object
+    object_rad: float  # their orientations
+    arm_rad: float  # joint positions
+    tcp_m: float  # position of the gripper
+    disturbed_m: float  # largest displacement of any other object
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay(Frozen):
-    """Recorded and replayed motion.
+    """Recorded and replayed motion, perhaps of different lengths."""
 
-    Attributes:
-        verdict: Of the replay.
-        saved: Recording as read.
-        now: Recording of the replay; its length may differ.
-        standing: Exported pose of each other object by id. Each of shape (7,).
-    """
-
-    verdict: Verdict
+    verdict: Verdict  # of the replay
     saved: Recording
     now: Recording
-    standing: Mapping[str, Float64[np.ndarray, "7"]]
-
-    def find_unknown_objects(self) -> tuple[str, ...]:
-        """List moved objects of the recording that the scene does not have."""
-        return tuple(name for name in self.saved.moved_ids if name not in self.standing)
+    standing: Mapping[str, Float64[np.ndarray, "7"]]  # exported pose of each other object by id
 
     def compute_difference(self) -> ReplayDifference:
         """Compute how far the replay is from the recording."""
@@ -84,24 +65,6 @@ def _compute_max_distance(a: Float[np.ndarray, "t 7"], b: Float[np.ndarray, "t 7
     return float(np.linalg.norm(a[:, :3] - b[:, :3], axis=1).max())
 
 
-def replay_trajectory(
-    files: Mapping[str, bytes], row: Mapping[str, Any], arrays: bytes, arm: Arm | None = None
-) -> Verdict:
-    """Return the verdict of a saved trajectory, from the exported scene and its own commands alone.
-
-    Args:
-        files: Of the scene by name: `scene.xml` and `assets/…` are read.
-        row: Of trajectories/: `x_id`, `y_id` and `relation`.
-        arrays: The file that `row["arrays"]` names.
-        arm: The robot, where it came from a file; else it is found by its name in the arrays.
-
-    Raises:
-        InputError: `bad_arrays`, `bad_task`, `bad_scene` or `bad_mjcf`; or as `load_named_arm`.
-    """
-    saved = decode_recording(arrays, str(row.get("arrays")))
-    return replay_recording(files, row, saved, Station(files, arm or load_named_arm(saved.robot))).verdict
-
-
 def replay_recording(
     files: Mapping[str, bytes],
     row: Mapping[str, Any],
@@ -109,7 +72,7 @@ def replay_recording(
     station: Station,
     max_disturbed_m: float | None = None,
 ) -> Replay:
-    """Replay decoded arrays on a station of these files, and return both recordings.
+    """Replay decoded arrays of a row of trajectories/ on a station of the exported scene's files.
 
     `max_disturbed_m` overrides the arrays' bound on other objects [m].
     """
@@ -117,19 +80,12 @@ def replay_recording(
     commands = ServoCommands(saved.step_s, saved.command, saved.phase)
     proof = execute_commands(station, saved.base, commands, goal, more=0)
     poses = station.data().qpos
-    others = {name: at for name, at in station.object_qpos.items() if name != goal.x_id}
-    return Replay(
-        proof.verdict, saved, proof.recording, {name: poses[at : at + 7].copy() for name, at in others.items()}
-    )
+    standing = {name: poses[at : at + 7].copy() for name, at in station.object_qpos.items() if name != goal.x_id}
+    return Replay(proof.verdict, saved, proof.recording, standing)
 
 
 def load_named_arm(name: str) -> Arm:
-    """Load the arm named in arrays of any origin: never from a file, as arrays could name any path.
-
-    Raises:
-        InputError: `robot_is_a_file` for the name of a file.
-        ConfigError: for an unknown name.
-    """
+    """Load the arm named in arrays of any origin: never from a file, as arrays could name any path."""
     if name.endswith(".xml") or "/" in name or "\\" in name:
         raise InputError(
             f"its robot came from a file, {sanitize_line(name, 100)}, that has to be given", "robot_is_a_file"

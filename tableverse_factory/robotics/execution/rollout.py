@@ -21,14 +21,8 @@ from tableverse_factory.physics.simulate.mujoco_sleep import allow_sleep
 from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, StateSample
 from tableverse_factory.robotics.robots.station import Station
 
+# Speed below which an object may sleep: MuJoCo's default, 1e-3, freezes objects that have just lost their support
 SLEEP_TOLERANCE = 1e-4
-"""Speed below which an object may sleep.
-
-MuJoCo's default, 1e-3, freezes objects that have just lost their support, whose first ten steps are slower. With this
-value success and displacements equaled those of rollouts with everything awake, in all trajectories that were measured
-(docs/trajectories.md).
-"""
-
 MIN_TIMESTEP_S = 1e-4
 MAX_ITERATIONS = 1000  # limit for each of MuJoCo's solvers, so that any scene is simulated in bounded time
 _SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations")
@@ -36,17 +30,11 @@ _SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ServoCommands(Frozen):
-    """Commands of the servos.
+    """Targets of the servos."""
 
-    Attributes:
-        step_s: Time between samples [s].
-        targets: Of the joints [rad], and the opening of the gripper [m]. Shape (t, j + 1).
-        phases: Index into `Phase` of each sample, ascending. Shape (t,).
-    """
-
-    step_s: float
-    targets: Float64[np.ndarray, "t k"]
-    phases: Int32[np.ndarray, " t"]
+    step_s: float  # between samples
+    targets: Float64[np.ndarray, "t k"]  # of the joints [rad], and the opening of the gripper [m]; k = j + 1
+    phases: Int32[np.ndarray, " t"]  # index into `Phase` of each sample, ascending
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -58,7 +46,7 @@ class ServoCommands(Frozen):
 
 
 def build_commands(motion: Motion) -> ServoCommands:
-    """Convert a motion to commands."""
+    """Build the commands of a motion."""
     return ServoCommands(motion.step_s, np.column_stack([motion.positions, motion.openings]), motion.phases)
 
 
@@ -66,12 +54,7 @@ class Rollout:
     """Commands in execution on a station; `others` are the uncarried objects, in the order of the model."""
 
     def __init__(self, station: Station, base: Pose, commands: ServoCommands, x_id: str, y_id: str) -> None:
-        """Place the base at a pose in the table frame; `x_id` is the carried object, `y_id` the reference.
-
-        Raises:
-            InputError: `bad_arrays` if the scene has no such objects, or the commands are not for this arm; `bad_scene`
-                as `check_simulation_settings`.
-        """
+        """Place the base at a pose in the table frame; `x_id` is the carried object, `y_id` the reference."""
         check_simulation_settings(station.model)
         if absent := [name for name in (x_id, y_id) if name not in station.object_bodies]:
             raise InputError(f"the scene has no object {sanitize_line(absent[0], 100)!r}", "bad_arrays")
@@ -134,11 +117,7 @@ def align_timestep(model: mujoco.MjModel, step_s: float) -> Iterator[int]:
 
 
 def check_simulation_settings(model: mujoco.MjModel) -> None:
-    """Refuse a scene whose own settings would make its simulation endless.
-
-    Raises:
-        InputError: `bad_scene`.
-    """
+    """Refuse a scene of any origin whose own settings would make its simulation endless."""
     timestep = float(model.opt.timestep)
     if not timestep >= MIN_TIMESTEP_S:
         raise InputError(

@@ -22,19 +22,11 @@ DROP_S = 0.06  # an object without finger contact for this long is dropped; sing
 LAG_RAD = 0.03  # maximum joint error where the fingers close and open, and at the end
 BLOCKED_RAD = 0.25  # maximum joint error elsewhere, far above the normal lag of the servos
 _PHASES = tuple(Phase)
-_HELD_PHASES = (Phase.PRE_PLACE, Phase.PLACE)
-_STILL_PHASES = (Phase.GRASP, Phase.PLACE, Phase.POST_PLACE)
 
 
 @dataclass(frozen=True, slots=True)
 class RolloutFailure:
-    """First failure of a rollout.
-
-    Attributes:
-        reason: Code: `simulation_unstable`, `servo_lag`, `not_grasped`, `slipped`, `dropped`, `disturbed`,
-            `not_released`, `relation_missed` or `not_at_rest`.
-        detail: One line with the values that decided.
-    """
+    """First failure of a rollout: a reason code, and one line with the values that decided."""
 
     phase: Phase
     reason: str
@@ -51,17 +43,12 @@ def compute_displacement_limits(
 
 @dataclass(slots=True)
 class SuccessChecker:
-    """Online checker of one rollout's samples, in order.
-
-    Attributes:
-        failure: First failure, if any.
-        at_rest: Whether the object was at rest for the last `HOLD_S`.
-    """
+    """Online checker of one rollout's samples, in order."""
 
     goal: Goal
     execution: Rollout
     failure: RolloutFailure | None = None
-    at_rest: bool = False
+    at_rest: bool = False  # whether the object was at rest for the last `HOLD_S`
     _allowed_m: np.ndarray = field(init=False)
     _ends: dict[Phase, int] = field(init=False)
     _stood_m: float = 0.0
@@ -113,11 +100,10 @@ class SuccessChecker:
     def _check_disturbance(self, sample: StateSample) -> RolloutFailure | None:
         if not (sample.moved_m > self._allowed_m).any() and sample.heights_m.min(initial=0.0) >= -FALL_M:
             return None
-        fallen = np.flatnonzero(sample.heights_m < -FALL_M)
-        beyond = np.flatnonzero(sample.moved_m > self._allowed_m)
-        if len(fallen):
+        if len(fallen := np.flatnonzero(sample.heights_m < -FALL_M)):
             detail = f"{self.execution.others[fallen[0]]} fell from the table"
         else:
+            beyond = np.flatnonzero(sample.moved_m > self._allowed_m)
             k = int(beyond[np.argmax(sample.moved_m[beyond])])
             moved, allowed = 1e3 * sample.moved_m[k], 1e3 * self._allowed_m[k]
             detail = f"{self.execution.others[k]} was moved by {moved:.1f} mm, more than {allowed:.1f} mm"
@@ -125,22 +111,19 @@ class SuccessChecker:
 
     def _check_drop(self, sample: StateSample) -> RolloutFailure | None:
         phase = _PHASES[sample.phase]
-        if (
-            phase not in _HELD_PHASES
-            or self._lost_s < DROP_S - 1e-9
-            or _is_release_commanded(self.execution.commands, sample.index)
-        ):
+        if phase not in (Phase.PRE_PLACE, Phase.PLACE) or self._lost_s < DROP_S - 1e-9:
+            return None
+        if _is_release_commanded(self.execution.commands, sample.index):
             return None
         rise = 1e3 * (float(sample.center[2]) - self._stood_m)
-        return RolloutFailure(
-            phase, "dropped", f"no finger touched it for {self._lost_s:.2f} s; it was {rise:.0f} mm up"
-        )
+        detail = f"no finger touched it for {self._lost_s:.2f} s; it was {rise:.0f} mm up"
+        return RolloutFailure(phase, "dropped", detail)
 
     def _check_phase_end(self, sample: StateSample) -> RolloutFailure | None:
         phase = _PHASES[sample.phase]
         if sample.index != self._ends[phase]:
             return None
-        if phase in _STILL_PHASES and sample.arm_error_rad > LAG_RAD:
+        if phase in (Phase.GRASP, Phase.PLACE, Phase.POST_PLACE) and sample.arm_error_rad > LAG_RAD:
             detail = f"a joint stands {sample.arm_error_rad:.3f} rad from its target, more than {LAG_RAD}"
             return RolloutFailure(phase, "servo_lag", detail)
         if phase is Phase.GRASP and sample.pads != 3:

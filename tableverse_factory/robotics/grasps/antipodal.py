@@ -39,25 +39,17 @@ _HALF_SCORE_LEVER_M = 0.04  # at this distance from the center of mass nearness 
 # Pairs in one cell count as one; parts of a body have this size; widths of one kind differ by less than this
 _CELL_M, _PART_M, _KIND_M = 0.012, 0.06, 0.02
 _CLOSING_START_M = 0.012  # pads begin to close this far outside their contacts
-_MIN_WIDTH_M = 0.001
-_SLACK_M = 0.0005
+_MIN_WIDTH_M, _SLACK_M = 0.001, 0.0005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ContactPairs(Frozen):
-    """Antipodal pairs of contacts.
+    """Antipodal pairs of contacts."""
 
-    Attributes:
-        first: Contact of the finger on the negative side of the axis. Shape (n, 3) [m].
-        axis: Unit vectors to the other contact. Shape (n, 3).
-        width: Between the contacts. Shape (n,) [m].
-        alignment: 0 where a normal lies on the rim of the friction cone, 1 where both lie on the axis. Shape (n,).
-    """
-
-    first: Points
-    axis: Points
-    width: Numbers
-    alignment: Numbers
+    first: Points  # contact of the finger on the negative side of the axis [m]
+    axis: Points  # unit vectors to the other contact
+    width: Numbers  # between the contacts [m]
+    alignment: Numbers  # 0 where a normal is on the rim of the friction cone, 1 where both are on the axis
 
     def middle(self) -> Points:
         return self.first + 0.5 * self.width[:, None] * self.axis
@@ -81,34 +73,27 @@ def sample_antipodal_grasps(
     the pads that presses on something from both sides. It ignores the approach direction (see `grasps.arbitration`).
     `felt` are the convex pieces, which a simulation collides, as one mesh; `config.candidates` is the number of rays.
     """
-    caster = make_raycasting_scene(mesh)
     opening = max_opening_m - OPENING_MARGIN_M
-    pairs = _find_contact_pairs(mesh, caster, config.candidates, opening, rng)
-    pairs = _keep_above_table(pairs, gripper)
+    pairs = _keep_above_table(_find_contact_pairs(mesh, config.candidates, opening, rng), gripper)
     pairs = _spread_pairs(pairs, _score_nearness(pairs.middle(), center))
     return _generate_approaches(pairs, make_raycasting_scene(felt), center, gripper, opening)
 
 
-def _find_contact_pairs(
-    mesh: TriangleMesh, caster: RaycastingScene, count: int, opening: float, rng: np.random.Generator
-) -> _ContactPairs:
+def _find_contact_pairs(mesh: TriangleMesh, count: int, opening: float, rng: np.random.Generator) -> _ContactPairs:
     """Find all pairs within the opening [m] and within the friction cone."""
-    sign = compute_outward_sign(mesh)
+    caster, sign = make_raycasting_scene(mesh), compute_outward_sign(mesh)
     points, inward = sample_inward_normals(mesh, count)
     inward = sign * inward
     ways = _sample_cone_directions(inward, rng)
     edge, found = _compute_cone_cosine(FRICTION), []
-    for width, normals in (
-        cast_surface_rays(caster, points, ways, sign),
-        _cast_last_exits(caster, points, ways, sign, opening),
-    ):
+    walls = cast_surface_rays(caster, points, ways, sign)
+    back, last = cast_surface_rays(caster, points + opening * ways, -ways, sign)  # back from beyond the opening
+    for width, normals in (walls, (opening - back, last)):
         slopes = np.minimum(np.einsum("ij,ij->i", inward, ways), np.einsum("ij,ij->i", normals, ways))
         good = (width >= _MIN_WIDTH_M) & (width <= opening) & (slopes >= edge)
         alignment = (slopes[good] - edge) / (1.0 - edge)
-        found.append(_ContactPairs(points[good], ways[good], width[good], alignment))
-    wall, whole = found
-    fields = ("first", "axis", "width", "alignment")
-    return _ContactPairs(*(np.concatenate([getattr(wall, name), getattr(whole, name)]) for name in fields))
+        found.append((points[good], ways[good], width[good], alignment))
+    return _ContactPairs(*map(np.concatenate, zip(*found, strict=True)))
 
 
 def _sample_cone_directions(inward: Points, rng: np.random.Generator) -> Points:
@@ -132,14 +117,6 @@ def _sample_cone_directions(inward: Points, rng: np.random.Generator) -> Points:
 def _compute_cone_cosine(friction: float) -> float:
     """Compute the cosine between the axis of a friction cone and its surface."""
     return float(1.0 / np.sqrt(1.0 + friction**2))
-
-
-def _cast_last_exits(
-    caster: RaycastingScene, points: Points, ways: Points, sign: float, opening: float
-) -> tuple[Numbers, Points]:
-    """Cast rays back from beyond the opening; return widths and outward normals at the far side."""
-    back, normals = cast_surface_rays(caster, points + opening * ways, -ways, sign)
-    return opening - back, normals
 
 
 def _compute_tangents(axes: Points) -> tuple[Points, Points]:

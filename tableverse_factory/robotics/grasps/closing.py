@@ -22,17 +22,13 @@ Rotations = Float64[np.ndarray, "n 3 3"]
 class PadContact(Frozen):
     """Contact of closed pads, per grasp.
 
-    Attributes:
-        width: Between the pads when both touch; not positive, or NaN, where they meet nothing. Shape (n,) [m].
-        sideways: From the gripper's middle to the middle between the pads, along the closing axis. Shape (n,) [m].
-        share: Share of the pads' area that presses from both sides. Shape (n,).
-        slope: Cosine between the closing axis and the mean contact normal, the smaller of both pads. At or below that
-            of the friction cone, the body is squeezed out. Shape (n,).
+    `slope` is the cosine between the closing axis and the mean contact normal, the smaller of both pads; at or below
+    that of the friction cone, the body is squeezed out.
     """
 
-    width: Numbers
-    sideways: Numbers
-    share: Numbers
+    width: Numbers  # between the pads when both touch; not positive, or NaN, where they meet nothing [m]
+    sideways: Numbers  # from the gripper's middle to that between the pads, along the closing axis [m]
+    share: Numbers  # of the pads' area that presses from both sides
     slope: Numbers
 
 
@@ -56,7 +52,10 @@ def close_pads(
         distance = distance.reshape(grid.shape[:2])
         nearest = distance.min(axis=1)
         near = distance <= nearest[:, None] + PAD_COMPLIANCE_M
-        mean = np.einsum("nc,nci->ni", near.astype(np.float64), _orient_normals(normals.reshape(grid.shape), ways))
+        normals = normals.reshape(grid.shape)
+        facing = np.einsum("nci,nci->nc", normals, ways)[..., None]
+        normals = np.where(facing > 0.0, -normals, normals)  # against the rays, whatever the winding of the faces
+        mean = np.einsum("nc,nci->ni", near.astype(np.float64), normals)
         length = np.maximum(np.linalg.norm(mean, axis=1), 1e-12)
         stops.append(half - nearest)
         touched.append(near & np.isfinite(distance))
@@ -64,12 +63,6 @@ def close_pads(
     with np.errstate(invalid="ignore"):  # where both meet nothing
         width, sideways = stops[0] + stops[1], 0.5 * (stops[1] - stops[0])
     return PadContact(width, sideways, (touched[0] & touched[1]).mean(axis=1), np.minimum(*slopes))
-
-
-def _orient_normals(normals: Points, ways: Points) -> Points:
-    """Orient normals against the rays, whatever the winding of the faces."""
-    facing = np.einsum("nci,nci->nc", normals, ways)[..., None]
-    return np.where(facing > 0.0, -normals, normals)
 
 
 def close_grasps(grasps: Grasps, felt: TriangleMesh, gripper: GripperShape, max_opening_m: float) -> Grasps:

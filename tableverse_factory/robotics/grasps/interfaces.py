@@ -1,7 +1,6 @@
 """Grasp models by name, and the clearance test that all proposed grasps pass."""
 
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -20,30 +19,15 @@ from tableverse_factory.robotics.grasps.closing import close_grasps
 from tableverse_factory.robotics.grasps.remote import request_grasps
 from tableverse_factory.robotics.robots.arm import Arm
 
-_MESH_POINTS = 1000
-_PIECE_POINTS = 500
+_MESH_POINTS, _PIECE_POINTS = 1000, 500
 
 
-class GraspModel(Protocol):
-    """Proposes grasps of an isolated object."""
-
-    def __call__(
-        self, target: SceneObject, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
-    ) -> Grasps:
-        """Propose grasps in the table frame, with widths and scores.
-
-        Raises:
-            ModelError: if a model does not answer, or its answer is invalid.
-        """
-        ...
+# Proposes grasps of an isolated object, in the table frame, with widths and scores; or raises a ModelError
+GraspModel = Callable[[SceneObject, Arm, TrajectoriesConfig, np.random.Generator, Services], Grasps]
 
 
 def propose_antipodal(
-    target: SceneObject,
-    arm: Arm,
-    config: TrajectoriesConfig,
-    rng: np.random.Generator,
-    services: Services,  # noqa: ARG001
+    target: SceneObject, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, _services: Services
 ) -> Grasps:
     """Sample pairs of contacts on the mesh (`grasps.antipodal`)."""
     center = transform_points(target.pose, make_body_shape(target.mesh, target.hulls, 1.0).moments.center[None])[0]
@@ -53,16 +37,11 @@ def propose_antipodal(
 
 
 def propose_graspgen(
-    target: SceneObject,
-    arm: Arm,
-    config: TrajectoriesConfig,
-    rng: np.random.Generator,  # noqa: ARG001
-    services: Services,
+    target: SceneObject, arm: Arm, config: TrajectoriesConfig, _rng: np.random.Generator, services: Services
 ) -> Grasps:
     """Request grasps from a server (`grasps.remote`), closed on the pieces."""
-    return close_grasps(
-        request_grasps(target.standing, config, services), _merge_pieces(target), arm.shape, arm.max_opening_m
-    )
+    found = request_grasps(target.standing, config, services)
+    return close_grasps(found, _merge_pieces(target), arm.shape, arm.max_opening_m)
 
 
 GRASP_MODELS: dict[str, GraspModel] = {"antipodal": propose_antipodal, "graspgen": propose_graspgen}
@@ -76,11 +55,7 @@ def propose_grasps(
     rng: np.random.Generator,
     services: Services,
 ) -> Grasps:
-    """Propose grasps of an object that leave the gripper clear of the others, not yet arbitrated.
-
-    Raises:
-        ModelError: see `GraspModel`.
-    """
+    """Propose grasps of an object that leave the gripper clear of the others, not yet arbitrated."""
     found = GRASP_MODELS[config.grasp_model](target, arm, config, rng, services)
     pieces = [place_mesh(hull, other.pose) for other in others for hull in other.hulls]
     room = find_clear_grasps(found, arm.shape, arm.max_opening_m, _sample_surface(target), pieces)

@@ -10,7 +10,8 @@ from schemas.geometry import Frozen
 from schemas.trajectories import JointPath, Motion, NoMotion, Numbers, Phase
 from tableverse_factory.robotics.motion.approach_configs import ApproachConfig
 from tableverse_factory.robotics.motion.pick_place import LINE_MARGIN_M, PickPlace
-from tableverse_factory.robotics.motion.segments import PathSegment, TimedRun, time_segments
+from tableverse_factory.robotics.motion.retime import TimedCurve
+from tableverse_factory.robotics.motion.segments import PathSegment, time_segments
 from tableverse_factory.robotics.robots.arm import Arm
 
 # Clearances kept from the scene between the lines; later ones are fallbacks, which are recorded [m]
@@ -22,21 +23,13 @@ _PHASES = list(Phase)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPaths(Frozen):
-    """Joint paths of a motion, without time.
-
-    Attributes:
-        take: Configuration and lines of the grasp.
-        give: Configuration and lines of the release.
-        reaching: From the start to the pre-grasp pose. Shape (n, j) [rad].
-        carrying: From the post-grasp to the pre-place pose. Shape (m, j) [rad].
-        margins: Clearances of the two [m].
-    """
+    """Joint paths [rad] of a motion, without time, between the lines of the grasp and of the release."""
 
     take: ApproachConfig
     give: ApproachConfig
-    reaching: JointPath
-    carrying: JointPath
-    margins: tuple[float, float]
+    reaching: JointPath  # from the start to the pre-grasp pose
+    carrying: JointPath  # from the post-grasp to the pre-place pose
+    margins: tuple[float, float]  # clearances of the two [m]
 
     def list_fallbacks(self) -> tuple[str, ...]:
         """List shortened lines and reduced margins, in words."""
@@ -59,13 +52,13 @@ def assemble_motion(task: PickPlace, paths: MotionPaths, config: TrajectoriesCon
             PathSegment(Phase.GRASP, take.hand.path[::-1], task.reaching_space(take.opening_m, 0.0)),
         ),
         (
-            PathSegment(Phase.POST_GRASP, take.load.path, task.lifting_space(0.0)),
-            PathSegment(Phase.PRE_PLACE, paths.carrying, task.carrying_space(paths.margins[1] / 2)),
-            PathSegment(Phase.PLACE, give.load.path[::-1], task.lowering_space(0.0)),
+            PathSegment(Phase.POST_GRASP, take.load.path, task.holding_space(0.0, task.taken)),
+            PathSegment(Phase.PRE_PLACE, paths.carrying, task.holding_space(paths.margins[1] / 2)),
+            PathSegment(Phase.PLACE, give.load.path[::-1], task.holding_space(0.0, task.released)),
         ),
         (PathSegment(Phase.POST_PLACE, give.hand.path, task.leaving_space(give.opening_m, 0.0)),),
     )
-    runs: list[TimedRun] = []
+    runs: list[tuple[TimedCurve, np.ndarray]] = []
     for index, sections in enumerate(plans):
         dynamics.set_payload(task.world.station, task.carried if index == 1 else None)
         run = time_segments(
@@ -77,17 +70,19 @@ def assemble_motion(task: PickPlace, paths: MotionPaths, config: TrajectoriesCon
     return _concatenate_runs(runs, paths, task.width_m, arm, config.step_s)
 
 
-def _concatenate_runs(runs: Sequence[TimedRun], paths: MotionPaths, width_m: float, arm: Arm, step_s: float) -> Motion:
+def _concatenate_runs(
+    runs: Sequence[tuple[TimedCurve, np.ndarray]], paths: MotionPaths, width_m: float, arm: Arm, step_s: float
+) -> Motion:
     hold = max(0.0, width_m - SQUEEZE_M)
     opened, released = paths.take.opening_m, paths.give.opening_m
     closing, opening = _ramp_opening(opened, hold, arm, step_s), _ramp_opening(hold, released, arm, step_s)
-    first, second, third = (run.timed for run in runs)
+    (first, reaching), (second, carrying), (third, leaving) = runs
     parts = (
-        (first.positions, first.velocities, np.full(len(first.positions), opened), runs[0].phases),
+        (first.positions, first.velocities, np.full(len(first.positions), opened), reaching),
         _hold_still(first.positions[-1:], closing, Phase.GRASP),
-        (second.positions[1:], second.velocities[1:], np.full(len(second.positions) - 1, hold), runs[1].phases[1:]),
+        (second.positions[1:], second.velocities[1:], np.full(len(second.positions) - 1, hold), carrying[1:]),
         _hold_still(second.positions[-1:], opening, Phase.PLACE),
-        (third.positions[1:], third.velocities[1:], np.full(len(third.positions) - 1, released), runs[2].phases[1:]),
+        (third.positions[1:], third.velocities[1:], np.full(len(third.positions) - 1, released), leaving[1:]),
     )
     positions, velocities, openings, phases = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Motion(step_s, positions, velocities, openings, phases.astype(np.int32), paths.list_fallbacks())

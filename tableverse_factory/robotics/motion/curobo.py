@@ -37,11 +37,7 @@ class CuroboPlanner:
     """Experimental GPU planner; never run on a GPU."""
 
     def __init__(self) -> None:
-        """Load the package.
-
-        Raises:
-            ModelError: if cuRobo or PyTorch is not installed, or there is no GPU.
-        """
+        """Load the package, which needs a GPU."""
         try:
             self._torch: Any = importlib.import_module("torch")
             self._motion: Any = importlib.import_module("curobo.motion_planner")
@@ -54,17 +50,9 @@ class CuroboPlanner:
         self._planners: dict[str, Any] = {}
 
     def plan_path(
-        self,
-        start: JointVector,
-        goal: JointVector,
-        space: CollisionSpace,
-        rng: np.random.Generator,  # noqa: ARG002
+        self, start: JointVector, goal: JointVector, space: CollisionSpace, _rng: np.random.Generator
     ) -> JointPath | None:
-        """Plan a path, checked against `space`, or return None; `rng` is not used, as cuRobo restarts its own sequence.
-
-        Raises:
-            ModelError: if cuRobo has no file of this arm.
-        """
+        """Plan a path, checked against `space`, or return None; cuRobo restarts its own random sequence."""
         planner = self._planner(space.world.station.arm.name)
         around = list_obstacles(space)
         planner.update_world(self._scene_of(around))
@@ -96,11 +84,9 @@ class CuroboPlanner:
         return self._planners[arm]
 
     def _scene_of(self, around: tuple[Obstacle, ...]) -> Any:
-        meshes = [_describe_mesh(obstacle) for obstacle in around if obstacle.mesh is not None]
-        boxes = [_describe_box(obstacle) for obstacle in around if obstacle.mesh is None]
         return self._scene.Scene(
-            mesh=[self._scene.Mesh(**arguments) for arguments in meshes],
-            cuboid=[self._scene.Cuboid(**arguments) for arguments in boxes],
+            mesh=[self._scene.Mesh(**_describe_obstacle(o)) for o in around if o.mesh is not None],
+            cuboid=[self._scene.Cuboid(**_describe_obstacle(o)) for o in around if o.mesh is None],
         )
 
     def _state(self, planner: Any, q: JointVector) -> Any:
@@ -116,23 +102,13 @@ class CuroboPlanner:
         mesh = merge_object_pieces(world, carried.object_id)
         obstacle = Obstacle(carried.object_id, pose, mesh, np.zeros(3), np.zeros(3))
         offset = self._types.Pose.from_list(obstacle.listed_pose)
-        still = self._scene.Mesh(**(_describe_mesh(obstacle) | {"pose": [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]}))
+        still = self._scene.Mesh(**(_describe_obstacle(obstacle) | {"pose": [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]}))
         planner.attachment_manager.attach(state, [still], link_name=_ATTACHED_LINK, world_objects_pose_offset=offset)
 
 
-def _describe_mesh(obstacle: Obstacle) -> dict[str, Any]:
-    """Build arguments of `curobo.scene.Mesh`."""
-    mesh = obstacle.mesh
+def _describe_obstacle(obstacle: Obstacle) -> dict[str, Any]:
+    """Build arguments of `curobo.scene.Mesh` or, without a mesh, of `Cuboid`."""
+    placed, mesh = {"name": obstacle.name, "pose": obstacle.listed_pose}, obstacle.mesh
     if mesh is None:
-        raise ValueError(f"{obstacle.name} is a box")
-    return {
-        "name": obstacle.name,
-        "vertices": mesh.vertices.tolist(),
-        "faces": mesh.faces.tolist(),
-        "pose": obstacle.listed_pose,
-    }
-
-
-def _describe_box(obstacle: Obstacle) -> dict[str, Any]:
-    """Build arguments of `curobo.scene.Cuboid`."""
-    return {"name": obstacle.name, "dims": obstacle.size.tolist(), "pose": obstacle.listed_pose}
+        return {**placed, "dims": obstacle.size.tolist()}
+    return {**placed, "vertices": mesh.vertices.tolist(), "faces": mesh.faces.tolist()}

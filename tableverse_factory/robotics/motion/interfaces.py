@@ -15,15 +15,12 @@ class Planner(Protocol):
     """Deterministic joint path planner, bounded by counts."""
 
     def plan_path(
-        self, start: JointVector, goal: JointVector, space: CollisionSpace, rng: np.random.Generator
+        self, start: JointVector, goal: JointVector, space: CollisionSpace, rng: np.random.Generator, /
     ) -> JointPath | None:
-        """Plan corners of a path that is free in `space`, both ends included, or return None.
-
-        The path is checked against `space` again; `rng` is the only source of randomness.
-        """
+        """Plan corners of a path that is free in `space`, both ends included, or return None; it is checked again."""
         ...
 
-    def list_fallbacks(self, world: CollisionWorld) -> tuple[str, ...]:
+    def list_fallbacks(self, world: CollisionWorld, /) -> tuple[str, ...]:
         """List approximations the planner makes of this scene, in words."""
         ...
 

@@ -19,12 +19,10 @@ from tableverse_factory.geometry.math.transforms import matrix_from_pose
 Configurations = Float64[np.ndarray, "b j"]
 Rotations = Float64[np.ndarray, "b 3 3"]
 Positions = Float64[np.ndarray, "b 3"]
-POSITION_TOLERANCE_M = 1e-6
-ROTATION_TOLERANCE_RAD = 1e-5
+POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD = 1e-6, 1e-5
 # Distance of solutions from joint limits, so that a servo that overshoots does not run into its stop
 LIMIT_MARGIN_RAD = 0.02
-MAX_ITERATIONS = 40
-LINE_ITERATIONS = 8
+MAX_ITERATIONS, LINE_ITERATIONS = 40, 8
 MAX_STEP_RAD = 0.6
 RESTARTS = 24
 DISTINCT_RAD = 0.25  # solutions whose joints all differ by less are duplicates
@@ -34,27 +32,16 @@ _ROTATION_WEIGHT_M = 0.3  # A radian of error weighs as much as this many meters
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KinematicChain(Frozen):
-    """Serial arm from its base to the TCP.
+    """Serial arm of hinges [rad] and slides [m] from its base to the TCP."""
 
-    Attributes:
-        offsets: From the frame after joint i-1 to the frame of joint i at rest. Shape (j, 4, 4) [m].
-        axes: Axis of each joint in its own frame. Shape (j, 3).
-        hinges: Whether a joint turns; the others slide. Shape (j,).
-        references: Joint values of the model's reference configuration. Shape (j,) [rad or m].
-        lower: Shape (j,) [rad or m].
-        upper: Shape (j,) [rad or m].
-        tip: From the frame after the last joint to the TCP. Shape (4, 4) [m].
-        turns: Factors of 1, sin and 1 - cos in each joint's rotation matrix. Shape (3, j, 3, 3).
-    """
-
-    offsets: Float64[np.ndarray, "j 4 4"]
-    axes: Float64[np.ndarray, "j 3"]
-    hinges: Bool[np.ndarray, " j"]
-    references: JointVector
+    offsets: Float64[np.ndarray, "j 4 4"]  # from the frame after joint i-1 to the frame of joint i at rest [m]
+    axes: Float64[np.ndarray, "j 3"]  # of each joint in its own frame
+    hinges: Bool[np.ndarray, " j"]  # whether a joint turns; the others slide
+    references: JointVector  # joint values of the model's reference configuration
     lower: JointVector
     upper: JointVector
-    tip: Matrix4
-    turns: Float64[np.ndarray, "3 j 3 3"]
+    tip: Matrix4  # from the frame after the last joint to the TCP
+    turns: Float64[np.ndarray, "3 j 3 3"]  # factors of 1, sin and 1 - cos in each joint's rotation matrix
 
     def forward(self, q: Configurations) -> tuple[Rotations, Positions]:
         """Compute orientation and position of the TCP. Shapes (b, 3, 3) and (b, 3) [m]."""
@@ -131,9 +118,6 @@ def build_chain(
     """Build the chain from a body to a site of a compiled model, through the named hinges or slides.
 
     `limits` are the arm's, as the model's ranges may exceed the actuators' [rad or m].
-
-    Raises:
-        ValueError: if the joints do not lie, in this order, between the base and the site.
     """
     wanted = [model.joint(name).id for name in joint_names]
     offsets, found, pending = [], [], np.eye(4)
@@ -206,8 +190,7 @@ def follow_poses(
 ) -> tuple[Float64[np.ndarray, "n b j"], Int64[np.ndarray, " b"]]:
     """Track a sequence of poses, a few millimeters apart, from configurations at the pose before the first.
 
-    Returns:
-        The configurations, and how many poses each of the b reached within the limits and without a jump.
+    Also returns how many poses each of the b configurations reached within the limits and without a jump.
     """
     lower, upper = chain.lower + LIMIT_MARGIN_RAD / 2, chain.upper - LIMIT_MARGIN_RAD / 2
     rows = np.empty((len(tcp_in_base), *start.shape))

@@ -22,23 +22,14 @@ _BOX = trimesh.creation.box((2.0, 2.0, 2.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Obstacle(Frozen):
-    """Obstacle of a planner.
+    """Obstacle of a planner, one mesh or box."""
 
-    Attributes:
-        name: Its body.
-        pose: Its own frame in the robot's base frame: T_planning = T_world→robot · T_asset.
-        mesh: In its own frame [m]; None where a box replaces it.
-        center: Middle of its box, in its own frame [m].
-        size: Edge lengths of that box along its own axes [m].
-        boxed: Why a box replaces the mesh; empty for a mesh, and for true boxes.
-    """
-
-    name: str
-    pose: Pose
-    mesh: TriangleMesh | None
-    center: Vector3
-    size: Vector3
-    boxed: str = ""
+    name: str  # of its body
+    pose: Pose  # its own frame in the robot's base frame: T_planning = T_world→robot · T_asset
+    mesh: TriangleMesh | None  # in its own frame [m]; None where a box replaces it
+    center: Vector3  # middle of its box, in its own frame [m]
+    size: Vector3  # edge lengths of that box along its own axes [m]
+    boxed: str = ""  # why a box replaces the mesh; empty for a mesh, and for true boxes
 
     @property
     def box_pose(self) -> Pose:

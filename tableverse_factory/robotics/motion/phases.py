@@ -12,6 +12,7 @@ import numpy as np
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose
 from schemas.trajectories import JointPath, JointVector, Motion, NoMotion, Phase
+from tableverse_factory.geometry.math.transforms import translate_pose
 from tableverse_factory.robotics.motion.approach_configs import ApproachConfig, find_approach_configs, rank_pairs
 from tableverse_factory.robotics.motion.assembly import MARGINS_M, MotionPaths, assemble_motion
 from tableverse_factory.robotics.motion.interfaces import Planner
@@ -39,16 +40,8 @@ def plan_motion(
 ) -> Motion | NoMotion:
     """Plan a motion that grasps an object at one TCP pose and releases it at another, or return the first failed phase.
 
-    Args:
-        world: Robot and scene.
-        start: Initial configuration, at rest. Shape (j,) [rad].
-        tcp_grasp: In the table frame.
-        tcp_place: TCP where the fingers open, in the table frame, including the placement's drop.
-        object_id: The object.
-        width_m: Distance between the contacts of the grasp [m].
-        config: `speed` and `step_s`.
-        rng: The only source of randomness.
-        planner: Plans the paths between the lines.
+    It starts from rest. Poses are in the table frame; `tcp_place`, where the fingers open, includes the placement's
+    drop. `width_m` is the distance between the contacts of the grasp, `rng` the only source of randomness.
     """
     if world.unseen:
         return NoMotion(Phase.PRE_GRASP, "no_shape", f"no convex piece: {', '.join(world.unseen)}")
@@ -96,7 +89,7 @@ def _raise_release(task: PickPlace, near: JointVector) -> PickPlace:
         depth = task.compute_depth_at(found[0])
         if depth == 0.0:
             return task.allow_release_contacts(found[0])
-        task = task.raise_release(depth + RAISE_M)
+        task = replace(task, tcp_place=translate_pose(task.tcp_place, np.array([0.0, 0.0, depth + RAISE_M])))
         if task.tcp_place.position[2] - given.tcp_place.position[2] > MAX_RELEASE_M:
             return given
     return given
@@ -107,11 +100,11 @@ def _find_approach(task: PickPlace, near: JointVector, *, grasp: bool) -> tuple[
     tcp = task.tcp_grasp if grasp else task.tcp_place
     made = task.reaching_space if grasp else task.leaving_space
     taking, giving = (Phase.GRASP, Phase.GRASP, Phase.POST_GRASP), (Phase.PLACE, Phase.POST_PLACE, Phase.PLACE)
-    load = task.lifting_space(LINE_MARGIN_M) if grasp else task.lowering_space(LINE_MARGIN_M)
+    load = task.holding_space(LINE_MARGIN_M, task.taken if grasp else task.released)
     found: tuple[ApproachConfig, ...] | NoMotion = ()
     for opening in task.openings():
         hand = made(opening, LINE_MARGIN_M)
-        found = find_approach_configs(task.world, tcp, near, hand, load, taking if grasp else giving)
+        found = find_approach_configs(tcp, near, hand, load, taking if grasp else giving)
         if not isinstance(found, NoMotion) or found.reason == "out_of_reach":
             break
     return found
@@ -138,7 +131,7 @@ def _plan_transits(
         if reaching is None:
             continue
         blamed = Phase.PRE_PLACE
-        spaces = [task.carrying_space(margin) for margin in MARGINS_M]
+        spaces = [task.holding_space(margin) for margin in MARGINS_M]
         carrying = _plan_with_margins(posts[i], pres[k], spaces, rng, planner)
         if carrying is not None:
             return MotionPaths(take, give, reaching[0], carrying[0], (reaching[1], carrying[1]))
@@ -163,7 +156,7 @@ def _explain_no_path(
     if phase is Phase.PRE_GRASP:
         space, ends = task.reaching_space(take.opening_m, MARGINS_M[-1]), (start, take.hand.path[-1])
     else:
-        space = task.carrying_space(MARGINS_M[-1])
+        space = task.holding_space(MARGINS_M[-1])
         ends = (take.load.path[-1], give.load.path[-1])
     blocked = [why for q in ends if (why := task.world.describe_collision(space, q))]
     if blocked:

@@ -19,7 +19,7 @@ import numpy as np
 
 from schemas.geometry import Frozen, Pose
 from schemas.trajectories import JointVector
-from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, translate_pose
+from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
 from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.world import CONTACT_TOLERANCE_M, CollisionSpace, CollisionWorld, Pair
 from tableverse_factory.robotics.robots.gripper_clearance import compute_approach_openings
@@ -32,17 +32,14 @@ RESTING_GAP_M = 0.0006  # objects nearer than this to the carried object count a
 class PickPlace(Frozen):
     """An object, two TCP poses in the table frame, and the collision spaces that follow from them.
 
-    Attributes:
-        width_m: Distance between the fingers that hold the object [m].
-        taken: Pairs of the object that may touch in the lift, with their maximum depth [m].
-        released: The same for the lowering.
+    `taken` and `released` are pairs of the object that may touch in the lift and in the lowering, with their depth [m].
     """
 
     world: CollisionWorld
     object_id: str
     tcp_grasp: Pose
     tcp_place: Pose
-    width_m: float
+    width_m: float  # distance between the fingers that hold the object
     taken: tuple[tuple[Pair, float], ...] = ()
     released: tuple[tuple[Pair, float], ...] = ()
 
@@ -60,32 +57,20 @@ class PickPlace(Frozen):
 
     def reaching_space(self, opening_m: float, margin_m: float) -> CollisionSpace:
         """Return free space with open fingers and the scene as exported."""
-        return self.world.space(opening_m, margin_m=margin_m)
+        return CollisionSpace(self.world, opening_m, margin_m)
 
-    def lifting_space(self, margin_m: float) -> CollisionSpace:
-        """Return free space with the object held, its initial contacts allowed."""
-        return self._holding_space(margin_m, self.taken)
-
-    def carrying_space(self, margin_m: float) -> CollisionSpace:
-        """Return free space with the object held, no contact allowed."""
-        return self._holding_space(margin_m, ())
-
-    def lowering_space(self, margin_m: float) -> CollisionSpace:
-        """Return free space with the object held, its contacts at the release allowed."""
-        return self._holding_space(margin_m, self.released)
+    def holding_space(self, margin_m: float, resting: tuple[tuple[Pair, float], ...] = ()) -> CollisionSpace:
+        """Return free space with the object held, and contacts allowed: none, those of the grasp or of the release."""
+        return CollisionSpace(self.world, self.width_m, margin_m, self.carried, resting=dict(resting))
 
     def leaving_space(self, opening_m: float, margin_m: float) -> CollisionSpace:
         """Return free space with open fingers and the object where it was released."""
         placed = compose_poses(self.tcp_place, self.carried.object_to_tcp)
-        return self.world.space(opening_m, margin_m=margin_m, standing={self.object_id: placed})
+        return CollisionSpace(self.world, opening_m, margin_m, standing={self.object_id: placed})
 
     def compute_depth_at(self, q: JointVector) -> float:
         """Compute the object's deepest penetration at a configuration, allowing none; at least 0 [m]."""
         return max(0.0, -min(self._find_contacts(q).values(), default=0.0))
-
-    def raise_release(self, height_m: float) -> "PickPlace":
-        """Return the task with a higher release."""
-        return replace(self, tcp_place=translate_pose(self.tcp_place, np.array([0.0, 0.0, height_m])))
 
     def allow_grasp_contacts(self, q: JointVector) -> "PickPlace":
         """Allow, while lifting, the object's contacts at a grasp configuration, as deep as there."""
@@ -97,9 +82,6 @@ class PickPlace(Frozen):
         pairs = {pair: 0.0 for pair, depth in self._find_contacts(q).items() if depth >= -CONTACT_TOLERANCE_M}
         return replace(self, released=tuple(sorted(pairs.items())))
 
-    def _holding_space(self, margin_m: float, resting: tuple[tuple[Pair, float], ...]) -> CollisionSpace:
-        return self.world.space(self.width_m, margin_m=margin_m, carried=self.carried, resting=dict(resting))
-
     def _find_contacts(self, q: JointVector) -> dict[Pair, float]:
-        space = self.carrying_space(RESTING_GAP_M)
-        return self.world.select_object_pairs(self.object_id, self.world.find_contacts(space, q))
+        pairs = self.world.find_contacts(self.holding_space(RESTING_GAP_M), q)
+        return self.world.select_object_pairs(self.object_id, pairs)

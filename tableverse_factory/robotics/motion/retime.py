@@ -27,24 +27,18 @@ from tableverse_factory.robotics.robots.arm import Arm
 logging.getLogger("toppra").setLevel(logging.ERROR)
 
 TORQUE_SHARE = 0.9  # share of the drives' torque available to planning; the remainder is for tracking
-POINTS_PER_KNOT = 3
-MIN_POINTS = 60
+POINTS_PER_KNOT, MIN_POINTS = 3, 60
 _LIMIT_SHARE = 0.98
+Marks = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimedCurve(Frozen):
-    """Curve sampled at a constant step, at rest at both ends.
+    """Curve sampled at a constant step, at rest at both ends."""
 
-    Attributes:
-        positions: Shape (t, j) [rad].
-        velocities: Shape (t, j) [rad/s].
-        places: Parameter of the curve at each sample. Shape (t,).
-    """
-
-    positions: JointPath
-    velocities: JointPath
-    places: Float64[np.ndarray, " t"]
+    positions: JointPath  # [rad]
+    velocities: JointPath  # [rad/s]
+    places: Float64[np.ndarray, " t"]  # parameter of the curve at each sample
 
 
 class _SplinePath(AbstractGeometricPath):  # type: ignore[misc]
@@ -88,12 +82,13 @@ def retime_curve(curve: BSpline, arm: Arm, dynamics: ArmDynamics, speed: float, 
         ),
     ]
     _, rates, _ = TOPPRA(limits, path, gridpoints=grid, solver_wrapper="seidel").compute_parameterization(0.0, 0.0)
-    if rates is None or not np.isfinite(rates).all():
+    if rates is None or not np.isfinite(rates).all() or (rates[1:] + rates[:-1] <= 0.0).any():
         return None
-    return _sample_motion(path, grid, np.asarray(rates), speed * arm.max_velocity, speed * arm.max_acceleration, step_s)
+    stretch = _compute_stretch(path, grid, rates, speed * arm.max_velocity, speed * arm.max_acceleration)
+    return _sample_motion(path, grid, rates, stretch, step_s)
 
 
-def _choose_gridpoints(curve: BSpline) -> Float64[np.ndarray, " n"]:
+def _choose_gridpoints(curve: BSpline) -> Marks:
     """Choose where limits are checked: a few points per piece, more at the slow ends."""
     breaks = np.unique(curve.t)
     per_piece = max(POINTS_PER_KNOT, int(np.ceil(MIN_POINTS / (len(breaks) - 1))))
@@ -105,22 +100,11 @@ def _choose_gridpoints(curve: BSpline) -> Float64[np.ndarray, " n"]:
     )
 
 
-def _sample_motion(
-    path: _SplinePath,
-    grid: Float64[np.ndarray, " n"],
-    rates: Float64[np.ndarray, " n"],
-    max_velocity: JointVector,
-    max_acceleration: JointVector,
-    step_s: float,
-) -> TimedCurve | None:
+def _sample_motion(path: _SplinePath, grid: Marks, rates: Marks, stretch: float, step_s: float) -> TimedCurve:
     """Sample the motion that passes the grid at these rates, each piece at a constant rate of change."""
     mean = (rates[1:] + rates[:-1]) / 2
-    if (mean <= 0.0).any():
-        return None
     times = np.concatenate([[0.0], np.cumsum(np.diff(grid) / mean)])
-    count = int(
-        np.ceil(times[-1] / step_s * _compute_stretch(path, grid, rates, max_velocity, max_acceleration) - 1e-9)
-    )
+    count = int(np.ceil(times[-1] / step_s * stretch - 1e-9))
     scale = times[-1] / (count * step_s)
     at = np.arange(count + 1) * step_s * scale
     piece = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(mean) - 1)
@@ -135,11 +119,7 @@ def _sample_motion(
 
 
 def _compute_stretch(
-    path: _SplinePath,
-    grid: Float64[np.ndarray, " n"],
-    rates: Float64[np.ndarray, " n"],
-    max_velocity: JointVector,
-    max_acceleration: JointVector,
+    path: _SplinePath, grid: Marks, rates: Marks, max_velocity: JointVector, max_acceleration: JointVector
 ) -> float:
     """Compute the stretch needed for violations between the grid's points; 1 without any."""
     share = np.linspace(0.0, 1.0, 5)

@@ -58,7 +58,7 @@ class RrtConnect:
         found = _connect_trees(start, goal, space, rng)
         return None if found is None else shorten_path(found, space, rng)
 
-    def list_fallbacks(self, world: CollisionWorld) -> tuple[str, ...]:  # noqa: ARG002
+    def list_fallbacks(self, _world: CollisionWorld) -> tuple[str, ...]:
         """Return none: collisions are checked on the scene itself."""
         return ()
 
@@ -72,12 +72,9 @@ def _connect_trees(
     while sum(len(tree.parents) for tree in trees) < MAX_BRANCHES and growing < 4 * MAX_BRANCHES:
         tree, other = trees[growing % 2], trees[1 - growing % 2]
         tip = _extend_tree(tree, rng.uniform(chain.lower, chain.upper), space)
-        if tip is not None:
-            met = _grow_to(other, tree.at(tip), space)
-            if met is not None:
-                rows = (tree.to_root(tip)[::-1], other.to_root(met)[1:])
-                row = rows[0] + rows[1] if growing % 2 == 0 else rows[1][::-1] + rows[0][::-1]
-                return np.array(row)
+        if tip is not None and (met := _grow_to(other, tree.at(tip), space)) is not None:
+            row = tree.to_root(tip)[::-1] + other.to_root(met)[1:]
+            return np.array(row if growing % 2 == 0 else row[::-1])
         growing += 1
     return None
 
@@ -97,9 +94,7 @@ def _grow_to(tree: _Tree, goal: JointVector, space: CollisionSpace) -> int | Non
     """Grow branches until a configuration is reached; None where an obstacle is in the way."""
     while True:
         tip = _extend_tree(tree, goal, space)
-        if tip is None:
-            return None
-        if np.array_equal(tree.at(tip), goal):
+        if tip is None or np.array_equal(tree.at(tip), goal):
             return tip
 
 
@@ -126,14 +121,11 @@ def _skip_corners(path: JointPath, space: CollisionSpace) -> JointPath:
     """Connect each corner to the farthest one in free straight view."""
     kept, at = [path[0]], 0
     while at < len(path) - 1:
-        ahead = next(k for k in range(len(path) - 1, at, -1) if k == at + 1 or _sees(path[at], path[k], space))
+        farthest_first = range(len(path) - 1, at, -1)
+        ahead = next(k for k in farthest_first if k == at + 1 or space.is_edge_free(path[at], path[k], EDGE_STEP_RAD))
         kept.append(path[ahead])
         at = ahead
     return np.array(kept)
-
-
-def _sees(start: JointVector, goal: JointVector, space: CollisionSpace) -> bool:
-    return space.is_edge_free(start, goal, EDGE_STEP_RAD)
 
 
 def _interpolate_path(corners: JointPath, marks: np.ndarray, value: float) -> JointVector:

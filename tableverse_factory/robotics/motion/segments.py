@@ -43,9 +43,7 @@ def blend_path(path: JointPath, radius_rad: float, *, touch_at_start: bool, touc
 def _place_breaks(length: float, radius: float, at_start: bool, at_end: bool) -> Float64[np.ndarray, " n"]:
     """Place breaks between cubics at a density that gives the wanted spacing."""
     fine = np.linspace(0.0, length, max(int(np.ceil(length / CONTACT_SPACING_RAD)) * 4, 16))
-    away = np.full(len(fine), np.inf)
-    away = np.minimum(away, fine if at_start else np.inf)
-    away = np.minimum(away, length - fine if at_end else np.inf)
+    away = np.minimum(fine if at_start else np.full(len(fine), np.inf), length - fine if at_end else np.inf)
     density = 1.0 / np.clip(SPACING_GROWTH * away, min(CONTACT_SPACING_RAD, radius), radius)
     total = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(fine))])
     count = max(int(np.ceil(total[-1])), 4)
@@ -63,14 +61,6 @@ class PathSegment(Frozen):
     space: CollisionSpace
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TimedRun(Frozen):
-    """Timed run with the index into `Phase` of each sample."""
-
-    timed: TimedCurve
-    phases: Int32[np.ndarray, " t"]
-
-
 def time_segments(
     sections: Sequence[PathSegment],
     arm: Arm,
@@ -80,8 +70,8 @@ def time_segments(
     *,
     touch_at_start: bool,
     touch_at_end: bool,
-) -> TimedRun | NoMotion:
-    """Compute the fastest run through all segments without a stop between them, or why there is none.
+) -> tuple[TimedCurve, Int32[np.ndarray, " t"]] | NoMotion:
+    """Compute the fastest run through all segments and the index into `Phase` of each sample, or why there is none.
 
     A failure is attributed to the run's last phase: `no_blend` where every blend collides, `too_fast` where no timing
     of the curve keeps velocity, acceleration and torque.
@@ -96,7 +86,8 @@ def time_segments(
             if timed is None:
                 detail = "no timing of the path from rest to rest keeps the limits of velocity, acceleration and torque"
                 return NoMotion(phase, "too_fast", detail)
-            return TimedRun(timed, _assign_phases(timed, sections, ends))
+            numbers = np.array([list(Phase).index(section.phase) for section in sections], dtype=np.int32)
+            return timed, numbers[_find_owners(timed.places, ends)]
     return NoMotion(phase, "no_blend", f"{blocked}, with corners blended over {BLEND_RADII_RAD[-1]:g} rad")
 
 
@@ -115,16 +106,14 @@ def _find_collision(curve: BSpline, sections: Sequence[PathSegment], ends: np.nd
     """Describe the curve's first collision, checked as finely as the corners were; empty where it is free."""
     steps = np.abs(np.diff(curve.c, axis=0)).max(axis=1).sum() / EDGE_STEP_RAD
     marks = np.linspace(curve.t[0], curve.t[-1], max(int(np.ceil(2 * steps)), 20))
-    owner = np.minimum(np.searchsorted(ends, marks, side="left"), len(sections) - 1)
+    owner = _find_owners(marks, ends)
     for index, section in enumerate(sections):
         path: JointPath = curve(marks[owner == index])
-        hit = section.space.find_first_collision(path)
-        if hit is not None:
+        if (hit := section.space.find_first_collision(path)) is not None:
             return f"{section.space.world.describe_collision(section.space, path[hit])} in {section.phase}"
     return ""
 
 
-def _assign_phases(timed: TimedCurve, sections: Sequence[PathSegment], ends: np.ndarray) -> Int32[np.ndarray, " t"]:
-    order = list(Phase)
-    numbers = np.array([order.index(section.phase) for section in sections], dtype=np.int32)
-    return numbers[np.minimum(np.searchsorted(ends, timed.places, side="left"), len(sections) - 1)]
+def _find_owners(places: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Find the segment of each place on the curve."""
+    return np.minimum(np.searchsorted(ends, places, side="left"), len(ends) - 1)

@@ -5,6 +5,7 @@ joint, at exact geometry, with the carried object. Every motion has to pass it, 
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,8 +15,7 @@ from schemas.trajectories import JointPath, Motion, NoMotion, Phase
 from tableverse_factory.robotics.motion.pick_place import PickPlace
 from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 
-CHECK_STEP_RAD = 0.004
-CHECK_OPENING_STEP_M = 0.004
+CHECK_STEP_RAD, CHECK_OPENING_STEP_M = 0.004, 0.004
 _ROUNDING = 1e-6
 _PHASES = list(Phase)
 
@@ -52,9 +52,8 @@ def _check_limits(world: CollisionWorld, motion: Motion, speed: float) -> NoMoti
     for name, values in excess.items():
         sample, joint = np.unravel_index(int(np.argmax(values)), values.shape)
         if values[sample, joint] > _ROUNDING:
-            detail = (
-                f"{name} of joint {joint + 1} is beyond its limit by {values[sample, joint]:.3g} at sample {sample}"
-            )
+            excess_by = values[sample, joint]
+            detail = f"{name} of joint {joint + 1} is beyond its limit by {excess_by:.3g} at sample {sample}"
             return NoMotion(_PHASES[motion.phases[sample]], "not_rechecked", detail)
     if np.abs(velocity[[0, -1]]).max() > _ROUNDING:
         return NoMotion(Phase.PRE_GRASP, "not_rechecked", "the motion does not start and end at rest")
@@ -80,32 +79,27 @@ def _check_torques(world: CollisionWorld, motion: Motion, object_id: str) -> NoM
 
 def _check_collisions(world: CollisionWorld, motion: Motion, object_id: str, width_m: float) -> NoMotion | None:
     for phase, space, path in split_by_space(world, motion, object_id, width_m):
-        hit = space.find_first_collision(path)
-        if hit is not None:
-            return NoMotion(
-                phase, "not_rechecked", f"{world.describe_collision(space, path[hit])} in the finished motion"
-            )
+        if (hit := space.find_first_collision(path)) is not None:
+            detail = f"{world.describe_collision(space, path[hit])} in the finished motion"
+            return NoMotion(phase, "not_rechecked", detail)
     return None
 
 
 def split_by_space(
     world: CollisionWorld, motion: Motion, object_id: str, width_m: float
 ) -> Iterator[tuple[Phase, CollisionSpace, JointPath]]:
-    """Iterate phase, collision space and dense configurations over the whole motion.
-
-    While the arm pauses, the fingers are checked on their way, with the object between them.
-    """
+    """Iterate phase, collision space and dense configurations; in pauses, the fingers on their way to the object."""
     q, phases = motion.positions, motion.phases
     grasp, place = (_find_last_sample(motion, phase) for phase in (Phase.GRASP, Phase.PLACE))
     task = PickPlace(world, object_id, *_compute_gripper_poses(world, motion), width_m)
     task = task.allow_grasp_contacts(q[grasp]).allow_release_contacts(q[place])
     opened, released = float(motion.openings[0]), float(motion.openings[-1])
-    lifting, lowering = task.lifting_space(0.0), task.lowering_space(0.0)
+    lifting, lowering = task.holding_space(0.0, task.taken), task.holding_space(0.0, task.released)
     spaces = {
         Phase.PRE_GRASP: task.reaching_space(opened, 0.0),
         Phase.GRASP: task.reaching_space(opened, 0.0),
         Phase.POST_GRASP: lifting,
-        Phase.PRE_PLACE: task.carrying_space(0.0),
+        Phase.PRE_PLACE: task.holding_space(0.0),
         Phase.PLACE: lowering,
         Phase.POST_PLACE: task.leaving_space(released, 0.0),
     }
@@ -113,11 +107,9 @@ def split_by_space(
         samples = np.flatnonzero(phases == number)
         first = max(int(samples[0]) - 1, 0)
         yield phase, spaces[phase], _densify(q[first : samples[-1] + 1])
-    stands = ((Phase.GRASP, grasp, opened, lifting), (Phase.PLACE, place, released, lowering))
-    for phase, at, opening, resting in stands:
+    for phase, at, opening, held in ((Phase.GRASP, grasp, opened, lifting), (Phase.PLACE, place, released, lowering)):
         for wide in np.arange(width_m, opening, CHECK_OPENING_STEP_M):
-            space = world.space(float(wide), carried=task.carried, resting=resting.resting)
-            yield phase, space, q[at : at + 1]
+            yield phase, replace(held, opening_m=float(wide)), q[at : at + 1]
 
 
 def _densify(path: JointPath) -> JointPath:
@@ -137,7 +129,5 @@ def _find_last_sample(motion: Motion, phase: Phase) -> int:
 
 def _compute_gripper_poses(world: CollisionWorld, motion: Motion) -> tuple[Pose, Pose]:
     """Compute the TCP at the grasp and at the release."""
-    grasp, place = (
-        world.tcp(motion.positions[_find_last_sample(motion, phase)]) for phase in (Phase.GRASP, Phase.PLACE)
-    )
-    return grasp, place
+    grasp, place = (_find_last_sample(motion, phase) for phase in (Phase.GRASP, Phase.PLACE))
+    return world.tcp(motion.positions[grasp]), world.tcp(motion.positions[place])

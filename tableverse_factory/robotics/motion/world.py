@@ -19,7 +19,7 @@ from tableverse_factory.geometry.math.transforms import compose_poses, invert_po
 from tableverse_factory.physics.mjcf.spec import TABLE
 from tableverse_factory.robotics.motion.dynamics import ArmDynamics, CarriedObject
 from tableverse_factory.robotics.motion.kinematics import build_chain
-from tableverse_factory.robotics.robots.station import Station, find_subtree
+from tableverse_factory.robotics.robots.station import PREFIX, Station, find_subtree
 
 Pair = tuple[int, int]  # two geom ids, ascending
 CONTACT_TOLERANCE_M = 1e-5  # penetration below this is the collision routine's own error [m]
@@ -28,21 +28,18 @@ _MOVING, _SELF, _HELD, _HELD_ROBOT = 1, 2, 4, 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CollisionSpace:
-    """Free space in one phase of a motion, made by `CollisionWorld.space`.
+    """Free space in one phase of a motion.
 
-    Attributes:
-        world: The world it is a view of.
-        opening_m: Distance between the fingers [m].
-        margin_m: Minimum distance of the arm and its payload from the scene [m].
-        carried: Object between the fingers; its pairs with the gripper are ignored.
-        standing: Poses of objects that are not where they were exported, by id.
-        resting: Pairs of the carried object that may touch, with their maximum depth.
+    Always checked: the arm with itself (without margin), the arm with the scene, and the carried object with the scene
+    and with the arm except its gripper. An object that is not carried, also the one to be grasped, is an obstacle for
+    the whole arm: open fingers that touch it would push it. `standing` gives poses of objects that are not where they
+    were exported, `resting` pairs of the carried object that may touch, with their maximum depth [m].
     """
 
     world: "CollisionWorld"
-    opening_m: float
-    margin_m: float = 0.0
-    carried: CarriedObject | None = None
+    opening_m: float  # distance between the fingers
+    margin_m: float = 0.0  # minimum distance of the arm and its payload from the scene
+    carried: CarriedObject | None = None  # between the fingers; its pairs with the gripper are ignored
     standing: Mapping[str, Pose] = field(default_factory=dict)
     resting: Mapping[Pair, float] = field(default_factory=dict)
 
@@ -61,16 +58,7 @@ class CollisionSpace:
 
 
 class CollisionWorld:
-    """Station at one base, for collision queries.
-
-    Attributes:
-        station: The scene and the arm.
-        chain: The arm, from its base to the TCP.
-        base: The arm's base in the table frame.
-        dynamics: Of the arm alone.
-        table_geom: Id of the slab, if there is one of that name.
-        unseen: Objects without any convex piece, which cannot be avoided: no motion is planned beside them.
-    """
+    """Station at one base, for collision queries."""
 
     def __init__(self, station: Station, base: Pose | None = None) -> None:
         """Copy the station's model, with its base at `base`, by default its present one."""
@@ -82,10 +70,12 @@ class CollisionWorld:
         self._data = mujoco.MjData(self._model)
         self._exported = np.array(station.model.qpos0)
         limits = (station.arm.lower, station.arm.upper)
-        self.chain = build_chain(self._model, _list_joint_names(station), station.base_body, station.tcp_site, limits)
+        joints = tuple(PREFIX + name for name in station.arm.joint_names)
+        self.chain = build_chain(self._model, joints, station.base_body, station.tcp_site, limits)
         self._joints = _as_slice(station.joint_qpos)
         self._masks = _CollisionMasks.of(station)
         solid = set(self._model.geom_bodyid[self._masks.solid].tolist())
+        # Objects without any convex piece, which cannot be avoided: no motion is planned beside them
         self.unseen = tuple(name for name, body in station.object_bodies.items() if body not in solid)
         self.dynamics = ArmDynamics(station.arm)
         table = mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_GEOM, TABLE)
@@ -106,23 +96,6 @@ class CollisionWorld:
         at = self.station.object_qpos[object_id]
         return Pose(self._exported[at : at + 3].copy(), self._exported[at + 3 : at + 7].copy())
 
-    def space(
-        self,
-        opening_m: float,
-        *,
-        margin_m: float = 0.0,
-        carried: CarriedObject | None = None,
-        standing: Mapping[str, Pose] | None = None,
-        resting: Mapping[Pair, float] | None = None,
-    ) -> CollisionSpace:
-        """Make a collision space.
-
-        Always checked: the arm with itself (without margin), the arm with the scene, and the carried object with the
-        scene and with the arm except its gripper. An object that is not carried, also the one to be grasped, is an
-        obstacle for the whole arm: open fingers that touch it would push it.
-        """
-        return CollisionSpace(self, opening_m, margin_m, carried, standing or {}, resting or {})
-
     def is_free(self, space: CollisionSpace, q: JointVector) -> bool:
         """Test whether all distances of a space are respected at a configuration."""
         self._compute_contacts(space, q)
@@ -141,9 +114,8 @@ class CollisionWorld:
         """Return the least signed distance [m] of each pair within the margin at a configuration."""
         self._compute_contacts(space, q)
         found: dict[Pair, float] = {}
-        for (first, second), distance in zip(
-            self._data.contact.geom.tolist(), self._data.contact.dist.tolist(), strict=True
-        ):
+        contact = self._data.contact
+        for (first, second), distance in zip(contact.geom.tolist(), contact.dist.tolist(), strict=True):
             pair = (min(first, second), max(first, second))
             found[pair] = min(distance, found.get(pair, np.inf))
         return found
@@ -256,12 +228,6 @@ def _order_coarse_to_fine(count: int) -> list[int]:
         order += [k for k in range(stride, count, stride) if k not in seen]
         seen.update(order)
     return order
-
-
-def _list_joint_names(station: Station) -> tuple[str, ...]:
-    model = station.model
-    by_address = {int(address): model.joint(joint).name for joint, address in enumerate(model.jnt_qposadr)}
-    return tuple(by_address[int(address)] for address in station.joint_qpos)
 
 
 def _as_slice(indices: np.ndarray) -> slice | np.ndarray:

@@ -30,17 +30,11 @@ _UPSIDE_DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation(Frozen):
-    """Rotation from the object's present to its future orientation, about the table's origin.
-
-    Attributes:
-        quaternion_wxyz: The rotation.
-        angle: Its angle, 0 to pi [rad].
-        body: The rotated object, without its cavity and flat top.
-    """
+    """Rotation from the object's present to its future orientation, about the table's origin."""
 
     quaternion_wxyz: Quaternion
-    angle: float
-    body: BodyFeatures
+    angle: float  # 0 to pi [rad]
+    body: BodyFeatures  # the rotated object, without its cavity and flat top
 
 
 def list_orientations(standing: TriangleMesh, body: BodyFeatures) -> tuple[Orientation, ...]:

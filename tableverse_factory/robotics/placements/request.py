@@ -35,21 +35,13 @@ ENOUGH_CLEAR = 6  # with this many placements clear by boxes, outlines are not t
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacementSamples(Frozen):
-    """Samples of one or of all headings.
+    """Samples of one or of all headings."""
 
-    Attributes:
-        heading: Index of the heading. Shape (n,).
-        cells: Offset of the rotated object in cells of its map. Shape (n, 2).
-        middles: Middle of its box there. Shape (n, 2) [m].
-        costs: Lower is better. Shape (n,).
-        clear: Whether boxes are clear there. Shape (n,).
-    """
-
-    heading: Int64[np.ndarray, " n"]
-    cells: Int64[np.ndarray, "n 2"]
-    middles: Points2
+    heading: Int64[np.ndarray, " n"]  # index of the heading
+    cells: Int64[np.ndarray, "n 2"]  # offset of the rotated object in cells of its map
+    middles: Points2  # of its box there [m]
     costs: Float64[np.ndarray, " n"]
-    clear: Bool[np.ndarray, " n"]
+    clear: Bool[np.ndarray, " n"]  # whether boxes are clear there
 
     def rank(self, avoided: Vector2 | None) -> list[int]:
         """Rank indices: clear boxes, then others, then those near `avoided` [m]; each by cost, alike ones last."""
@@ -80,32 +72,20 @@ def concatenate_samples(parts: Sequence[PlacementSamples]) -> PlacementSamples:
 
 @dataclass(frozen=True, slots=True)
 class NoPlacement:
-    """Reason why there is no placement.
+    """Reason why there is no placement."""
 
-    Attributes:
-        reason: `no_container`, `no_stable_top`, `does_not_stand` or `no_room`.
-        detail: One line for people, with the tally of rejections.
-    """
-
-    reason: str
-    detail: str
+    reason: str  # `no_container`, `no_stable_top`, `does_not_stand` or `no_room`
+    detail: str  # one line for people, with the tally of rejections
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CandidatePlacement(Frozen):
-    """Place where the object would come to rest.
-
-    Attributes:
-        turn: Its orientation.
-        offset: From the rotated object to the object at rest [m].
-        drops: Release heights, best first [m].
-        clear_by: As in `Placement`.
-    """
+    """Place where the object would come to rest."""
 
     turn: Orientation
-    offset: Vector3
-    drops: tuple[float, ...]
-    clear_by: str
+    offset: Vector3  # from the rotated object to the object at rest [m]
+    drops: tuple[float, ...]  # release heights, best first [m]
+    clear_by: str  # as in `Placement`
 
     def to_placements(self, standing: Pose) -> Iterator[Placement]:
         """Convert to poses of the object's own frame, which now stands at `standing`."""
@@ -116,24 +96,16 @@ class CandidatePlacement(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class PlacementRequest:
-    """Relation to achieve between two objects of a scene.
-
-    Attributes:
-        x: Object to place.
-        y: Reference.
-        epsilon_m: Minimum gap to other boxes [m].
-        delta_margin_m: Minimum gap along the axis of a side [m].
-        wanted: Number of placements.
-    """
+    """Relation to achieve between an object and a reference of a scene."""
 
     relation: Relation
-    x: SceneObject
-    y: SceneObject
+    x: SceneObject  # to place
+    y: SceneObject  # reference
     others: tuple[SceneObject, ...]
     table: Slab
-    epsilon_m: float
-    delta_margin_m: float
-    wanted: int
+    epsilon_m: float  # minimum gap to other boxes
+    delta_margin_m: float  # minimum gap along the axis of a side
+    wanted: int  # number of placements
 
     @property
     def predicate(self) -> Predicate:

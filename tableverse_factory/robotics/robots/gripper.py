@@ -23,24 +23,14 @@ _DIGITS = 7  # decimals kept of simulated rest positions; the rest is within the
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gripper(Frozen):
-    """Two fingers that slide towards each other.
+    """Two fingers that slide towards each other."""
 
-    Attributes:
-        joints: Ids of the finger slides.
-        geoms: Ids of the colliding finger geoms.
-        control: Actuator control with closed and with open fingers.
-        closed: Joint positions with closed fingers. Shape (k,) [m].
-        opened: Joint positions with open fingers. Shape (k,) [m].
-        max_opening_m: Distance between the open fingertips [m].
-        shape: Boxes around the geoms, in the gripper frame.
-    """
-
-    joints: tuple[int, ...]
-    geoms: tuple[int, ...]
-    control: tuple[float, float]
-    closed: JointVector
-    opened: JointVector
-    max_opening_m: float
+    joints: tuple[int, ...]  # ids of the finger slides
+    geoms: tuple[int, ...]  # ids of the colliding finger geoms
+    control: tuple[float, float]  # of the actuator with closed and with open fingers
+    closed: JointVector  # joint positions [m]
+    opened: JointVector  # joint positions [m]
+    max_opening_m: float  # between the open fingertips
     shape: GripperShape
 
 

@@ -31,12 +31,9 @@ _DAMPING = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReachMap(Frozen):
-    """Map of cells of `CELL_M`, the first around distance 0 and height 0.
+    """Map of cells of `CELL_M`, the first around distance 0 and height 0: rows are distances, columns heights.
 
-    Attributes:
-        cells: Reached cells; rows are distances, columns heights. Shape (r, z).
-        margins: Distance of each reached cell to the nearest unreached one [m], 0 for unreached cells. Cells below the
-            foot or above the map do not count.
+    Margins are distances of reached cells to the nearest unreached one [m], else 0; the border above and below is none.
     """
 
     cells: Bool[np.ndarray, "r z"]

@@ -41,26 +41,17 @@ _TARGET_GRASPS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt(Frozen):
-    """Tried pair of grasp and placement.
+    """Tried pair of grasp and placement."""
 
-    Attributes:
-        base: Of the robot, in the table frame.
-        stage: Of the paper's arbitration, 1 to 3.
-        score: Of the grasp.
-        failed_phase: Empty on success.
-        reason: Code; empty on success.
-        fallbacks: Compromises of the placement and the motion, in words.
-    """
-
-    base: Pose
-    stage: int
-    score: float
-    failed_phase: str
-    reason: str
+    base: Pose  # of the robot, in the table frame
+    stage: int  # of the paper's arbitration, 1 to 3
+    score: float  # of the grasp
+    failed_phase: str  # empty on success
+    reason: str  # code; empty on success
     detail: str
     motion: Motion | None = None
     proof: RolloutResult | None = None
-    fallbacks: tuple[str, ...] = ()
+    fallbacks: tuple[str, ...] = ()  # compromises of the placement and the motion, in words
 
     @property
     def success(self) -> bool:
@@ -75,23 +66,14 @@ class Attempt(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedTask:
-    """Result of a task.
+    """Result of a task."""
 
-    Attributes:
-        attempt: The successful one, or the first of those that came furthest; None where nothing could be tried.
-        reason: Code of what prevented any attempt; empty where there was one.
-        detail: One line for people: what prevented any attempt, or a tally of failures.
-        candidates: Number of grasps with clearance.
-        tried: Number of attempts.
-        survives: Names of the perturbations under which it succeeds too.
-    """
-
-    attempt: Attempt | None = None
-    reason: str = ""
-    detail: str = ""
-    candidates: int = 0
-    tried: int = 0
-    survives: tuple[str, ...] = ()
+    attempt: Attempt | None = None  # the successful one, or the first of those that came furthest
+    reason: str = ""  # code of what prevented any attempt; empty where there was one
+    detail: str = ""  # what prevented any attempt, or a tally of failures
+    candidates: int = 0  # number of grasps with clearance
+    tried: int = 0  # number of attempts
+    survives: tuple[str, ...] = ()  # perturbations under which it succeeds too
 
 
 def search_trajectory(

@@ -18,12 +18,7 @@ from tableverse_factory.dataset.trajectory_files import add_digests
 from tableverse_factory.robotics.execution.arrays import Recording, decode_recording, encode_recording
 from tableverse_factory.robotics.execution.audit import audit_trajectories
 from tableverse_factory.robotics.execution.execute import RolloutResult, execute_and_check
-from tableverse_factory.robotics.execution.replay import (
-    ReplayDifference,
-    load_named_arm,
-    replay_recording,
-    replay_trajectory,
-)
+from tableverse_factory.robotics.execution.replay import ReplayDifference, load_named_arm, replay_recording
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.pick_recording import BASE, BLOCK, REFERENCE, exported, goal, pick_and_place, scene_files, station
@@ -75,9 +70,9 @@ def problems(recording: Recording, row: dict[str, object], tasks: Sequence[dict[
 
 def test_a_replay_from_the_files_alone_is_equal(good: RolloutResult) -> None:
     data = encode_recording(good.recording)
-    assert replay_trajectory(scene_files(), row_of(good), data) == good.verdict
     fresh = Station(scene_files(), load_arm("panda"))
     again = replay_recording(scene_files(), row_of(good), decode_recording(data), fresh)
+    assert again.verdict == good.verdict
     assert again.compute_difference() == ReplayDifference(0.0, 0.0, 0.0, 0.0, 0.0)
     assert encode_recording(again.now) == data, "and its recording is the same to the last byte"
 
@@ -86,7 +81,7 @@ def test_a_replay_from_the_files_alone_is_equal(good: RolloutResult) -> None:
 def test_failures_are_reproduced_too(closed: float) -> None:
     failed = execute_and_check(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03), closed=closed), goal())
     assert not failed.verdict.success
-    assert replay_trajectory(scene_files(), row_of(failed), encode_recording(failed.recording)) == failed.verdict
+    assert replay_recording(scene_files(), row_of(failed), failed.recording, station()).verdict == failed.verdict
     assert problems(failed.recording, row_of(failed)) == ""
     assert "replayed it fails with" in problems(failed.recording, row_of(failed, reason="slipped"))
 

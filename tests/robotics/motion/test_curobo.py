@@ -17,11 +17,11 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     transform_points,
 )
-from tableverse_factory.robotics.motion.curobo import _describe_box, _describe_mesh
+from tableverse_factory.robotics.motion.curobo import _describe_obstacle
 from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.interfaces import PLANNERS
 from tableverse_factory.robotics.motion.obstacles import build_obstacle, list_obstacles, merge_object_pieces
-from tableverse_factory.robotics.motion.world import CollisionWorld
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 from tableverse_factory.robotics.robots.station import Station
 from tests.helpers.simple_scenes import Solid, box
 from tests.helpers.work_cells import BLOCK, HOME, block, down, station_of
@@ -45,7 +45,7 @@ def world(base: Pose | None = None) -> CollisionWorld:
 def test_an_obstacle_seen_from_the_base_is_where_it_is_on_the_table(x, y, yaw):
     base = Pose(np.array([x, y, 0.0]), quaternion_about_z(yaw))
     here = world(base)
-    found = {obstacle.name: obstacle for obstacle in list_obstacles(here.space(0.04))}
+    found = {obstacle.name: obstacle for obstacle in list_obstacles(CollisionSpace(here, 0.04))}
     assert set(found) == {"table", BLOCK, "tilted"}
     for name in (BLOCK, "tilted"):
         on_table = transform_points(here.object_pose(name), found[name].mesh.vertices)
@@ -64,7 +64,7 @@ def test_the_mesh_is_the_object_as_it_was_exported():
 def test_the_distance_to_the_robot_is_the_same_in_both_frames():
     here = world()
     tcp = here.chain.pose_matrix(HOME)[:3, 3]
-    for obstacle in list_obstacles(here.space(0.04)):
+    for obstacle in list_obstacles(CollisionSpace(here, 0.04)):
         if obstacle.mesh is not None:
             seen = transform_points(obstacle.pose, obstacle.mesh.vertices)
             real = transform_points(here.object_pose(obstacle.name), obstacle.mesh.vertices)
@@ -76,9 +76,9 @@ def test_the_distance_to_the_robot_is_the_same_in_both_frames():
 def test_what_is_carried_is_no_obstacle_and_what_was_let_go_stands_there():
     here = world()
     carried = CarriedObject(BLOCK, identity_pose())
-    assert BLOCK not in {obstacle.name for obstacle in list_obstacles(here.space(0.04, carried=carried))}
+    assert BLOCK not in {obstacle.name for obstacle in list_obstacles(CollisionSpace(here, 0.04, carried=carried))}
     there = Pose(np.array([0.2, 0.2, 0.05]), identity_pose().quaternion_wxyz)
-    moved = next(o for o in list_obstacles(here.space(0.04, standing={BLOCK: there})) if o.name == BLOCK)
+    moved = next(o for o in list_obstacles(CollisionSpace(here, 0.04, standing={BLOCK: there})) if o.name == BLOCK)
     np.testing.assert_allclose(compose_poses(here.base, moved.pose).position, there.position, atol=1e-9)
 
 
@@ -103,14 +103,12 @@ def test_a_bad_mesh_is_its_box_and_says_why():
 
 
 def test_arguments_are_plain_lists_with_the_quaternion_real_part_first():
-    table, thing, *_ = list_obstacles(world().space(0.04))
-    arguments = _describe_mesh(thing)
+    table, thing, *_ = list_obstacles(CollisionSpace(world(), 0.04))
+    arguments = _describe_obstacle(thing)
     np.testing.assert_allclose(arguments["pose"], [*thing.pose.position, *thing.pose.quaternion_wxyz])
     assert isinstance(arguments["vertices"], list)
     assert isinstance(arguments["faces"][0], list)
-    assert _describe_box(table)["dims"] == table.size.tolist()
-    with pytest.raises(ValueError, match="box"):
-        _describe_mesh(table)
+    assert _describe_obstacle(table)["dims"] == table.size.tolist()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("curobo") is not None, reason="cuRobo is installed here")

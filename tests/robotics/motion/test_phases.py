@@ -14,7 +14,7 @@ from tableverse_factory.robotics.motion.phases import plan_motion
 from tableverse_factory.robotics.motion.rrt import RrtConnect
 from tableverse_factory.robotics.motion.segments import PathSegment, time_segments
 from tableverse_factory.robotics.motion.validate import validate_motion
-from tableverse_factory.robotics.motion.world import CollisionWorld
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 from tests.helpers.simple_scenes import Solid, box
 from tests.helpers.work_cells import (
     BLOCK,
@@ -216,7 +216,7 @@ def test_a_run_through_a_wall_is_no_matter_of_limits():
     ends = [
         solve_ik(world.chain, world.in_base(tcp), HOME, 1)[0] for tcp in (down(0.05, 0.0, 0.2), down(-0.2, 0.0, 0.2))
     ]
-    sections = [PathSegment(Phase.PRE_GRASP, np.array(ends), world.space(0.04))]
+    sections = [PathSegment(Phase.PRE_GRASP, np.array(ends), CollisionSpace(world, 0.04))]
     arm = world.station.arm
     found = time_segments(sections, arm, world.dynamics, 0.5, 0.02, touch_at_start=False, touch_at_end=False)
     assert isinstance(found, NoMotion)

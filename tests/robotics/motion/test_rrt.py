@@ -7,7 +7,7 @@ import pytest
 
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.rrt import EDGE_STEP_RAD, RrtConnect, shorten_path
-from tableverse_factory.robotics.motion.world import CollisionWorld
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 from tests.helpers.simple_scenes import Solid, box
 from tests.helpers.work_cells import BLOCK, HOME, clutter, deepest, down, object_geoms, station_of
 
@@ -23,7 +23,7 @@ def dense(path: np.ndarray, step: float = 0.01) -> np.ndarray:
 
 
 def at(world: CollisionWorld, x: float, y: float, z: float) -> np.ndarray:
-    space = world.space(0.04, margin_m=MARGIN_M)
+    space = CollisionSpace(world, 0.04, margin_m=MARGIN_M)
     turns = [solve_ik(world.chain, world.in_base(down(x, y, z, yaw)), HOME, 6) for yaw in (0.0, 0.8, 1.6, 2.4)]
     return next(q for q in np.concatenate(turns) if space.is_free(q))
 
@@ -33,7 +33,7 @@ def at(world: CollisionWorld, x: float, y: float, z: float) -> np.ndarray:
 )
 def test_a_path_is_free_by_the_distance_of_every_pair_and_the_same_each_time(start, goal):
     world = clutter()
-    space = world.space(0.04, margin_m=MARGIN_M)
+    space = CollisionSpace(world, 0.04, margin_m=MARGIN_M)
     ends = [at(world, *start), at(world, *goal)]
     path = RrtConnect().plan_path(*ends, space, np.random.default_rng(0))
     np.testing.assert_array_equal(path[[0, -1]], ends)
@@ -55,7 +55,7 @@ def walled(gap_m: float) -> CollisionWorld:
 
 def test_a_narrow_passage_is_found():
     world = walled(0.3)
-    space = world.space(0.04, margin_m=MARGIN_M)
+    space = CollisionSpace(world, 0.04, margin_m=MARGIN_M)
     ends = [at(world, -0.2, -0.05, 0.15), at(world, 0.0, 0.2, 0.12)]
     assert not space.is_edge_free(*ends, EDGE_STEP_RAD)
     path = RrtConnect().plan_path(*ends, space, np.random.default_rng(0))
@@ -67,7 +67,7 @@ def test_a_narrow_passage_is_found():
 
 def test_what_is_blocked_gives_none_within_the_bound():
     world = clutter()
-    space = world.space(0.04, margin_m=MARGIN_M)
+    space = CollisionSpace(world, 0.04, margin_m=MARGIN_M)
     inside = solve_ik(world.chain, world.in_base(down(0.0, 0.0, 0.05)), HOME, 1)[0]
     assert not space.is_free(inside)
     assert RrtConnect().plan_path(HOME, inside, space, np.random.default_rng(0)) is None
@@ -79,7 +79,7 @@ def test_a_goal_without_a_way_to_it_ends_too():
     boxed_in = [Solid(box(0.02, 0.3, 0.3), (s * 0.13, 0.0, 0.15), object_id=f"x_{s + 1}") for s in (-1, 1)]
     boxed_in += [Solid(box(0.24, 0.02, 0.3), (0.0, s * 0.14, 0.15), object_id=f"y_{s + 1}") for s in (-1, 1)]
     world = CollisionWorld(station_of([*boxed_in, Solid(box(0.3, 0.3, 0.02), (0.0, 0.0, 0.8), object_id="lid")]))
-    space = world.space(0.04)
+    space = CollisionSpace(world, 0.04)
     free = [q for q in solve_ik(world.chain, world.in_base(down(0.0, 0.0, 0.2)), HOME, 6) if space.is_free(q)]
     for goal in free[:1]:
         path = RrtConnect().plan_path(HOME, goal, space, np.random.default_rng(0))
@@ -88,7 +88,7 @@ def test_a_goal_without_a_way_to_it_ends_too():
 
 def test_shortcuts_keep_the_ends_and_make_nothing_longer():
     world, rng = clutter(), np.random.default_rng(1)
-    space = world.space(0.04)
+    space = CollisionSpace(world, 0.04)
     detour = np.array([HOME, HOME + 0.2, HOME + np.array([0.3, -0.2, 0.1, 0.1, 0, 0, 0]), HOME - 0.1])
     short = shorten_path(detour, space, rng)
     np.testing.assert_array_equal(short[[0, -1]], detour[[0, -1]])

@@ -8,7 +8,7 @@ from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.robotics.motion.dynamics import CarriedObject
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.pick_place import PickPlace
-from tableverse_factory.robotics.motion.world import CollisionWorld, _order_coarse_to_fine
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld, _order_coarse_to_fine
 from tests.helpers.simple_scenes import Solid, box
 from tests.helpers.work_cells import (
     BLOCK,
@@ -42,7 +42,7 @@ def test_free_agrees_with_the_distance_of_every_pair(carrying):
     held = held_pose(down(0.0, 0.0, GRASP_M), world.object_pose(BLOCK)) if carrying else None
     carried = CarriedObject(BLOCK, held) if held else None
     for margin in (0.0, 0.01):
-        space, seen = world.space(0.06, margin_m=margin, carried=carried), set()
+        space, seen = CollisionSpace(world, 0.06, margin_m=margin, carried=carried), set()
         for q in near_the_table(60):
             distance = deepest(world, q, 0.06, held, object_geoms(world))
             if abs(distance - margin) < 2e-4:
@@ -66,9 +66,10 @@ def test_a_block_standing_on_the_table_may_be_lifted_but_not_pushed_down():
         solve_ik(world.chain, world.in_base(down(0.0, 0.0, GRASP_M + z)), HOME, 1)[0] for z in (0.0, -0.002, 0.003)
     )
     task = PickPlace(world, BLOCK, grasp, grasp, WIDTH_M)
-    strict = task.lifting_space(0.0003)
+    strict = task.holding_space(0.0003, task.taken)
     assert not strict.is_free(at)
-    lift = task.allow_grasp_contacts(at).lifting_space(0.0003)
+    taking = task.allow_grasp_contacts(at)
+    lift = taking.holding_space(0.0003, taking.taken)
     assert lift.is_free(at)
     assert lift.is_free(above)
     assert not lift.is_free(below)
@@ -78,14 +79,15 @@ def test_a_block_standing_on_the_table_may_be_lifted_but_not_pushed_down():
 def test_open_fingers_may_not_touch_what_they_are_to_grasp():
     world = clutter()
     q = solve_ik(world.chain, world.in_base(down(0.0, 0.0, GRASP_M)), HOME, 1)[0]
-    assert world.space(WIDTH_M + 0.01).is_free(q)
-    assert not world.space(WIDTH_M - 0.01).is_free(q)
+    assert CollisionSpace(world, WIDTH_M + 0.01).is_free(q)
+    assert not CollisionSpace(world, WIDTH_M - 0.01).is_free(q)
 
 
 def test_an_object_that_was_let_go_elsewhere_is_an_obstacle_there_and_no_more_here():
     world = alone()
     here, there = (solve_ik(world.chain, world.in_base(down(x, 0.0, 0.04)), HOME, 1)[0] for x in (0.0, 0.2))
-    as_is, moved = world.space(0.02), world.space(0.02, standing={BLOCK: Pose(np.array([0.2, 0.0, 0.05]), _UPRIGHT)})
+    standing = {BLOCK: Pose(np.array([0.2, 0.0, 0.05]), _UPRIGHT)}
+    as_is, moved = CollisionSpace(world, 0.02), CollisionSpace(world, 0.02, standing=standing)
     assert (as_is.is_free(here), as_is.is_free(there)) == (False, True)
     assert (moved.is_free(here), moved.is_free(there)) == (True, False)
 
@@ -95,9 +97,9 @@ _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 def test_the_arm_may_not_go_through_itself():
     folded = np.array([0.0, -1.7, 0.0, -3.05, 0.0, 0.1, 0.0])
-    assert not alone().space(0.04).is_free(folded)
-    assert alone().describe_collision(alone().space(0.04), folded).count("robot/") == 2
-    assert alone().space(0.04).is_free(HOME)
+    assert not CollisionSpace(alone(), 0.04).is_free(folded)
+    assert alone().describe_collision(CollisionSpace(alone(), 0.04), folded).count("robot/") == 2
+    assert CollisionSpace(alone(), 0.04).is_free(HOME)
 
 
 def test_a_base_elsewhere_sees_the_same_scene_from_there():
@@ -105,15 +107,15 @@ def test_a_base_elsewhere_sees_the_same_scene_from_there():
     first = CollisionWorld(station)
     turned = CollisionWorld(station, Pose(np.array([0.55, 0.0, 0.0]), quaternion_about_z(np.pi)))
     q = solve_ik(turned.chain, turned.in_base(down(0.2, 0.0, 0.1)), HOME, 1)[0]
-    assert not turned.space(0.04).is_free(q)
-    assert first.space(0.04).is_free(HOME)
+    assert not CollisionSpace(turned, 0.04).is_free(q)
+    assert CollisionSpace(first, 0.04).is_free(HOME)
     np.testing.assert_allclose(station.model.body_pos[station.base_body], first.base.position)  # left as it was
 
 
 def test_spaces_of_one_world_do_not_disturb_each_other():
     world = clutter()
     rows = near_the_table(20)
-    spaces = [world.space(0.06), world.space(0.02, margin_m=0.01)]
+    spaces = [CollisionSpace(world, 0.06), CollisionSpace(world, 0.02, margin_m=0.01)]
     alone_each = [[space.is_free(q) for q in rows] for space in spaces]
     mixed = [[space.is_free(q) for space in spaces] for q in rows]
     assert [list(row) for row in zip(*mixed, strict=True)] == alone_each

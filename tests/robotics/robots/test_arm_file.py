@@ -10,7 +10,7 @@ from schemas.geometry import Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 from tableverse_factory.robotics.motion.rrt import RrtConnect
-from tableverse_factory.robotics.motion.world import CollisionWorld
+from tableverse_factory.robotics.motion.world import CollisionSpace, CollisionWorld
 from tableverse_factory.robotics.robots.base import find_bases
 from tableverse_factory.robotics.robots.panda import build_panda
 from tableverse_factory.robotics.robots.registry import load_arm
@@ -85,7 +85,7 @@ def test_motions_are_planned_within_what_the_actuators_can_be_told(tmp_path: Pat
     kept = solve_ik(worlds["narrow"].chain, target, turned, 4)
     assert (np.abs(kept[:, 0]) < 0.6).all()
     ahead, side = (np.where(np.arange(6) == 0, angle, arms["wide"].home) for angle in (-0.5, 0.5))
-    path = RrtConnect().plan_path(ahead, side, worlds["narrow"].space(0.05), np.random.default_rng(0))
+    path = RrtConnect().plan_path(ahead, side, CollisionSpace(worlds["narrow"], 0.05), np.random.default_rng(0))
     assert path is not None
     assert (np.abs(path[:, 0]) <= 0.6).all()
 

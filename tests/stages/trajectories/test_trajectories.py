@@ -18,10 +18,12 @@ from schemas.tables import TRAJECTORIES
 from schemas.trajectories import Grasps
 from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError
 from tableverse_factory.models.services import Services
-from tableverse_factory.robotics.execution.replay import replay_trajectory
+from tableverse_factory.robotics.execution.arrays import decode_recording
+from tableverse_factory.robotics.execution.replay import load_named_arm, replay_recording
 from tableverse_factory.robotics.grasps.remote import POINTS
 from tableverse_factory.robotics.motion import interfaces
 from tableverse_factory.robotics.motion.rrt import RrtConnect
+from tableverse_factory.robotics.robots.station import Station
 from tableverse_factory.stages.export.export import export
 from tableverse_factory.stages.trajectories import trajectories as trajectories_module
 from tableverse_factory.stages.trajectories.preflight import check_trajectory_models
@@ -93,7 +95,9 @@ def test_what_is_called_a_success_is_one_from_the_saved_files_alone(finished):
     executed = [row for row in finished.trajectory_rows if row["arrays"]]
     assert len(executed) == 2
     for row in executed:
-        assert replay_trajectory(files, row, files[row["arrays"]]).success == row["success"]
+        saved = decode_recording(files[row["arrays"]])
+        replay = replay_recording(files, row, saved, Station(files, load_named_arm(saved.robot)))
+        assert replay.verdict.success == row["success"]
 
 
 def test_nothing_that_was_exported_is_touched(finished):
