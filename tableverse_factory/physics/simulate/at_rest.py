@@ -1,7 +1,8 @@
 """Simulation until all bodies are at rest, and their drift afterwards."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import mujoco
@@ -10,7 +11,6 @@ from jaxtyping import Bool, Float64, Int64
 
 from schemas.geometry import Frozen, Pose
 from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_angle
-from tableverse_factory.physics.simulate.mujoco_sleep import allow_sleep
 
 SPEED_LIMIT = 0.01  # at rest every object moves slower than this, in m/s and in rad/s
 ACCELERATION_LIMIT = 0.5  # and changes its speed by less than this between samples, in m/s² and in rad/s²
@@ -150,6 +150,18 @@ def make_quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
     """Make simulation data without MuJoCo's log file in the current folder; warnings are read from the data."""
     mujoco.set_mju_user_warning(lambda _: None)
     return mujoco.MjData(model)
+
+
+@contextmanager
+def allow_sleep(model: mujoco.MjModel, tolerance: float) -> Iterator[None]:
+    """Let MuJoCo put bodies slower than the tolerance [m/s, rad/s] for ten steps to sleep, with all that they touch."""
+    option = model.opt
+    own = int(option.enableflags), float(option.sleep_tolerance)
+    option.enableflags, option.sleep_tolerance = own[0] | int(mujoco.mjtEnableBit.mjENBL_SLEEP), tolerance
+    try:
+        yield
+    finally:
+        option.enableflags, option.sleep_tolerance = own
 
 
 def _list_velocity_indices(model: mujoco.MjModel, bodies: Sequence[int]) -> Int64[np.ndarray, "n 6"]:

@@ -17,7 +17,7 @@ from schemas.geometry import Frozen, Pose
 from schemas.trajectories import Motion, Phase
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.physics.simulate.mujoco_sleep import allow_sleep
+from tableverse_factory.physics.simulate.at_rest import allow_sleep
 from tableverse_factory.robotics.execution.monitor import ExecutionMonitor, StateSample
 from tableverse_factory.robotics.robots.station import Station
 
