@@ -32,14 +32,9 @@ model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel""
 
 
 def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]) -> str:
-    """Make the card as Markdown with the Hub's front matter: the same for the same dataset.
-
-    Args:
-        out: The dataset.
-        run: Its `run.json`.
-        shards: Numbers of the committed shards, the only ones it covers.
-    """
-    scenes = _read_scenes(out, shards)
+    """Make the card of these committed shards as Markdown with the Hub's front matter; `run` is `run.json`."""
+    read = read_shards(out, "scenes", shards, _COLUMNS)
+    scenes = pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *read])
     rows = {
         table: sum(found.num_rows for found in read_shards(out, table, shards, ["scene_id"]))
         for table in ("objects", "tasks")
@@ -57,11 +52,8 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
             ("what", "count"),
             [
                 ("scenes in the manifest", scenes.num_rows),
-                ("done", status["done"]),
-                ("dropped", status["dropped"]),
-                ("failed", status["failed"]),
-                ("objects", rows["objects"]),
-                ("tasks", rows["tasks"]),
+                *((outcome, status[outcome]) for outcome in ("done", "dropped", "failed")),
+                *rows.items(),
                 *([("trajectories that succeed in simulation", motions.succeeded)] if motions.tasks else []),
                 ("shards", len(shards)),
             ],
@@ -79,16 +71,11 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
         f"Seed {run['seed']}, configuration `{run['fingerprint'][:16]}`; `run.json` holds every value and version.",
-        *_describe_profile(run),
     ]
+    if "published" in run:  # by `tableverse export`
+        profile = run["published"]["profile"]
+        parts.append(f"Only scenes of the profile `{profile}` are in here; the others were left out.")
     return "\n\n".join(parts) + "\n"
-
-
-def _describe_profile(run: Mapping[str, Any]) -> list[str]:
-    """Name the profile of a dataset that `tableverse export` wrote."""
-    if "published" not in run:
-        return []
-    return [f"Only scenes of the profile `{run['published']['profile']}` are in here; the others were left out."]
 
 
 def _format_funnel(scenes: pa.Table) -> str:
@@ -101,7 +88,6 @@ def _format_funnel(scenes: pa.Table) -> str:
 
 
 def _format_trajectories(motions: TrajectorySummary) -> list[str]:
-    """Format how many tasks a robot tried, and where it failed; nothing without trajectories."""
     if not motions.tasks:
         return []
     share = motions.succeeded / motions.tasks
@@ -121,15 +107,13 @@ def _format_licences(scenes: pa.Table) -> str:
     verdicts = Counter(row["licence_verdict"] or "unknown" for row in done)
     names = Counter((_name_licences(row), row["licence_verdict"] or "unknown") for row in done)
     by_verdict = _format_table(("verdict", "done scenes"), _sort_by_count(verdicts))
-    by_name = _format_table(
-        ("licence", "verdict", "done scenes"), [(*key, count) for key, count in _sort_by_count(names)]
-    )
+    named = [(*key, count) for key, count in _sort_by_count(names)]
+    by_name = _format_table(("licence", "verdict", "done scenes"), named)
     note = "Sorted by name, not by a lawyer; `tableverse export` writes a dataset without what may not be passed on."
     return f"{by_verdict}\n\n{by_name}\n\n{note}"
 
 
 def _name_licences(row: Mapping[str, Any]) -> str:
-    """Name the licences that bind a scene."""
     meshes = row["mesh_licences"]
     return (row["licence"] or "not stated") + (f"; meshes: {', '.join(meshes)}" if meshes else "")
 
@@ -140,22 +124,17 @@ def _format_sources(scenes: pa.Table) -> str:
 
 
 def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:
-    """Format who found the objects and who judged, what that cost, and how far the rules agree."""
     found = Counter(row["perception"] or "none" for row in _select_done(scenes, "perception"))
     rows = [("perception", name, count) for name, count in _sort_by_count(found)]
     rows += [("judge", name, count) for name, count in _sort_by_count(verdicts.judges)]
     parts = [_format_table(("door", "answered by", "done scenes"), rows)]
     if spent:
-        parts.append("What their answers cost when they were first given:")
-        parts.append(
-            _format_table(
-                ("asked by the", "calls", "tokens read", "tokens written", "USD"),
-                [
-                    (asker, cost.calls, cost.input_tokens, cost.output_tokens, f"{cost.usd:.4g}" if cost.usd else "–")
-                    for asker, cost in spent.items()
-                ],
-            )
-        )
+        head = ("asked by the", "calls", "tokens read", "tokens written", "USD")
+        paid = [
+            (asker, cost.calls, cost.input_tokens, cost.output_tokens, f"{cost.usd:.4g}" if cost.usd else "–")
+            for asker, cost in spent.items()
+        ]
+        parts += ["What their answers cost when they were first given:", _format_table(head, paid)]
     if (agreement := verdicts.agreement) is not None:
         parts.append(
             f"Beside the rules, over {agreement.scenes} scenes: same gate {agreement.usable_share:.0%}, "
@@ -163,8 +142,7 @@ def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str,
             f"masses × {agreement.mass_ratio:.2f}, tasks shared {agreement.tasks_share:.0%}."
         )
     if verdicts.remarks:
-        parts.append("Not taken as answered:")
-        parts.append(_format_table(("remark", "times"), _sort_by_count(verdicts.remarks)))
+        parts += ["Not taken as answered:", _format_table(("remark", "times"), _sort_by_count(verdicts.remarks))]
     return "\n\n".join(parts)
 
 
@@ -174,11 +152,6 @@ def _select_done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
 
 def _sort_by_count(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
-
-
-def _read_scenes(out: StoragePath, shards: Sequence[int]) -> pa.Table:
-    tables = read_shards(out, "scenes", shards, _COLUMNS)
-    return pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *tables])
 
 
 def _format_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

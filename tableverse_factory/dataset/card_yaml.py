@@ -6,15 +6,13 @@ from collections.abc import Iterable, Sequence
 import yaml
 
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-_TAGS = ("mujoco", "simulation", "robotics", "table-top", "3d")
-
+_TAGS = ["mujoco", "simulation", "robotics", "table-top", "3d"]
+# Licence names that the Hub knows, and its names of some SPDX identifiers
 _HUB_LICENCES = re.compile(
     r"apache-2\.0|mit|bsd(-[23]-clause)?|isc|ncsa|unlicense|wtfpl|zlib|gfdl|gpl-3\.0|odbl|odc-by|pddl"
     r"|cc0-1\.0|cc-by-(2\.0|2\.5|3\.0|4\.0)|cc-by-sa-[34]\.0|cc-by-nc-[234]\.0|cc-by-nc-sa-[234]\.0|cc-by-nd-4\.0"
     r"|cc-by-nc-nd-[34]\.0|cdla-permissive-[12]\.0|cdla-sharing-1\.0"
 )
-"""Licence names that the Hub knows."""
-
 _HUB_NAMES = {
     "cc0": "cc0-1.0",
     "odbl-1.0": "odbl",
@@ -23,23 +21,19 @@ _HUB_NAMES = {
     "gpl-3.0-only": "gpl-3.0",
     "gpl-3.0-or-later": "gpl-3.0",
 }
-"""Names on the Hub of some SPDX identifiers."""
 
 
 def make_front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[str]) -> str:
-    """Make the front matter, with its two lines of dashes.
+    """Make the front matter, with its two lines of dashes; the first of `tables` is the default.
 
-    Args:
-        n_scenes: Number of scenes in the dataset.
-        licences: Names of the licences that bind them; empty if none is stated.
-        tables: Tables that have rows; the first is the default.
+    `licences` are the names of those that bind the scenes, empty if none is stated.
     """
     head = {
         "pretty_name": "Table-top scenes for MuJoCo",
         **_make_license_keys(licences),
         "size_categories": [next((name for limit, name in SIZES if n_scenes < limit), "1M<n<10M")],
         "task_categories": ["robotics"],
-        "tags": list(_TAGS),
+        "tags": _TAGS,
         "configs": [
             {
                 "config_name": table,

@@ -20,9 +20,7 @@ def read_shard(out: StoragePath, table: str, shard: int, columns: Sequence[str] 
     """Read a table of one shard.
 
     Raises:
-        FileNotFoundError: if the file is missing: the shard may be being rewritten, or has no rows in this table.
-        StoreError: if the store refuses or does not answer.
-        BuildError: if the file is damaged.
+        FileNotFoundError: if the shard is being rewritten, or has no rows in this table.
     """
     path = shard_path(out, table, shard)
     try:
@@ -36,11 +34,7 @@ def read_shard(out: StoragePath, table: str, shard: int, columns: Sequence[str] 
 def read_shards(
     out: StoragePath, table: str, shards: Iterable[int], columns: Sequence[str] | None = None
 ) -> Iterator[pa.Table]:
-    """Read a table of these shards, in their order, without those that are being rewritten just now.
-
-    Raises:
-        StoreError, BuildError: as `read_shard`.
-    """
+    """Read a table of these shards, in their order, without those that are being rewritten just now."""
     present = set(list_names(out / table)) if table in SPARSE else None
     for shard in shards:
         if present is None or shard_name(table, shard) in present:

@@ -18,6 +18,7 @@ from tableverse_factory.dataset.shards import advise_repair, shard_path
 from tableverse_factory.dataset.tar_members import read_scene_files
 from tableverse_factory.dataset.trajectory_files import strip_motions
 
+# Columns of scenes/ that the commit adds to those of the scene itself
 ADDED_BY_COMMIT = frozenset(
     {
         *("kind", "name", "url", "source", "uri", "licence", "licence_verdict", "content_sha256"),
@@ -26,19 +27,10 @@ ADDED_BY_COMMIT = frozenset(
         *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),
     }
 )
-"""Columns of scenes/ that the commit adds to those of the scene itself."""
 
 
 def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> ExportedScene | None:
-    """Load a scene as it left `export`, without its trajectories.
-
-    Returns:
-        The stage's output; None if the shard is not committed, or the scene has no files in it.
-
-    Raises:
-        BuildError: if the shard is damaged.
-        StoreError: if the store refuses or does not answer.
-    """
+    """Load a scene as it left `export`, without trajectories; None if it is not committed or has no files."""
     try:
         tables = _read_tables(out, shard, _read_version(shard_path(out, "scenes", shard)))
         scenes, objects, tasks = (table.filter(pc.equal(table["scene_id"], scene_id)).to_pylist() for table in tables)
@@ -57,7 +49,7 @@ def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> Exported
 
 @lru_cache(maxsize=1)
 def _read_tables(out: StoragePath, shard: int, version: tuple[Hashable, ...]) -> tuple[pa.Table, ...]:  # noqa: ARG001
-    """Read the tables of a shard, cached: its scenes are loaded one after the other, and in a store each is a download.
+    """Read the tables of a shard, cached, as its scenes are loaded one after the other.
 
     The version is that of the table of scenes, which is removed first and written last when a shard is rewritten.
     """

@@ -22,9 +22,7 @@ from tableverse_factory.dataset.shards import SPARSE, shard_name, shard_stem
 
 MERGED = "merged"
 MANY_SHARDS = 16  # datasets of up to so many shards have no merged tables, which would gain nothing
-
-MADE_FROM = b"tableverse.shards"
-"""Metadata key of the digest of the shards that a merged table was made from (see `digest_shards`)."""
+MADE_FROM = b"tableverse.shards"  # metadata key of the digest of a merged table's shards (`digest_shards`)
 
 
 def merged_path(out: StoragePath, table: str) -> StoragePath:
@@ -41,9 +39,6 @@ def write_merged_tables(out: StoragePath, n_shards: int) -> None:
     """Merge the tables of a finished dataset of many shards, except those that are up to date.
 
     Memory holds one row group and one shard; the same shards give the same bytes.
-
-    Raises:
-        BuildError: if a shard is missing or damaged, or the disk or the store refuses.
     """
     if n_shards <= MANY_SHARDS:
         return
@@ -61,11 +56,7 @@ def write_merged_tables(out: StoragePath, n_shards: int) -> None:
 
 
 def remove_merged_tables(out: StoragePath) -> None:
-    """Remove the merged tables, before the first shard changes.
-
-    Raises:
-        BuildError: if the disk or the store refuses.
-    """
+    """Remove the merged tables, before the first shard changes."""
     remove_folder(out / MERGED)
 
 

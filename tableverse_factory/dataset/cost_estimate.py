@@ -19,9 +19,8 @@ from tableverse_factory.core.errors import BuildError, ConfigError
 MIN_SCENES = 50
 LEVEL = 0.95
 SEED = 20260
+# Prices per hour of a CPU or GPU, GB stored for a month, million tokens read or written
 PRICES = ("cpu_hour", "gpu_hour", "gb_month", "input_mtok", "output_mtok")
-"""Names of prices: per hour of a CPU or GPU, GB stored for a month, million tokens read or written."""
-
 _MIN_RESAMPLES, _MAX_RESAMPLES = 200, 1000
 _MAX_DRAWS = 20_000_000
 _DRAWS_AT_ONCE = 1_000_000
@@ -33,38 +32,23 @@ Values: TypeAlias = Float[np.ndarray, " n"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StageTimes:
-    """Times of one stage on every measured scene; 0 for scenes that did not reach it.
-
-    Attributes:
-        name: Of the stage.
-        pool: Pool of workers that runs it.
-        cpu_s: CPU time. Shape (n,) [s].
-        wall_s: Wall time. Shape (n,) [s].
-    """
+    """CPU and wall times of one stage on every measured scene [s]; 0 for scenes that did not reach it."""
 
     name: str
-    pool: str
+    pool: str  # of workers that run it
     cpu_s: Values
     wall_s: Values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BuildSample:
-    """Measured costs of a build, one entry per scene; storage and tokens may be known of fewer scenes.
+    """Measured costs of a build, one entry per scene; storage and tokens may be known of fewer scenes."""
 
-    Attributes:
-        stages: In the order in which they run.
-        storage: Bytes per scene, by what holds them. Shape (m,) each.
-        input_tokens: Shape (m,).
-        output_tokens: Shape (m,).
-        notes: What could not be measured.
-    """
-
-    stages: tuple[StageTimes, ...]
-    storage: Mapping[str, Values] = field(default_factory=dict)
+    stages: tuple[StageTimes, ...]  # in the order in which they run
+    storage: Mapping[str, Values] = field(default_factory=dict)  # [bytes], by what holds them
     input_tokens: Values = field(default_factory=lambda: np.zeros(0))
     output_tokens: Values = field(default_factory=lambda: np.zeros(0))
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what could not be measured
 
     @property
     def scenes(self) -> int:
@@ -99,54 +83,29 @@ class IntervalEstimate:
 
 @dataclass(frozen=True, slots=True)
 class CostEstimate:
-    """Cost estimate of a build.
-
-    Attributes:
-        cpu_hours: CPU time that the stages use.
-        cpu_hours_held: CPUs that actors hold, waiting included.
-        gpu_hours: GPUs that actors hold.
-        waiting_share: Share of the stages' wall time that is no CPU time.
-        storage: Bytes, by what holds them.
-        wall_hours: On the stated cluster if no worker is ever idle; None if no cluster was stated.
-        least_wall_hours: The same without waiting for models or crowded machines.
-        bottleneck: What limits the wall time.
-        costs: By purpose, in the currency of the prices.
-        stages: CPU and wall time per scene that enters the build [s], by stage.
-        notes: What was left out.
-    """
+    """Cost estimate of a build."""
 
     scenes: int
     measured: int
-    cpu_hours: IntervalEstimate
-    cpu_hours_held: IntervalEstimate
-    gpu_hours: IntervalEstimate
-    waiting_share: float
-    storage: Mapping[str, IntervalEstimate]
+    cpu_hours: IntervalEstimate  # CPU time that the stages use
+    cpu_hours_held: IntervalEstimate  # CPUs that actors hold, waiting included
+    gpu_hours: IntervalEstimate  # GPUs that actors hold
+    waiting_share: float  # of the stages' wall time, what is no CPU time
+    storage: Mapping[str, IntervalEstimate]  # [bytes], by what holds them
     input_tokens: IntervalEstimate
     output_tokens: IntervalEstimate
-    wall_hours: IntervalEstimate | None
-    least_wall_hours: IntervalEstimate | None
-    bottleneck: str
-    costs: Mapping[str, IntervalEstimate]
-    stages: Mapping[str, tuple[IntervalEstimate, IntervalEstimate]]
-    notes: tuple[str, ...]
+    wall_hours: IntervalEstimate | None  # on the stated cluster if no worker is ever idle; None if none was stated
+    least_wall_hours: IntervalEstimate | None  # the same without waiting for models or crowded machines
+    bottleneck: str  # of the wall time
+    costs: Mapping[str, IntervalEstimate]  # by purpose, in the currency of the prices
+    stages: Mapping[str, tuple[IntervalEstimate, IntervalEstimate]]  # CPU and wall time per scene that enters [s]
+    notes: tuple[str, ...]  # what was left out
 
 
 def estimate_cost(
     measured: BuildSample, scenes: int, pools: Pools, cluster: ClusterSize | None, prices: Mapping[str, float]
 ) -> CostEstimate:
-    """Estimate the cost of a build of scenes like the measured ones.
-
-    Args:
-        measured: A finished or running build.
-        scenes: Rows of the planned manifest.
-        pools: Resources that an actor of each pool holds.
-        cluster: Where it will run, or None.
-        prices: By the names in `PRICES`; missing ones are 0.
-
-    Raises:
-        BuildError: if fewer than `MIN_SCENES` scenes were measured, or the pools want GPUs and the cluster has none.
-    """
+    """Estimate the cost of a build of so many scenes like the measured ones; missing `PRICES` are 0."""
     if measured.scenes < MIN_SCENES:
         raise BuildError(
             f"{measured.scenes} scenes with timings are too few to say what {scenes} will take: build at least "
@@ -209,17 +168,12 @@ def bootstrap_total(values: Values, scenes: int) -> IntervalEstimate:
         students[start : start + at_once] = (drawn.mean(axis=1) - mean) / spread
     low, high = np.quantile(students, [(1.0 + LEVEL) / 2.0, (1.0 - LEVEL) / 2.0])
     least = max(0.0, mean - float(low) * deviation)
-    return IntervalEstimate(
-        mean * scenes, min(mean, least) * scenes, max(mean, mean - float(high) * deviation) * scenes
-    )
+    most = max(mean, mean - float(high) * deviation)
+    return IntervalEstimate(mean * scenes, min(mean, least) * scenes, most * scenes)
 
 
 def parse_amounts(text: Sequence[str], allowed: Sequence[str], option: str) -> dict[str, float]:
-    """Parse `name=number` entries.
-
-    Raises:
-        ConfigError: naming what is allowed.
-    """
+    """Parse `name=number` entries."""
     found: dict[str, float] = {}
     for entry in text:
         name, separator, value = entry.partition("=")

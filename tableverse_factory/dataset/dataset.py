@@ -31,14 +31,10 @@ MAX_SCENE_BYTES = 2 * 1024**3
 
 
 def open_dataset(path: str | Path) -> "Dataset":
-    """Open a dataset that `tableverse build` wrote, finished or not.
+    """Open a dataset that `tableverse build` wrote, finished or not; InputError if there is none at `path`.
 
-    Args:
-        path: A folder, `s3://bucket/prefix`, `https://host/folder`, `hf://datasets/OWNER/NAME` (with `@REVISION` for
-            another than `main`), or any other fsspec URI.
-
-    Raises:
-        InputError: if there is no dataset at `path`.
+    It is a folder, `s3://bucket/prefix`, `https://host/folder`, `hf://datasets/OWNER/NAME` (with `@REVISION` for
+    another than `main`), or any other fsspec URI.
     """
     try:
         filesystem, root = _filesystem(str(path))
@@ -68,13 +64,13 @@ def _filesystem(path: str) -> tuple[fsspec.AbstractFileSystem, str]:
         from tableverse_factory.dataset.http_dataset import WebFolder, check_web_address
 
         folder = WebFolder(check_web_address(path))
-        return folder, folder.address
-    if scheme == "hf":
+    elif scheme == "hf":
         from tableverse_factory.dataset.hub_folder import open_hub_folder
 
         folder = open_hub_folder(path)
-        return folder, folder.address
-    return resolve_filesystem(path)
+    else:
+        return resolve_filesystem(path)
+    return folder, folder.address
 
 
 class Dataset:
@@ -92,11 +88,7 @@ class Dataset:
         self._arrow = pa.fs.LocalFileSystem() if self._is_local else make_arrow_filesystem(filesystem)
 
     def record(self) -> dict[str, Any] | None:
-        """Read `run.json`; None if there is none, as in a dataset of another tool.
-
-        Raises:
-            InputError: `bad_run` if it cannot be read, or is no JSON object.
-        """
+        """Read `run.json`; None if there is none, as in a dataset of another tool, InputError `bad_run` if bad."""
         # imports Pillow, which queries need not load
         from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json
 
@@ -138,17 +130,11 @@ class Dataset:
         return self.table("trajectories")
 
     def table(self, name: str) -> ds.Dataset:
-        """Open a table by name as a pyarrow dataset.
-
-        Raises:
-            InputError: if there is no such table, or a committed shard lacks its file.
-        """
+        """Open a table by name as a pyarrow dataset."""
         if name not in TABLES:
             raise InputError(f"no table {name!r}; there are {', '.join(TABLES)}")
         sizes = self._list_sizes(name)
-        names = [shard_name(name, shard) for shard in self.shards]
-        if name in SPARSE:
-            names = [shard for shard in names if shard in sizes]
+        names = [file for shard in self.shards if (file := shard_name(name, shard)) in sizes or name not in SPARSE]
         folder = f"{self._root}/{name}"
         if missing := [name for name in names if name not in sizes]:
             raise InputError(f"{self.path}: damaged: {folder}/{missing[0]} is missing although its shard is committed")
@@ -160,7 +146,7 @@ class Dataset:
         return self._open_files([f"{folder}/{name}" for name in names], name)
 
     def _list_sizes(self, table: str) -> dict[str, int]:
-        """List the files of a table by name with their sizes [bytes]."""
+        """List the sizes of a table's files by name [bytes]."""
         folder = f"{self._root}/{table}"
         try:
             entries = self._filesystem.ls(folder, detail=True)
@@ -188,17 +174,12 @@ class Dataset:
         """Open a scene, reading its own bytes of the shard and nothing else.
 
         Raises:
-            InputError: if there is no such scene, with the nearest ids; if it has no files, with the reason; or if
-                the shard is damaged.
+            InputError: if there is no such scene, with the nearest ids; or if it has no files, with the reason.
         """
         return self.scene_at(self.scene_row(scene_id))
 
     def scene_row(self, scene_id: str) -> dict[str, Any]:
-        """Read the scene's row of scenes/, from its shard's file alone; dropped and failed scenes have one too.
-
-        Raises:
-            InputError: if there is no such scene, with the nearest ids, or the table cannot be read.
-        """
+        """Read the scene's row of scenes/, from its shard's file alone; dropped and failed scenes have one too."""
         shard = self._shard_by_scene.get(scene_id)
         rows = [] if shard is None else self._read_rows(shard, scene_id, "scenes")
         if not rows:
@@ -206,14 +187,7 @@ class Dataset:
         return rows[0]
 
     def scene_at(self, row: Mapping[str, Any]) -> "Scene":
-        """Open the scene of a known row of scenes/.
-
-        Args:
-            row: As the table has it, or its columns `scene_id`, `shard`, `tar_offset` and `tar_size` at least.
-
-        Raises:
-            InputError: as `scene`, but for an unknown one.
-        """
+        """Open the scene of a row of scenes/, with `scene_id`, `shard`, `tar_offset` and `tar_size` at least."""
         scene_id, shard = str(row["scene_id"]), int(row["shard"])
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_describe_loss(row)}")

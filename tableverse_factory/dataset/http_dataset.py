@@ -24,7 +24,6 @@ MAX_WHOLE_BYTES = 512 * 1024**2  # largest file that is read whole, such as the 
 _FIRST_READ_BYTES = 64 * 1024
 _N_THREADS = 16
 _OPTIONAL_FOLDERS = frozenset({"scenes", MERGED, *SPARSE})  # folders in which a dataset may lack a file
-
 _ADDRESS_CHARS = re.compile(r"[^\s\x00-\x1f\x7f\\]+")
 
 
@@ -40,12 +39,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
     cachable = False  # what was seen of a dataset ends with it
 
     def __init__(self, address: str, **options: Any) -> None:
-        """Send no request yet.
-
-        Args:
-            address: Of the folder, from `check_web_address`.
-            options: Of fsspec.
-        """
+        """Send no request yet; `address` is from `check_web_address`, `options` are fsspec's."""
         super().__init__(address, **options)
         self.address = address
         self._ranges = HttpRangeReader(self.headers)
@@ -69,11 +63,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
 
     def exists(self, path: str, **_: Any) -> bool:
         """Return whether there is such a file."""
-        try:
-            self.info(path)
-        except FileNotFoundError:
-            return False
-        return True
+        return self._find_size(path) is not None
 
     def info(self, path: str, **_: Any) -> dict[str, Any]:
         """Look up name, type and size [bytes] of a file without reading it."""
@@ -104,11 +94,7 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
 
     @cached_property
     def planned_shards(self) -> tuple[int, ...]:
-        """Numbers of the shards in the plan, in order.
-
-        Raises:
-            StoreError: if the plan is missing or malformed.
-        """
+        """Numbers of the shards in the plan, in order."""
         path = f"{self.address}/plan.parquet"
         try:
             shards = sorted(set(read_remote_table(self, path, PLAN, ("shard",))["shard"].to_pylist()))
@@ -161,19 +147,12 @@ class WebFolder(AbstractFileSystem):  # type: ignore[misc]
             self._missing.add(path)
             raise
         except RefusedError:
-            if not self._may_be_missing(path):
+            folder = path.removeprefix(self.address).strip("/").partition("/")[0]
+            if folder not in _OPTIONAL_FOLDERS or not self.exists(f"{self.address}/run.json"):
                 raise
             self._refused.add(path)
             self._missing.add(path)
             raise FileNotFoundError(f"{redact_uri(path)}: there is no such file") from None
-        return self._check_version(path, piece)
-
-    def _may_be_missing(self, path: str) -> bool:
-        folder = path.removeprefix(self.address).strip("/").partition("/")[0]
-        return folder in _OPTIONAL_FOLDERS and self.exists(f"{self.address}/run.json")
-
-    def _check_version(self, path: str, piece: ByteRange) -> ByteRange:
-        """Return the range if it is of the version of the file that was seen first."""
         if self._versions.setdefault(path, (piece.total, piece.version)) != (piece.total, piece.version):
             raise StoreError(f"{redact_uri(path)}: it changed since the dataset was opened: open it again")
         return piece
@@ -185,11 +164,7 @@ class _WebFile(AbstractBufferedFile):  # type: ignore[misc]
 
 
 def check_web_address(text: str) -> str:
-    """Check the address of a dataset on the web, and return it without a slash at its end.
-
-    Raises:
-        InputError: if it is malformed, or holds a secret or a query.
-    """
+    """Check the address of a dataset on the web, and return it without a slash at its end."""
     try:
         parts = urlsplit(text)
         _ = parts.port

@@ -24,16 +24,10 @@ T = TypeVar("T")
 
 
 def call_hub(name: str, request: Callable[[], T], timeout_s: float = TIMEOUT_S) -> T:
-    """Call huggingface_hub, and again while the Hub is busy.
-
-    Args:
-        name: Of the dataset, for errors.
-        request: Calls huggingface_hub and nothing else: whatever it raises counts as the Hub's error.
-        timeout_s: Time limit of one attempt [s].
+    """Call huggingface_hub, and again while the Hub is busy; whatever `request` raises counts as the Hub's error.
 
     Raises:
         ChangedError: if the dataset changed since the commit that was to be followed.
-        StoreError: if the Hub refuses, fails five times, or gives no answer in time.
     """
     late = StoreError(
         f"{name}: the Hub gives no answer within {timeout_s:.0f} s: run the same command again, and if that does not "
@@ -53,11 +47,7 @@ def call_hub(name: str, request: Callable[[], T], timeout_s: float = TIMEOUT_S) 
 
 @contextmanager
 def select_transfer(api: "HfApi", name: str) -> Iterator[None]:
-    """Let huggingface_hub send by Xet only if the Hub supports it; otherwise it would retry in silence for minutes.
-
-    Raises:
-        StoreError: if the Hub refuses or does not answer.
-    """
+    """Let huggingface_hub send by Xet only if the Hub supports it; otherwise it would retry in silence for minutes."""
     from huggingface_hub import constants
 
     before = constants.HF_HUB_DISABLE_XET

@@ -33,12 +33,7 @@ class ChangedError(StoreError):
 
 @contextmanager
 def translate_errors(what: str) -> Iterator[None]:
-    """Translate what huggingface_hub raises into one line.
-
-    Raises:
-        ChangedError: if a commit was to follow another than the newest.
-        StoreError: for every other failure of the Hub or the connection.
-    """
+    """Translate what huggingface_hub raises into one line."""
     from huggingface_hub.errors import HfHubHTTPError
 
     transport_error = HfHubHTTPError.__bases__[0]  # of the HTTP library that this release of huggingface_hub uses

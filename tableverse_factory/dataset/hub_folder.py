@@ -15,14 +15,7 @@ class HubFolder(WebFolder):
     protocol = "tableverse-hub"
 
     def __init__(self, address: str, name: str, commit: str, **options: Any) -> None:
-        """Send no request yet.
-
-        Args:
-            address: Of the files of the commit.
-            name: As `OWNER/NAME`.
-            commit: Its hash.
-            options: Of fsspec.
-        """
+        """Send no request yet; `address` is that of the files of the commit."""
         super().__init__(address, **options)
         self._name, self._commit = name, commit
 
@@ -50,14 +43,8 @@ class HubFolder(WebFolder):
 
 
 def open_hub_folder(text: str) -> HubFolder:
-    """Open the dataset at `hf://datasets/OWNER/NAME[@REVISION]` at the commit that the revision names now.
-
-    Raises:
-        InputError: if the address is malformed, or huggingface_hub is not installed.
-        StoreError: if the Hub refuses or does not answer.
-    """
-    asked, api = parse_hub_address(text), make_hub_api()
-    with translate_errors(f"hf://datasets/{asked.name}@{asked.revision}"):
-        commit = api.repo_info(asked.name, revision=asked.revision, repo_type="dataset").sha
-    address = f"{api.endpoint}/datasets/{asked.name}/resolve/{commit}"
-    return HubFolder(address, asked.name, str(commit))
+    """Open the dataset at `hf://datasets/OWNER/NAME[@REVISION]` at the commit that the revision names now."""
+    (name, revision), api = parse_hub_address(text), make_hub_api()
+    with translate_errors(f"hf://datasets/{name}@{revision}"):
+        commit = api.repo_info(name, revision=revision, repo_type="dataset").sha
+    return HubFolder(f"{api.endpoint}/datasets/{name}/resolve/{commit}", name, str(commit))

@@ -22,9 +22,6 @@ def check_files(out: StoragePath, committed: Iterable[int]) -> None:
 
     Safe while a build runs: a shard that is rewritten leaves `scenes/` first, and its other files are replaced, not
     removed. So list the committed shards before.
-
-    Raises:
-        BuildError: naming the first missing file, and what to do.
     """
     shards = sorted(committed)
     for folder in (name for name in FOLDERS if name != "scenes"):
@@ -37,12 +34,11 @@ def check_files(out: StoragePath, committed: Iterable[int]) -> None:
 def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
     """Compare the length of every tar with the offsets of its scenes; needs a dataset that no build is writing.
 
-    A table of trajectories must exist if scenes have some. Reads three columns of every shard; in a store several at
-    once, because reads mostly wait for answers.
+    A table of trajectories must exist if scenes have some. In a store several shards are read at once, because reads
+    mostly wait for answers.
 
     Raises:
         FileNotFoundError: if a shard is being rewritten just now.
-        BuildError: naming the first tar of a wrong length or the missing table, and what to do.
     """
     shards = sorted(committed)
     trajectory_files = frozenset(list_names(out / "trajectories") if shards else ())

@@ -10,45 +10,30 @@ from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.dataset.committed_rows import read_rows
 
 _COLUMNS = (
-    *("status", "judge", "judge_model", "judge_remarks"),
-    *("usable", "quality_score", "rules_usable", "rules_score", "rules_names_share", "rules_mass_ratio"),
-    *("rules_tasks", "rules_shared_tasks"),
+    *("status", "judge", "judge_model", "judge_remarks", "usable", "quality_score", "rules_usable", "rules_score"),
+    *("rules_names_share", "rules_mass_ratio", "rules_tasks", "rules_shared_tasks"),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class RulesAgreement:
-    """Agreement of judge and rules, over the scenes that another judge than the rules has judged.
-
-    Attributes:
-        usable_share: Scenes with the same gate.
-        score_difference: Median of judge minus rules.
-        names_share: Objects with the same noun, mean over scenes.
-        mass_ratio: Judge's masses over the rules', median over scenes of their medians.
-        tasks_share: Tasks of the rules that the judge has too.
-    """
+    """Agreement of judge and rules, over the scenes that another judge than the rules has judged."""
 
     scenes: int
-    usable_share: float
-    score_difference: float
-    names_share: float
-    mass_ratio: float
-    tasks_share: float
+    usable_share: float  # scenes with the same gate
+    score_difference: float  # median of judge minus rules
+    names_share: float  # objects with the same noun, mean over scenes
+    mass_ratio: float  # judge's masses over the rules', median over scenes of their medians
+    tasks_share: float  # tasks of the rules that the judge has too
 
 
 @dataclass(frozen=True, slots=True)
 class JudgeSummary:
-    """Judgements by judge, and remarks on their answers.
+    """Judgements by judge, and remarks on their answers."""
 
-    Attributes:
-        judges: Scenes by judge, `openai: model` where a model was asked.
-        remarks: Remarks on what was not taken as answered, by code.
-        agreement: None if only the rules judged.
-    """
-
-    judges: Mapping[str, int]
-    remarks: Mapping[str, int]
-    agreement: RulesAgreement | None
+    judges: Mapping[str, int]  # scenes by judge, `openai: model` where a model was asked
+    remarks: Mapping[str, int]  # on what was not taken as answered, by code
+    agreement: RulesAgreement | None  # None if only the rules judged
 
 
 def summarize_judgements(out: StoragePath, shards: Sequence[int]) -> JudgeSummary:

@@ -13,26 +13,20 @@ from typing import Any
 class LicenceVerdict(StrEnum):
     """Permitted use of a scene, from the least to the most restricted."""
 
-    PERMISSIVE = "permissive"
-    """May be adapted and passed on, at most with credit."""
-    SHARE_ALIKE = "share-alike"
-    """The same, but only under the same licence."""
+    PERMISSIVE = "permissive"  # may be adapted and passed on, at most with credit
+    SHARE_ALIKE = "share-alike"  # the same, but only under the same licence
     NON_COMMERCIAL = "non-commercial"
-    """Not for commercial use."""
-    NO_DERIVATIVES = "no-derivatives"
-    """May be passed on, but not adapted; a scene is an adaptation."""
-    RESTRICTED = "restricted"
-    """All rights are reserved, or the terms forbid collections of the works."""
-    UNKNOWN = "unknown"
-    """No licence is stated, or none that is recognised."""
+    NO_DERIVATIVES = "no-derivatives"  # may be passed on, but not adapted; a scene is an adaptation
+    RESTRICTED = "restricted"  # all rights are reserved, or the terms forbid collections of the works
+    UNKNOWN = "unknown"  # no licence is stated, or none that is recognised
 
 
+# Verdicts that a published dataset may hold
 PROFILES: Mapping[str, frozenset[LicenceVerdict]] = {
     "permissive": frozenset({LicenceVerdict.PERMISSIVE}),
     "share-alike": frozenset({LicenceVerdict.PERMISSIVE, LicenceVerdict.SHARE_ALIKE}),
     "non-commercial": frozenset({LicenceVerdict.PERMISSIVE, LicenceVerdict.SHARE_ALIKE, LicenceVerdict.NON_COMMERCIAL}),
 }
-"""Verdicts that a published dataset may hold."""
 
 _PERMISSIVE = re.compile(
     r"cc0([- ]1\.0)?|cc[- ]?zero|pdm|pddl(-1\.0)?|public[- ]domain( mark| dedication)?( 1\.0)?|unlicense|0bsd|wtfpl"
@@ -57,6 +51,16 @@ _ADDRESS = re.compile(
     r"https?://(?:www\.)?creativecommons\.org/(?:licenses/(?P<licence>by(?:-(?:nc|nd|sa))*)|publicdomain/(?P<free>zero|mark))"
     rf"(?:/(?:4\.0|[1-3]\.[0-9](?:/(?:{_JURISDICTIONS}))?))?(?:/(?:deed|legalcode)(?:\.[a-z]{{2,3}}(?:-[a-z]{{2,4}})?)?)?/?"
 )
+_SHORT_TERMS = {
+    "creative commons": "cc",
+    "attribution": "by",
+    "noncommercial": "nc",
+    "non-commercial": "nc",
+    "noderivatives": "nd",
+    "noderivs": "nd",
+    "sharealike": "sa",
+    "share alike": "sa",
+}
 _SUFFIXES = re.compile(r"\s+(international|unported|generic|universal|licen[cs]e)\b")
 _PROSE = re.compile(r"[()\[\],;]")
 _MAX_CHARS = 512
@@ -103,16 +107,7 @@ def _shorten_name(name: str) -> str:
     """Shorten an address of Creative Commons, or its long name."""
     if (address := _ADDRESS.fullmatch(name)) is not None:
         return {"zero": "cc0", "mark": "pdm"}[address["free"]] if address["free"] else f"cc-{address['licence']}"
-    for long, short in (
-        ("creative commons", "cc"),
-        ("attribution", "by"),
-        ("noncommercial", "nc"),
-        ("non-commercial", "nc"),
-        ("noderivatives", "nd"),
-        ("noderivs", "nd"),
-        ("sharealike", "sa"),
-        ("share alike", "sa"),
-    ):
+    for long, short in _SHORT_TERMS.items():
         name = name.replace(long, short)
     return name
 

@@ -8,9 +8,7 @@ from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import pluralize
 from tableverse_factory.dataset.committed_rows import read_rows
 
-MODEL_ROLE_BY_STAGE = {"perceive": "detector", "curate": "judge"}
-"""Role of the model that a stage asks, which prefixes its columns."""
-
+MODEL_ROLE_BY_STAGE = {"perceive": "detector", "curate": "judge"}  # of the model that it asks; prefixes columns
 _FIGURES = ("calls", "input_tokens", "output_tokens", "usd")
 COST_COLUMNS = tuple(f"{role}_{figure}" for role in MODEL_ROLE_BY_STAGE.values() for figure in _FIGURES)
 

@@ -11,17 +11,7 @@ TALLEST = 4  # largest ratio of height to width: a strip of four pixels by seven
 
 
 def read_photograph(data: bytes, name: str, width: int) -> Image.Image:
-    """Read the photograph in RGB, `width` wide or, if it is smaller, as it is.
-
-    Args:
-        data: Of the file.
-        name: For errors.
-        width: The largest [px]; a much larger JPEG is decoded at a half, a quarter or an eighth of its size.
-
-    Raises:
-        InputError: `bad_photo` if it does not decode or is more than `TALLEST` times as high as wide,
-            `picture_too_large` if it has too many pixels.
-    """
+    """Read the photograph in RGB, at most `width` wide [px]; a large JPEG is decoded at a fraction of its size."""
     image = open_image(data, name, LARGE_IMAGE_BOUNDS, "bad_photo")
     if image.height > TALLEST * image.width:
         raise InputError(f"{name} is {image.width} x {image.height} pixels: a strip, not a photograph", "bad_photo")

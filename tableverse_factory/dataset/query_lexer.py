@@ -39,11 +39,7 @@ class Token:
 
 
 def tokenize(text: str) -> list[Token]:
-    """Split the text into tokens, `end` last.
-
-    Raises:
-        QueryError: at a character that begins no token.
-    """
+    """Split the text into tokens, `end` last."""
     tokens, position, end = [], 0, len(text.rstrip())
     while position < end:
         match = _TOKEN.match(text, position)

@@ -60,23 +60,14 @@ class _Operand:
 
 
 def parse_filter(text: str, schema: pa.Schema) -> pc.Expression:
-    """Parse a condition into a pyarrow expression over the columns of `schema`.
-
-    Raises:
-        QueryError: if it is malformed, names no column or compares unlike values; its second and third line show
-            the place.
-    """
+    """Parse a condition into a pyarrow expression over the columns of `schema`."""
     if len(text) > MAX_CHARS:
         raise QueryError(f"the expression has {len(text)} characters; at most {MAX_CHARS} are read")
     return _Parser(text, schema).parse()
 
 
 def check_columns(names: Sequence[str], schema: pa.Schema) -> list[str]:
-    """Return the names if all are columns.
-
-    Raises:
-        QueryError: for a name that is no column, with the nearest.
-    """
+    """Return the names if all are columns."""
     for name in names:
         if name not in schema.names:
             raise QueryError(f"no column {name[:80]!r}; {_suggest_column(name, schema)}")

@@ -24,14 +24,7 @@ def randomize_files(
 ) -> dict[str, bytes]:
     """Randomize the appearance of a scene's files; `meta.json` gets their new digests and the values asked for.
 
-    Args:
-        files: Of an exported scene.
-        table_texture: Of the table; None leaves it.
-        lights: Seed, or None.
-        camera: Seed, or None.
-
-    Raises:
-        InputError: if the texture or a seed is invalid, or the scene cannot be changed.
+    None leaves the texture, the lights or the camera; the two latter are seeds.
     """
     lights, camera = _check_seed("lights", lights), _check_seed("camera", camera)
     table = None if table_texture is None else make_table_png(table_texture)
@@ -52,16 +45,10 @@ def _check_seed(name: str, seed: int | None) -> int | None:
 
 
 def make_table_png(table_texture: TableTexture) -> bytes:
-    """Encode the texture as a PNG file.
-
-    Raises:
-        InputError: if there is no such texture, or the picture is invalid.
-    """
-    picture = (
-        table_texture
-        if isinstance(table_texture, np.ndarray)
-        else make_texture(parse_texture_seed(table_texture), TEXTURE_PX)
-    )
+    """Encode the texture as a PNG file."""
+    picture = table_texture
+    if not isinstance(picture, np.ndarray):
+        picture = make_texture(parse_texture_seed(picture), TEXTURE_PX)
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or not picture.size:
         raise InputError(f"a texture of shape {picture.shape} and type {picture.dtype}: give (h, w, 3) in uint8")
     if max(picture.shape) > MAX_PICTURE_PX:

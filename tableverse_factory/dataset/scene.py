@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Exported scene."""
+    """Exported scene; methods raise InputError where its files or tables cannot be read."""
 
     scene_id: str
     row: Mapping[str, Any]
@@ -29,34 +29,26 @@ class Scene:
         return dict(self._files)
 
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """Return the trajectory of each task that was tried, in the order of the tasks.
-
-        Raises:
-            InputError: if the table cannot be read, or names a file that is missing.
-        """
+        """Return the trajectory of each task that was tried, in the order of the tasks."""
         return tuple(
             Trajectory(row, None if row["arrays"] is None else self._read_file(row["arrays"]))
             for row in self.trajectory_rows()
         )
 
     def trajectory_rows(self) -> list[dict[str, Any]]:
-        """Read its rows of trajectories/; raises InputError if the table cannot be read."""
+        """Read its rows of trajectories/."""
         return self._rows("trajectories")
 
     def object_rows(self) -> list[dict[str, Any]]:
-        """Read its rows of objects/; raises InputError if the table cannot be read."""
+        """Read its rows of objects/."""
         return self._rows("objects")
 
     def task_rows(self) -> list[dict[str, Any]]:
-        """Read its rows of tasks/, including refused ones; raises InputError if the table cannot be read."""
+        """Read its rows of tasks/, including refused ones."""
         return self._rows("tasks")
 
     def trajectory(self, task_id: str) -> Trajectory:
-        """Return the trajectory of a task.
-
-        Raises:
-            InputError: if the task was not tried, with those that were.
-        """
+        """Return the trajectory of a task."""
         found = {str(trajectory.row["task_id"]): trajectory for trajectory in self.trajectories()}
         if task_id not in found:
             tried, asked = ", ".join(list(found)[:10]) or "none", sanitize_line(task_id, 80)
@@ -70,11 +62,7 @@ class Scene:
 
     @property
     def meta(self) -> dict[str, Any]:
-        """Content of `meta.json`: certificate, camera, poses and the judge's verdict (docs/formats.md).
-
-        Raises:
-            InputError: `bad_meta` if it is no JSON object, or its `objects` are no list of objects with ids.
-        """
+        """Content of `meta.json`: certificate, camera, poses and the judge's verdict (docs/formats.md)."""
         from tableverse_factory.core.storage.untrusted import parse_json  # imports Pillow, which queries need not load
 
         meta = parse_json(self._read_file("meta.json"), f"scene {self.scene_id}: meta.json", "bad_meta")
@@ -86,11 +74,7 @@ class Scene:
     def model(
         self, texture: "TableTexture | None" = None, lights: int | None = None, camera: int | None = None
     ) -> "mujoco.MjModel":
-        """Compile the MuJoCo model from memory, with the appearance that `restyle` gives.
-
-        Raises:
-            InputError: if MuJoCo refuses it, or as `restyle`.
-        """
+        """Compile the MuJoCo model from memory, with the appearance that `restyle` gives."""
         from tableverse_factory.physics.mjcf.load import load_model
 
         try:
@@ -108,9 +92,6 @@ class Scene:
                 that covers `catalogue.TILE_M`; None keeps it.
             lights: Seed for position, strength and color temperature of the lamps; None keeps them.
             camera: Seed for a small displacement of the camera `observation`; None keeps it.
-
-        Raises:
-            InputError: if there is no such texture, or the scene has no table to change.
         """
         if texture is None and lights is None and camera is None:
             return self
@@ -120,21 +101,14 @@ class Scene:
         return Scene(self.scene_id, self.row, files, self._rows)
 
     def extract(self, dest: str | Path) -> tuple[Path, ...]:
-        """Write every file below the folder `dest` and return the paths.
-
-        Raises:
-            InputError: if `dest` is not an empty or a new folder.
-        """
+        """Write every file below the folder `dest` and return the paths."""
         folder = Path(dest)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(f"{folder}: already there; give a new or an empty folder")
-        paths = []
         for name, data in self._files.items():
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-            paths.append(path)
-        return tuple(paths)
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(data)
+        return tuple(folder / name for name in self._files)
 
     def _read_file(self, name: str) -> bytes:
         if name not in self._files:

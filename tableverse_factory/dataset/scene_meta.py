@@ -29,11 +29,7 @@ class SceneMeta:
 
 
 def read_meta(data: bytes) -> SceneMeta:
-    """Read the stored certificate, and the poses before settling.
-
-    Raises:
-        InputError: `bad_meta` if the file is not a `meta.json` of this format.
-    """
+    """Read the stored certificate, and the poses before settling."""
     try:
         content = json.loads(data)
         if content["format"] != FORMAT:
@@ -42,20 +38,14 @@ def read_meta(data: bytes) -> SceneMeta:
         pairs = tuple((str(name), float(value)) for name, value in stored["displacement_m"])
         names = {key: tuple(map(str, stored[key])) for key in ("fell", "left_container")}
         objects = {str(item["object_id"]): item for item in content["objects"]}
+        placed = {name: item["poses"]["placed"] for name, item in objects.items()}
+        holders = {name: item.get("placed_in", item["contained_in"]) for name, item in objects.items()}
         return SceneMeta(
             Certificate(**{**stored, "displacement_m": pairs, **names}),
             PoseHistory(
-                placed={
-                    name: _parse_pose(item["poses"]["placed"])
-                    for name, item in objects.items()
-                    if item["poses"]["placed"] is not None
-                },
+                placed={name: _parse_pose(pose) for name, pose in placed.items() if pose is not None},
                 rectified={name: _parse_pose(item["poses"]["rectified"]) for name, item in objects.items()},
-                contained_in={
-                    name: holder
-                    for name, item in objects.items()
-                    if (holder := item.get("placed_in", item["contained_in"])) is not None
-                },
+                contained_in={name: holder for name, holder in holders.items() if holder is not None},
             ),
             dict(content["files"]),
         )
@@ -64,15 +54,7 @@ def read_meta(data: bytes) -> SceneMeta:
 
 
 def read_meta_pose(value: Any, owner: str) -> Pose:
-    """Read `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m].
-
-    Args:
-        value: As parsed.
-        owner: For errors: an object's id, or `the camera`.
-
-    Raises:
-        InputError: `bad_meta` if it is no pose.
-    """
+    """Read `{"position": [x, y, z], "quaternion_wxyz": [w, x, y, z]}`, at most `FARTHEST_M` away [m]."""
     try:
         return _parse_pose(value, FARTHEST_M)
     except (KeyError, TypeError, ValueError, OverflowError) as error:

@@ -20,16 +20,11 @@ PLAN = pa.schema([("scene_id", pa.string()), ("kind", pa.string()), ("shard", pa
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Scenes in the manifest's order, cut into shards of equal size.
+    """Scenes in the manifest's order, cut into shards of equal size."""
 
-    Attributes:
-        scene_ids: Unique ids; a scene's index in here is its rank everywhere.
-        shards: Shard of each scene, ascending from 0.
-    """
-
-    scene_ids: tuple[str, ...]
+    scene_ids: tuple[str, ...]  # unique; a scene's index in here is its rank everywhere
     kinds: tuple[str, ...]
-    shards: tuple[int, ...]
+    shards: tuple[int, ...]  # of each scene, ascending from 0
 
     @property
     def n_shards(self) -> int:
@@ -52,11 +47,7 @@ def make_plan(rows: Sequence[ImageRow], shard_size: int) -> Plan:
 
 
 def parse_shards(text: str) -> frozenset[int]:
-    """Parse a list of shards such as `3-7,9`.
-
-    Raises:
-        ConfigError: if it is malformed.
-    """
+    """Parse a list of shards such as `3-7,9`."""
     numbers: set[int] = set()
     for part in text.split(","):
         match = re.fullmatch(r"\s*(\d{1,100})\s*(?:-\s*(\d{1,100})\s*)?", part)
@@ -70,11 +61,7 @@ def parse_shards(text: str) -> frozenset[int]:
 
 
 def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int) -> None:
-    """Check that the plan of a number of scenes has these shards; None stands for all.
-
-    Raises:
-        ConfigError: naming the first that it does not have, and those that it has.
-    """
+    """Check that the plan of a number of scenes has these shards; None stands for all."""
     n_shards = -(-n_scenes // shard_size)
     beyond = [shard for shard in shards or () if shard >= n_shards]
     if beyond:
@@ -101,11 +88,7 @@ def write_plan(path: StoragePath, plan: Plan) -> None:
 
 
 def read_plan(path: StoragePath) -> Plan:
-    """Read plan.parquet.
-
-    Raises:
-        BuildError: if there is none, or it is not a plan.
-    """
+    """Read plan.parquet."""
     try:
         table = read_table(path, PLAN)
     except FileNotFoundError:

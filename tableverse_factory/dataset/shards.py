@@ -15,9 +15,8 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.trajectory_files import find_misfits
 
+# Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit
 FOLDERS = {"mjcf": "tar", "objects": "parquet", "tasks": "parquet", "timings": "parquet", "scenes": "parquet"}
-"""Folders of OUT and the suffix of their shards, in the order in which the files appear; the last is the commit."""
-
 SPARSE = {"trajectories": "parquet"}  # folders in which a shard has a file only if it has rows for it
 
 _COPY_BYTES = 1024 * 1024
@@ -42,11 +41,7 @@ class TarShard:
         return start, self._tar.offset - start
 
     def copy(self, source: BinaryIO, offset: int, size: int) -> tuple[int, int]:
-        """Append a scene's members as they are in another shard; return their offset and size here [bytes].
-
-        Raises:
-            BuildError: if the other shard is shorter than its offsets say.
-        """
+        """Append a scene's members as they are in another shard; return their offset and size here [bytes]."""
         start = self._tar.offset
         source.seek(offset)
         left = size
@@ -100,11 +95,7 @@ def tar_sort_key(scene_id: str) -> str:
 
 
 def check_exported(scene: ExportedScene, scene_id: str) -> None:
-    """Check that a scene can be committed, so that writing its shard cannot fail later.
-
-    Raises:
-        BuildError: naming the member that is no safe, sorted USTAR name, or the row that does not fit its table.
-    """
+    """Check that a scene can be committed, so that writing its shard cannot fail later."""
     if scene.scene_id != scene_id:
         raise BuildError(f"the exported scene is called {scene.scene_id[:100]!r}, not {scene_id!r}")
     names = [name for name, _ in scene.files]

@@ -14,11 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """How one task of a scene was tried.
-
-    Attributes:
-        row: Its row of trajectories/ (`schemas.tables.TRAJECTORIES`).
-    """
+    """How one task of a scene was tried; `row` is its row of trajectories/ (`schemas.tables.TRAJECTORIES`)."""
 
     row: Mapping[str, Any]
     _data: bytes | None = field(repr=False)
@@ -29,11 +25,10 @@ class Trajectory:
         return bool(self.row["success"])
 
     def recording(self) -> "Recording":
-        """Decode the commands to the robot and what then happened, sample by sample.
+        """Decode the commands to the robot and the states that followed, sample by sample.
 
         Raises:
-            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is damaged, or not
-                the one that its row was written with.
+            InputError: if no motion was executed, with the reason; `bad_arrays` if its file is not the one written.
         """
         from tableverse_factory.robotics.execution.arrays import decode_recording
 

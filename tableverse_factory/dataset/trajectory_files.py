@@ -14,11 +14,7 @@ Row = Mapping[str, Any]
 
 
 def arrays_name(task_id: str) -> str:
-    """Name of the file with the arrays of a task's motion, e.g. `trajectories/task_000.npz`.
-
-    Raises:
-        ValueError: if the id could not be part of a name.
-    """
+    """Name of the file with the arrays of a task's motion, e.g. `trajectories/task_000.npz`."""
     return f"{FOLDER}{check_id(task_id)}.npz"
 
 
@@ -34,15 +30,7 @@ def add_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list
 
 
 def check_digest(data: bytes, row: Row) -> bytes:
-    """Return the file of a row of trajectories/ if it is the one that the row was written with.
-
-    Args:
-        data: Of the file.
-        row: With `arrays` and `arrays_sha256`.
-
-    Raises:
-        InputError: `bad_arrays` if it was changed, or replaced by another.
-    """
+    """Return the file of a row of trajectories/ if it is the one written; InputError `bad_arrays` if not."""
     if _hash(data) != row.get("arrays_sha256"):
         name = sanitize_line(str(row["arrays"]), 100)
         raise InputError(

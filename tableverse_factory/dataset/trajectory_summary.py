@@ -12,17 +12,11 @@ BEFORE = "before any motion"  # phase of a task that failed because no motion wa
 
 @dataclass(frozen=True, slots=True)
 class TrajectorySummary:
-    """Outcomes of the tasks.
+    """Outcomes of the tasks."""
 
-    Attributes:
-        tasks: Tasks that were tried.
-        succeeded: Those of them that succeeded in simulation.
-        failed: The others by phase and reason, the most frequent first.
-    """
-
-    tasks: int
-    succeeded: int
-    failed: Mapping[tuple[str, str], int]
+    tasks: int  # tried
+    succeeded: int  # in simulation
+    failed: Mapping[tuple[str, str], int]  # the others by phase and reason, the most frequent first
 
 
 def summarize_trajectories(out: StoragePath, shards: Sequence[int]) -> TrajectorySummary:

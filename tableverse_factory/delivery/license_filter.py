@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit, urlunsplit
 import pyarrow as pa
 
 from schemas.identity import content_hash
-from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS, TRAJECTORIES
+from schemas.tables import SCENES, STORED_TABLES
 from tableverse_factory.core.errors import BuildError, InputError, StoreError
 from tableverse_factory.core.storage.files import StoragePath, atomic_file, list_names, open_stream, write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet, read_table
@@ -23,16 +23,9 @@ from tableverse_factory.dataset.shards import SPARSE, TarShard, committed_shards
 from tableverse_factory.models.local.hf_weights import parse_hub_name
 from tableverse_factory.run_record import diff_run_records, read_run, resume_refused_error, write_run
 
-_TABLES: Mapping[str, pa.Schema] = {
-    "objects": OBJECTS,
-    "tasks": TASKS,
-    "timings": TIMINGS,
-    "trajectories": TRAJECTORIES,
-}
 # Files of an export that was killed before `run.json`
 _LEFTOVER_FILES = frozenset({"plan.parquet", "plan.parquet.partial", "run.json.partial", ".work"})
-# Configuration keys with these suffixes name the builder's own paths and addresses
-_PRIVATE_SUFFIXES = ("_dir", "_url")
+_PRIVATE_SUFFIXES = ("_dir", "_url")  # of configuration keys that name the builder's own paths and addresses
 _PLAIN_NAME = re.compile(r"[\w.+-]+")
 _REDACTED = "…"  # replaces each word of a command
 Row = dict[str, Any]
@@ -40,16 +33,10 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class FilterResult:
-    """Summary of a filtered dataset.
+    """Numbers of scenes in a filtered dataset, and of those left out by verdict."""
 
-    Attributes:
-        kept: Scenes with a row in the new dataset.
-        done: Those of them that have files.
-        left_out: Number of scenes left out, by verdict.
-    """
-
-    kept: int
-    done: int
+    kept: int  # with a row
+    done: int  # with files
     left_out: Mapping[LicenceVerdict, int]
 
 
@@ -58,16 +45,7 @@ def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str) ->
 
     Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Private parts of
     `uri` (see `redact_uri`) and of the configuration (see `redact_config`) are removed. The caller holds the lock of
-    `dest`.
-
-    Args:
-        out: A finished dataset.
-        dest: A new or empty folder, or one where the same export was begun.
-        profile: One of `licences.PROFILES`.
-
-    Raises:
-        BuildError: if `out` is not finished, `dest` holds other files, or the disk refuses.
-        InputError: if a table of `out` cannot be read; `nothing_to_publish` if no license allows it.
+    `dest`: a new or empty folder, or one where the same export was begun. `profile` is one of `licences.PROFILES`.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     missing = plan.n_shards - len(committed_shards(out))
@@ -98,7 +76,7 @@ def _select_rows(
     shards: list[tuple[int, list[Row]]] = []
     for number in range(n_shards):
         rows = []
-        for row in _read_rows(out, "scenes", number, SCENES):
+        for row in _read_rows(out, "scenes", number):
             verdict = scene_license(row)
             if verdict in allowed:
                 places = {"uri": redact_uri(row["uri"] or ""), "url": redact_uri(row["url"] or "") or None}
@@ -111,7 +89,6 @@ def _select_rows(
 
 
 def _explain_nothing(profile: str, left_out: Mapping[LicenceVerdict, int]) -> str:
-    """Explain why nothing may be redistributed, and where licenses are stated."""
     counts = ", ".join(f"{count} {verdict.value}" for verdict, count in sorted(left_out.items()))
     return (
         f"no scene may be passed on as {profile}: {counts}. A licence is stated where the input lies: in source.json "
@@ -144,18 +121,15 @@ def _write_shard(out: StoragePath, source: int, dest: StoragePath, number: int, 
                 places[row["scene_id"]] = tar.copy(old, row["tar_offset"], row["tar_size"])
         tar.close()
     kept = {row["scene_id"] for row in rows}
-    for table, schema in _TABLES.items():
-        own = [row for row in _read_rows(out, table, source, schema) if row["scene_id"] in kept]
-        if table in SPARSE and not own:
-            continue
-        write_atomic(shard_path(dest, table, number), encode_parquet(build_table(own, schema)))
-    scenes = [_place_row(row, number, places.get(row["scene_id"])) for row in rows]
+    for table in ("objects", "tasks", "timings", "trajectories"):
+        own = [row for row in _read_rows(out, table, source) if row["scene_id"] in kept]
+        if own or table not in SPARSE:
+            write_atomic(shard_path(dest, table, number), encode_parquet(build_table(own, STORED_TABLES[table])))
+    scenes = []
+    for row in rows:
+        offset, size = places.get(row["scene_id"], (None, None))
+        scenes.append({**row, "shard": number, "tar_offset": offset, "tar_size": size})
     write_atomic(shard_path(dest, "scenes", number), encode_parquet(build_table(scenes, SCENES)))
-
-
-def _place_row(row: Row, number: int, place: tuple[int, int] | None) -> Row:
-    offset, size = place or (None, None)
-    return {**row, "shard": number, "tar_offset": offset, "tar_size": size}
 
 
 def redact_uri(uri: str) -> str:
@@ -202,14 +176,13 @@ def _strip_folders(path: str) -> str:
     return re.split(r"[/\\]", path.rstrip("/\\"))[-1]
 
 
-def _read_rows(out: StoragePath, table: str, number: int, schema: pa.Schema) -> list[Row]:
+def _read_rows(out: StoragePath, table: str, number: int) -> list[Row]:
     path = shard_path(out, table, number)
     try:
-        rows: list[Row] = read_table(path, schema).to_pylist()
+        return read_table(path, STORED_TABLES[table]).to_pylist()
     except StoreError:
         raise
     except (OSError, pa.ArrowException) as error:
         if table in SPARSE and isinstance(error, FileNotFoundError):
             return []
         raise InputError(f"{path} cannot be read: {' '.join(str(error).split())[:300]}") from error
-    return rows

@@ -31,28 +31,17 @@ _SECTIONS = 24  # sides of round primitives
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderScene(Frozen):
-    """Meshes to render.
+    """Meshes to render."""
 
-    Attributes:
-        still: In the table frame.
-        moving: Each in its own frame: objects first, then the arm's.
-        names: Object id of each of the first of `moving`.
-    """
-
-    still: PaintedMeshes
-    moving: PaintedMeshes
-    names: tuple[str, ...]
+    still: PaintedMeshes  # in the table frame
+    moving: PaintedMeshes  # each in its own frame: objects first, then the arm's
+    names: tuple[str, ...]  # object id of each of the first of `moving`
 
 
 class ArmMeshes:
     """Arm as one mesh per body, with their poses as functions of the joints."""
 
     def __init__(self, arm: Arm) -> None:
-        """Compile the arm on its own.
-
-        Raises:
-            InputError: `bad_arm` if MuJoCo refuses it.
-        """
         try:
             self._model = arm.spec().compile()
         except ValueError as error:
@@ -66,11 +55,7 @@ class ArmMeshes:
         self.meshes = tuple(_merge_body_mesh(self._model, body, shown) for body in self._bodies)
 
     def check_recording(self, recording: Recording) -> None:
-        """Check that a recording is of this arm.
-
-        Raises:
-            InputError: `bad_arrays`.
-        """
+        """Check that the recorded joints are those of this arm."""
         if (recorded := recording.qpos.shape[1]) != (known := len(self._addresses)):
             raise InputError(f"{recorded} positions are recorded, and {recording.robot} has {known}", "bad_arrays")
 
@@ -83,29 +68,16 @@ class ArmMeshes:
         """Compute the meshes' poses in the table frame from positions of joints and fingers. Shape (j + f,)."""
         self._data.qpos[self._addresses] = positions
         mujoco.mj_kinematics(self._model, self._data)
-        return [
-            compose_poses(
-                base, Pose(np.array(self._data.xpos[body]), normalize_quaternion(np.array(self._data.xquat[body])))
-            )
-            for body in self._bodies
-        ]
+        return [compose_poses(base, _read_pose(self._data, body)) for body in self._bodies]
 
 
 def build_recorded_scene(scene: Scene, x_id: str, figure: ArmMeshes, recording: Recording) -> RenderScene:
-    """Split the scene's meshes into recorded as moved and still, and add the arm on its pedestal.
-
-    Raises:
-        InputError: if the scene does not load, or has no object `x_id` or one that was recorded.
-    """
+    """Split the scene's meshes into recorded as moved and still, and add the arm on its pedestal."""
     return build_render_scene(scene, {x_id, *recording.moved_ids}, figure, recording.base)
 
 
 def build_render_scene(scene: Scene, moved: AbstractSet[str], figure: ArmMeshes, base: Pose) -> RenderScene:
-    """Split the scene's meshes into `moved` and still objects, and add the arm with its base in the table frame.
-
-    Raises:
-        InputError: if the scene does not load, or lacks an object.
-    """
+    """Split the scene's meshes into `moved` and still objects, and add the arm with its base in the table frame."""
     model = scene.model()
     scenery = load_scenery(model)
     if absent := sorted(moved - set(scenery.names)):
@@ -117,8 +89,7 @@ def build_render_scene(scene: Scene, moved: AbstractSet[str], figure: ArmMeshes,
     taken = [index for index, name in enumerate(names) if name in moved]
     meshes = []
     for k in taken:
-        body = data.body(names[k])
-        to_object = invert_pose(Pose(np.array(body.xpos), normalize_quaternion(np.array(body.xquat))))
+        to_object = invert_pose(_read_pose(data, model.body(names[k]).id))
         meshes.append(replace(scenery.parts[k], vertices=transform_points(to_object, scenery.parts[k].vertices)))
     return RenderScene(
         PaintedMeshes(
@@ -133,17 +104,17 @@ def build_render_scene(scene: Scene, moved: AbstractSet[str], figure: ArmMeshes,
 def iterate_poses(
     cast: RenderScene, figure: ArmMeshes, recording: Recording, samples: Sequence[int]
 ) -> Iterator[list[Pose]]:
-    """Iterate poses of everything that moves, at some samples of a recording.
-
-    Raises:
-        InputError: `bad_arrays` if the recording is of another arm.
-    """
+    """Iterate poses of everything that moves, at some samples of a recording."""
     figure.check_recording(recording)
     others = [recording.poses_of(name) for name in cast.names]
     ways = [recording.object_pose if way is None else way for way in others]  # X is none of the others
     for sample in samples:
         arm = figure.poses(recording.qpos[sample].astype(np.float64), recording.base)
         yield [pose_from_row(way[sample]) for way in ways] + arm
+
+
+def _read_pose(data: mujoco.MjData, body: int) -> Pose:
+    return Pose(np.array(data.xpos[body]), normalize_quaternion(np.array(data.xquat[body])))
 
 
 def _list_visual_geoms(model: mujoco.MjModel) -> list[int]:

@@ -14,8 +14,7 @@ from tableverse_factory.physics.render.views import frame_points
 from tableverse_factory.robotics.execution.arrays import Recording
 
 FIELD_OF_VIEW = float(np.deg2rad(44.0))  # vertical, of the robot camera
-_EYE_M = (1.2, 0.85, 1.0)
-# In the robot's base frame: across the table and to its left, with table and arm in view
+_EYE_M = (1.2, 0.85, 1.0)  # in the robot's base frame: across the table and to its left, with table and arm in view
 _TARGET_M = (0.37, 0.02, 0.26)
 _ELEVATION = float(np.deg2rad(30.0))
 # Of the film camera about the viewer's side, from which instructions say left and right; never from beyond
@@ -38,27 +37,17 @@ def place_film_camera(recording: Recording, figure: ArmMeshes, width: int, heigh
     It stands where instructions say left and right from, so that a film never mirrors them: straight there if the arm
     does not hide the object at the end, else as little to one side as possible; where the arm hides it from everywhere,
     where the line of sight is freest.
-
-    Raises:
-        InputError: `bad_arrays` if the recording is of another arm.
     """
     flat, up = np.cos(_ELEVATION), np.sin(_ELEVATION)
     sides = [np.array([flat * np.sin(angle), -flat * np.cos(angle), up]) for angle in _AZIMUTHS]
-    arm = [_collect_arm_points(recording, figure, sample) for sample in _spread_samples(recording)]
+    samples = np.unique(np.rint(np.linspace(0, len(recording) - 1, _FRAMING_SAMPLES)).astype(int))
+    arm = [_collect_arm_points(recording, figure, sample) for sample in samples]
     room = [min(_measure_clearance(side, recording.object_pose[-1, :3], arm[-1]), _CLEAR_M) for side in sides]
     side = sides[int(np.argmax(room))]
     way = recording.object_pose[:, :3].astype(np.float64)
-    around = [
-        way + np.array([x, y, 0.0])
-        for x in (-_PATH_MARGIN_M, _PATH_MARGIN_M)
-        for y in (-_PATH_MARGIN_M, _PATH_MARGIN_M)
-    ]
+    margins = (-_PATH_MARGIN_M, _PATH_MARGIN_M)
+    around = [way + np.array([x, y, 0.0]) for x in margins for y in margins]
     return frame_points(np.concatenate([*arm, *around]), look_at(side, np.zeros(3)), width, height)
-
-
-def _spread_samples(recording: Recording) -> list[int]:
-    """Choose samples evenly over a recording, ending with the last."""
-    return sorted(set(np.rint(np.linspace(0, len(recording) - 1, _FRAMING_SAMPLES)).astype(int).tolist()))
 
 
 def _collect_arm_points(recording: Recording, figure: ArmMeshes, sample: int) -> Points:
@@ -78,11 +67,7 @@ def _measure_clearance(side: Vector3, target: Vector3, arm: Points) -> float:
 
 
 def load_scene_camera(meta: dict[str, Any], width: int, height: int) -> PosedCamera | None:
-    """Load the photograph's camera, cropped centrally to this size; None where a scene has none.
-
-    Raises:
-        InputError: `bad_meta` if meta.json holds an invalid camera.
-    """
+    """Load the photograph's camera, cropped centrally to this size; None where a scene has none."""
     camera, pose = meta.get("camera"), meta.get("camera_to_table")
     if camera is None or pose is None:
         return None

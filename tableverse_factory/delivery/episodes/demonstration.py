@@ -6,7 +6,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
@@ -21,33 +21,19 @@ _XYZW = [0, 1, 2, 4, 5, 6, 3]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demonstration(Frozen):
-    """Episode of `n` samples.
+    """Episode of `n` samples."""
 
-    Attributes:
-        actions: Command that leads to the next sample, -1 to 1 between its limits. Shape (n, j + 1).
-        rewards: 1 at the end of a success. Shape (n,), float32.
-        dones: 1 at the end. Shape (n,), int64.
-        states: Time, qpos and qvel of the model. Shape (n, 1 + nq + nv).
-        observations: By name, each of shape (n, …).
-        model: MJCF of the scene with the arm in place.
-        assets: Files that the model references.
-    """
-
-    actions: Float32[np.ndarray, "n k"]
-    rewards: np.ndarray
-    dones: np.ndarray
-    states: Float64[np.ndarray, "n s"]
-    observations: Mapping[str, np.ndarray]
-    model: str
-    assets: Mapping[str, bytes]
+    actions: Float32[np.ndarray, "n k"]  # command that leads to the next sample, -1 to 1 between its limits; k = j + 1
+    rewards: Float32[np.ndarray, " n"]  # 1 at the end of a success
+    dones: Int64[np.ndarray, " n"]  # 1 at the end
+    states: Float64[np.ndarray, "n s"]  # time, qpos and qvel of the model
+    observations: Mapping[str, np.ndarray]  # by name, each of shape (n, …)
+    model: str  # MJCF of the scene with the arm in place
+    assets: Mapping[str, bytes]  # files that the model references
 
 
 def build_demonstration(episode: Episode, arm: Arm) -> Demonstration:
-    """Build the episode's samples.
-
-    Raises:
-        InputError: if the scene does not load with the arm, or the recording is of another arm or object.
-    """
+    """Build the episode's samples."""
     recording, count = episode.recording, len(episode.recording)
     files = episode.scene.files()
     spec = build_station_spec(files, arm)
@@ -94,10 +80,7 @@ def build_env_args(episode: Episode, arm: Arm) -> dict[str, Any]:
 
 
 def _build_states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarray:
-    """Build the model's state at each sample; objects that did not move stand as exported.
-
-    Speeds of objects are differences of their poses.
-    """
+    """Build the model's state at each sample; unmoved objects stand as exported, speeds are differences of poses."""
     recording, data = episode.recording, mujoco.MjData(model)
     joints = [model.joint(PREFIX + name) for name in (*arm.joint_names, *arm.finger_joints)]
     if recording.qpos.shape[1] != len(joints):

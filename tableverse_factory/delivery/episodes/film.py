@@ -21,11 +21,7 @@ _METHOD = 4  # WebP encoder effort against size, 0 to 6
 def render_frames(
     scene: Scene, x_id: str, recording: Recording, figure: ArmMeshes, eye: PosedCamera, samples: Sequence[int]
 ) -> Iterator[Picture]:
-    """Render samples of a recording; everything that did not move stands as exported.
-
-    Raises:
-        InputError: if the scene does not load, lacks object `x_id`, or the recording is of another arm.
-    """
+    """Render samples of a recording; everything that did not move stands as exported."""
     cast = build_recorded_scene(scene, x_id, figure, recording)
     pictures = IncrementalRenderer(cast.still, cast.moving, eye)
     for poses in iterate_poses(cast, figure, recording, samples):

@@ -27,11 +27,6 @@ class Feature:
         """Return the entry of meta/info.json."""
         return {"dtype": self.dtype, "shape": [self.size], "names": list(self.names) if self.names else None}
 
-    def arrow_type(self) -> pa.DataType:
-        """Return a scalar type for one component, else a list of fixed length."""
-        kind = pa.type_for_alias(self.dtype)
-        return kind if self.size == 1 else pa.list_(kind, self.size)
-
 
 def list_features(arm: Arm) -> dict[str, Feature]:
     """List every column of data/; policies read `observation.…` and `action` by default."""
@@ -53,11 +48,7 @@ def list_features(arm: Arm) -> dict[str, Feature]:
 
 
 def compute_stride(recording: Recording, fps: int | None) -> tuple[int, int]:
-    """Compute the samples per frame and the resulting frames per second.
-
-    Raises:
-        InputError: `bad_fps` if the recording's rate is not a whole number per second, or no multiple of `fps`.
-    """
+    """Compute the samples per frame and the resulting frames per second; `fps` None takes every sample."""
     rate = round(1.0 / recording.step_s)
     if abs(rate * recording.step_s - 1.0) > 1e-6:
         raise InputError(f"a step of {recording.step_s} s is no whole number of frames per second", "bad_fps")
@@ -67,11 +58,6 @@ def compute_stride(recording: Recording, fps: int | None) -> tuple[int, int]:
         possible = ", ".join(str(rate // k) for k in range(1, rate + 1) if rate % k == 0)
         raise InputError(f"{fps} frames per second of a recording of {rate}: give one of {possible}", "bad_fps")
     return rate // fps, fps
-
-
-def frame_samples(recording: Recording, every: int) -> list[int]:
-    """The samples that become frames: the first, then every so many."""
-    return list(range(0, len(recording), every))
 
 
 def build_columns(recording: Recording, samples: Sequence[int], fps: int, success: bool) -> dict[str, np.ndarray]:
@@ -108,9 +94,9 @@ def number_columns(values: dict[str, np.ndarray], episode: int, first: int, task
 
 
 def build_frame_table(values: dict[str, np.ndarray], known: dict[str, Feature]) -> pa.Table:
-    """Convert the columns to Arrow."""
+    """Convert the columns to Arrow: scalars for features of one component, else lists of fixed length."""
     arrays = []
     for name, feature in known.items():
         flat = pa.array(np.ascontiguousarray(values[name]).reshape(-1), type=pa.type_for_alias(feature.dtype))
         arrays.append(flat if feature.size == 1 else pa.FixedSizeListArray.from_arrays(flat, feature.size))
-    return pa.Table.from_arrays(arrays, schema=pa.schema([(name, f.arrow_type()) for name, f in known.items()]))
+    return pa.Table.from_arrays(arrays, names=list(known))

@@ -27,7 +27,7 @@ from tableverse_factory.physics.render.views import resize_camera
 _SUPERSAMPLING = 2  # samples per pixel, along each side
 _SKY_RAYS = 6
 _LEVELS = 1 << 14
-_NEAR_PLANE_M = 0.02  # A part nearer to the camera's plane than this is searched in the whole picture
+_NEAR_PLANE_M = 0.02  # a part nearer to the camera's plane than this is searched in the whole picture
 _SHADOW_MARGIN_M = 1e-3
 
 
@@ -90,10 +90,8 @@ class IncrementalRenderer:
         """Find subpixels in which a moving part is nearest, and their linear colors."""
         depth = self._depth.copy()
         owner = np.full(len(depth), -1, dtype=np.int32)
-        looks = [
-            part.look(self._fine, self._eye.camera_to_table, pose)
-            for part, pose in zip(self._moving, poses, strict=True)
-        ]
+        eye = self._eye.camera_to_table
+        looks = [part.look(self._fine, eye, pose) for part, pose in zip(self._moving, poses, strict=True)]
         for number, hits in enumerate(looks):
             nearer = hits.depth < depth[hits.pixels]
             depth[hits.pixels[nearer]] = hits.depth[nearer]
@@ -102,7 +100,7 @@ class IncrementalRenderer:
         for number, (part, hits, pose) in enumerate(zip(self._moving, looks, poses, strict=True)):
             won = np.flatnonzero(owner[hits.pixels] == number)
             pixels.append(hits.pixels[won])
-            colors.append(part.colors(_select_hits(hits, won), pose, self._eye.camera_to_table, self._lighting))
+            colors.append(part.colors(_select_hits(hits, won), pose, eye, self._lighting))
         return np.concatenate(pixels), np.concatenate(colors)
 
 
@@ -200,10 +198,8 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 def _downsample(image: np.ndarray) -> np.ndarray:
-    height, width, channels = image.shape
-    return image.reshape(
-        height // _SUPERSAMPLING, _SUPERSAMPLING, width // _SUPERSAMPLING, _SUPERSAMPLING, channels
-    ).mean(axis=(1, 3))
+    height, width = (side // _SUPERSAMPLING for side in image.shape[:2])
+    return image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, -1).mean(axis=(1, 3))
 
 
 def _select_hits(hits: Hits, indices: np.ndarray) -> Hits:

@@ -5,7 +5,7 @@
     DEST/data/chunk-000/file-000.parquet              a row per frame, many episodes in a file
     DEST/videos/KEY/chunk-000/file-000.mp4            the same frames as one camera sees them
 
-The layout is that of the public documentation of LeRobotDataset v3.0.
+The layout is that of the public documentation.
 """
 
 import tempfile
@@ -41,25 +41,15 @@ _CAMERAS = {"robot": ROBOT_CAMERA, "scene": SCENE_CAMERA}
 
 @dataclass(frozen=True, slots=True)
 class LeRobotOptions:
-    """Export options.
+    """Export options."""
 
-    Attributes:
-        failed: Include failed trajectories.
-        width: Of the pictures [px], even.
-        height: Of the pictures [px], even.
-        fps: Frames per second; None for all recorded ones.
-        cameras: `robot`, `scene` or both. The latter is the photograph's, which the arm may hide.
-        jobs: Rendering processes.
-        robot: Arm of recordings whose robot is not built in: a file, or `menagerie:NAME`.
-    """
-
-    failed: bool = False
-    width: int = 320
-    height: int = 240
-    fps: int | None = None
-    cameras: tuple[str, ...] = ("robot",)
-    jobs: int = 1
-    robot: str | None = None
+    failed: bool = False  # include failed trajectories
+    width: int = 320  # [px], even
+    height: int = 240  # [px], even
+    fps: int | None = None  # None for all recorded frames
+    cameras: tuple[str, ...] = ("robot",)  # `robot`, `scene` (the photograph's, which the arm may hide), or both
+    jobs: int = 1  # rendering processes
+    robot: str | None = None  # arm of recordings whose robot is not built in: a file, or `menagerie:NAME`
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,17 +66,8 @@ def export_lerobot(
 ) -> LeRobotResult:
     """Write the trajectories of a dataset to a new folder, which appears when it is complete.
 
-    The same dataset and options give the same bytes for any number of processes.
-
-    Args:
-        dataset: With trajectories.
-        dest: A folder that does not exist yet.
-        options: Selection and format.
-        progress: Called with the number of episodes written and of all.
-
-    Raises:
-        InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, a scene
-            lacks a requested camera, PyAV is missing, or as `load_recorded_arm`.
+    The same dataset and options give the same bytes for any number of processes. `progress` is called with the number
+    of episodes written and of all.
     """
     import_av()
     check_new_path(dest)

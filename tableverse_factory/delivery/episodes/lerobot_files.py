@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -36,7 +35,7 @@ class LeRobotFiles:
         data_mb: float = DATA_MB,
         video_mb: float = VIDEO_MB,
     ) -> None:
-        """Create the folder; `features` are the columns of data/, the sizes are maxima per file [MB]."""
+        """Create the folder; the sizes are maxima per file [MB]."""
         self._folder, self._setting, self._features = folder, setting, dict(features)
         self._data_mb, self._video_mb = data_mb, video_mb
         self._tasks: dict[str, int] = {}
@@ -117,7 +116,8 @@ class LeRobotFiles:
         rows = [{**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} for row in self._rows]
         _write_parquet(self._folder / _format_path(EPISODES_PATH, 0), [pa.Table.from_pylist(rows)])
         _write_parquet(self._folder / "meta/tasks.parquet", [build_tasks_table(self._tasks)])
-        stats = {name: _to_lists(merge_stats(figures)) for name, figures in self._figures.items()}
+        merged = {name: merge_stats(figures) for name, figures in self._figures.items()}
+        stats = {name: {key: value.tolist() for key, value in figure.items()} for name, figure in merged.items()}
         self._write_json("meta/stats.json", stats)
         self._write_json("meta/info.json", self._info())
         return self._folder
@@ -177,10 +177,6 @@ def build_tasks_table(tasks: Mapping[str, int]) -> pa.Table:
 
 def _format_path(template: str, number: int, **names: str) -> str:
     return template.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES, **names)
-
-
-def _to_lists(figures: FeatureStats) -> dict[str, Any]:
-    return {name: np.asarray(value).tolist() for name, value in figures.items()}
 
 
 def _write_parquet(path: Path, tables: list[pa.Table]) -> None:

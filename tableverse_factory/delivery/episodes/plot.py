@@ -21,10 +21,7 @@ _SWATCH, _SPACE = 12.0, 5.0  # length of a legend line, and the gap behind it (t
 
 
 def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max_opening_m: float) -> str:
-    """Draw the plot as inline markup.
-
-    `closed` and `opened` are positions of the fingers' joints. Both of shape (f,).
-    """
+    """Draw the plot as inline markup; `closed` and `opened` are positions of the fingers' joints, shape (f,)."""
     n_joints = recording.command.shape[1] - 1
     shown = np.unique(np.rint(np.linspace(0, len(recording) - 1, min(len(recording), _POINTS))).astype(int))
     end_s = max(float(recording.time_s[-1]), recording.step_s)
@@ -32,7 +29,8 @@ def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max
     joints = recording.qpos[shown, :n_joints]
     span = opened - closed
     opening = (recording.qpos[shown, n_joints:] - closed) @ span / (span @ span) * max_opening_m
-    low, high = _round_range(joints)
+    low = float(np.floor(joints.min()))
+    high = max(float(np.ceil(joints.max())), low + 1.0)
     top = _TOP + _JOINTS + _GAP
     parts = [
         f'<svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
@@ -40,28 +38,17 @@ def plot_svg(recording: Recording, closed: JointVector, opened: JointVector, max
         *_draw_bands(recording, end_s),
         *_draw_grid(low, high, max_opening_m, top),
     ]
-    for joint in range(n_joints):
-        points = _format_points(across, joints[:, joint], low, high, _TOP, _JOINTS)
-        parts.append(f'<polyline class="j{joint % COLORS + 1}" points="{points}"/>')
-    told = _format_points(across, recording.command[shown, -1], 0.0, max_opening_m, top, _GRIPPER)
-    parts.append(f'<polyline class="told" points="{told}"/>')
-    parts.append(
-        f'<polyline class="open" points="{_format_points(across, opening, 0.0, max_opening_m, top, _GRIPPER)}"/>'
-    )
-    parts += _draw_time_axis(end_s, top + _GRIPPER)
-    parts += _draw_legend(n_joints)
-    return "".join([*parts, "</svg>"])
+    shares = [(f"j{joint % COLORS + 1}", (joints[:, joint] - low) / (high - low)) for joint in range(n_joints)]
+    parts += [_draw_line(kind, across, share, _TOP, _JOINTS) for kind, share in shares]
+    for kind, lengths in (("told", recording.command[shown, -1]), ("open", opening)):
+        parts.append(_draw_line(kind, across, lengths / max_opening_m, top, _GRIPPER))
+    return "".join([*parts, *_draw_time_axis(end_s, top + _GRIPPER), *_draw_legend(n_joints), "</svg>"])
 
 
-def _round_range(values: np.ndarray) -> tuple[float, float]:
-    """Widen a range to whole numbers [rad]."""
-    low, high = float(np.floor(values.min())), float(np.ceil(values.max()))
-    return low, max(high, low + 1.0)
-
-
-def _format_points(across: np.ndarray, values: np.ndarray, low: float, high: float, top: float, height: float) -> str:
-    down = top + height * (1.0 - np.clip((values - low) / (high - low), -0.1, 1.1))
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
+def _draw_line(kind: str, across: np.ndarray, share: np.ndarray, top: float, height: float) -> str:
+    down = top + height * (1.0 - np.clip(share, -0.1, 1.1))
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
+    return f'<polyline class="{kind}" points="{points}"/>'
 
 
 def _draw_bands(recording: Recording, end_s: float) -> list[str]:

@@ -43,15 +43,7 @@ class RobomimicResult:
 def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: str | None = None) -> RobomimicResult:
     """Write the trajectories of a dataset to a new file, which appears when it is complete. Same input, same bytes.
 
-    Args:
-        dataset: With trajectories.
-        dest: A file that does not exist yet.
-        failed: Include failed trajectories.
-        robot: Arm of recordings whose robot is not built in: a file, or `menagerie:NAME`.
-
-    Raises:
-        InputError: if `dest` exists, there is nothing to export, the episodes are of several robots or steps, or h5py
-            is missing; or as `load_recorded_arm`.
+    `robot` is the arm of recordings whose robot is not built in: a file, or `menagerie:NAME`.
     """
     h5py = import_extra("h5py", "HDF5", "episodes")
     check_new_path(dest)
@@ -68,8 +60,7 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
                 check_kind(first, episode)
                 arm = load_recorded_arm(episode.recording, robot)
                 demo = build_demonstration(episode, arm)
-                meta = _build_episode_meta(episode.row)
-                _write_demo(data.create_group(f"demo_{number}"), demo, meta)
+                _write_demo(data.create_group(f"demo_{number}"), demo, episode.row)
                 _write_assets(file, episode.scene.scene_id, demo.assets)
                 names[bool(episode.row["success"])].append(f"demo_{number}")
                 total += len(demo.actions)
@@ -82,12 +73,9 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
     return RobomimicResult(len(rows), total)
 
 
-def _build_episode_meta(row: Mapping[str, Any]) -> dict[str, Any]:
+def _write_demo(group: Any, demo: Demonstration, row: Mapping[str, Any]) -> None:
     keys = ("scene_id", "task_id", "x_id", "y_id", "relation", "success", "failed_phase", "reason")
-    return {"lang": read_instruction(row), **{key: row[key] for key in keys}}
-
-
-def _write_demo(group: Any, demo: Demonstration, meta: Mapping[str, Any]) -> None:
+    meta = {"lang": read_instruction(row), **{key: row[key] for key in keys}}
     group.attrs["num_samples"] = len(demo.actions)
     group.attrs["model_file"] = demo.model
     group.attrs["ep_meta"] = json.dumps(meta)

@@ -9,12 +9,7 @@ from tableverse_factory.robotics.robots.registry import ARMS, load_arm
 
 
 def load_recorded_arm(recording: Recording, given: str | None = None) -> Arm:
-    """Load the arm of a recording; `given` is the user's, for recordings whose robot is not built in.
-
-    Raises:
-        InputError: `robot_is_a_file` or `robot_not_given` if it has to be given; `another_robot` for other joints.
-        ConfigError: if there is no arm of this name.
-    """
+    """Load the arm of a recording; `given` is the user's, for recordings whose robot is not built in."""
     name = recording.robot
     if given is not None and name not in ARMS:
         arm = load_arm(given)

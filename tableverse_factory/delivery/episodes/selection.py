@@ -30,11 +30,7 @@ class Episode(Frozen):
 
 
 def select_rows(dataset: Dataset, failed: bool) -> list[dict[str, Any]]:
-    """Select rows of trajectories with arrays, by scene and task; failures only on request.
-
-    Raises:
-        InputError: `no_trajectories` if there are none, with the number of failures.
-    """
+    """Select rows of trajectories with arrays, by scene and task; failures only if asked for."""
     rows = [row for row in dataset.trajectories.to_table().to_pylist() if row["arrays"]]
     kept = [row for row in rows if failed or row["success"]]
     if not kept:
@@ -49,21 +45,12 @@ def read_instruction(row: Mapping[str, Any]) -> str:
 
 
 def open_episode(dataset: Dataset, row: Mapping[str, Any]) -> Episode:
-    """Open the episode of a row.
-
-    Raises:
-        InputError: if the scene does not open, or its arrays are missing or invalid.
-    """
-    scene = dataset.scene(row["scene_id"])
-    return Episode(row, scene, load_recording(scene, row))
+    """Open the episode of a row."""
+    return next(open_episodes(dataset, [row]))
 
 
 def load_recording(scene: Scene, row: Mapping[str, Any]) -> Recording:
-    """Load the arrays that a row of trajectories/ names.
-
-    Raises:
-        InputError: `bad_arrays` if the file is missing, invalid, or not the one that was written.
-    """
+    """Load the arrays that a row of trajectories/ names."""
     name, data = str(row["arrays"]), scene.files().get(str(row["arrays"]))
     if data is None:
         raise InputError(f"scene {scene.scene_id} has no {sanitize_line(name, 100)}", "bad_arrays")
@@ -93,17 +80,13 @@ class EpisodeKind:
 
 
 def get_kind(episode: Episode) -> EpisodeKind:
-    """Return the kind of one episode."""
+    """Get the kind of one episode."""
     recording = episode.recording
     return EpisodeKind(recording.robot, recording.step_s, recording.command.shape[1], episode.name)
 
 
 def check_kind(first: EpisodeKind, episode: Episode) -> None:
-    """Check that an episode has the robot and step of the first one.
-
-    Raises:
-        InputError: `mixed_episodes`.
-    """
+    """Check that an episode has the robot and step of the first one."""
     other = get_kind(episode)
     if replace(other, episode=first.episode) != first:
         raise InputError(
@@ -114,10 +97,6 @@ def check_kind(first: EpisodeKind, episode: Episode) -> None:
 
 
 def check_new_path(dest: Path) -> None:
-    """Refuse an existing path.
-
-    Raises:
-        InputError: `dest_exists`.
-    """
+    """Refuse an existing path."""
     if dest.exists() or dest.is_symlink():
         raise InputError(f"{dest}: already there; give a new name", "dest_exists")

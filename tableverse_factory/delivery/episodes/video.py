@@ -24,11 +24,7 @@ _TICKS = 1000  # clock ticks per frame
 
 
 def import_av() -> ModuleType:
-    """Import PyAV.
-
-    Raises:
-        InputError: `no_extra` if it is not installed.
-    """
+    """Import PyAV; InputError `no_extra` if it is not installed."""
     return import_extra("av", "a video", "episodes")
 
 
@@ -54,12 +50,10 @@ class VideoFile:
     """MP4 of many episodes; dataset-wide frame k is shown from k / fps on."""
 
     def __init__(self, path: Path, fps: int) -> None:
-        """Open the file, in an existing folder."""
         self._av, self._fps = import_av(), fps
         self._container = self._av.open(str(path), "w", format="mp4")
         self._stream: Any = None
-        self.n_frames = 0
-        self.n_bytes = 0
+        self.n_frames, self.n_bytes = 0, 0
 
     def add(self, video: bytes) -> None:
         """Append a video of `encode_mp4`, packet by packet."""

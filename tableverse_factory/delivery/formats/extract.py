@@ -16,18 +16,18 @@ from tableverse_factory.delivery.formats.usd import encode_usd
 
 
 def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[Path, ...]:
-    """Write the scene to a new or empty folder, in a format of `FORMATS`, and return the paths.
-
-    Raises:
-        InputError: if the folder is not empty, the format unknown, or the scene does not load.
-    """
+    """Write the scene to a new or empty folder, in a format of `FORMATS`, and return the paths."""
     if file_format not in FORMATS:
         raise InputError(f"format {file_format!r:.40}: give one of {', '.join(FORMATS)}")
     if dest.exists() and (not dest.is_dir() or any(dest.iterdir())):
         raise InputError(f"{dest}: already there; give a new or an empty folder")
     contents = read_model_contents(scene.model())
     for content in (*contents.objects, *contents.still):
-        _check_name(content.name)
+        try:
+            check_id(content.name)  # foreign scenes may hold anything
+        except ValueError as error:
+            why = sanitize_line(str(error), 200)
+            raise InputError(f"a body of the scene cannot be a file: {why}", "bad_name") from None
     files = FORMATS[file_format](scene, contents, read_labels(scene.meta))
     for name, data in files.items():
         path = dest / name
@@ -42,19 +42,7 @@ def read_labels(meta: Mapping[str, Any]) -> dict[str, str]:
     return {object_id: clean_label(str(entry.get("label", object_id))) for object_id, entry in entries}
 
 
-def _check_name(name: str) -> None:
-    """Check that a body's name is a safe file name, as foreign scenes may hold anything."""
-    try:
-        check_id(name)
-    except ValueError as error:
-        raise InputError(
-            f"a body of the scene cannot be a file: {sanitize_line(str(error), 200)}", "bad_name"
-        ) from None
-
-
-Writer = Callable[[Scene, ModelContents, Mapping[str, str]], dict[str, bytes]]
-
-FORMATS: dict[str, Writer] = {
+FORMATS: dict[str, Callable[[Scene, ModelContents, Mapping[str, str]], dict[str, bytes]]] = {
     "mjcf": lambda scene, contents, labels: {**scene.files(), SCENE_GLB: encode_glb(contents, labels)},
     "glb": lambda _, contents, labels: {SCENE_GLB: encode_glb(contents, labels)},
     "urdf": lambda _, contents, labels: encode_urdf(contents, labels),

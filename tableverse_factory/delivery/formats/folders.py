@@ -1,7 +1,4 @@
-"""Scene folders, as the authors of the paper release theirs and as `tableverse extract` writes them.
-
-A folder per scene: an XML file with its assets, and scene.glb beside it.
-"""
+"""Scene folders, as the paper's authors and `tableverse extract` write them: an XML file with assets, and scene.glb."""
 
 from pathlib import Path
 

@@ -1,7 +1,4 @@
-"""Contents of a compiled MuJoCo model by object: visuals, colliders, mass properties.
-
-Shared by all output formats, and by measurements of any MJCF.
-"""
+"""Contents of a compiled MuJoCo model by object, for all output formats and for measurements of any MJCF."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,42 +30,25 @@ class VisualMesh(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelObject(Frozen):
-    """Object in its own frame, which is that of its body.
+    """Object with its attached bodies, in its own frame, which is that of its body."""
 
-    Attributes:
-        name: Of the body; `#7` where body 7 has none.
-        pose: Its own frame in the world.
-        looks: Visuals in MuJoCo's viewer, or everything where there are none.
-        unseen: Colliders that no visual represents, part of the shape all the same.
-        hulls: Convex colliders.
-        mass_kg: Including attached bodies.
-        center: Center of mass [m].
-        inertia: About the center of mass [kg m²]. Shape (3, 3).
-        friction: Largest sliding friction of the colliders.
-    """
-
-    name: str
-    pose: Pose
-    looks: tuple[VisualMesh, ...]
-    unseen: tuple[TriangleMesh, ...]
-    hulls: tuple[TriangleMesh, ...]
+    name: str  # of the body; `#7` where body 7 has none
+    pose: Pose  # of its own frame in the world
+    looks: tuple[VisualMesh, ...]  # visuals in MuJoCo's viewer, or everything where there are none
+    unseen: tuple[TriangleMesh, ...]  # colliders that no visual represents, part of the shape all the same
+    hulls: tuple[TriangleMesh, ...]  # convex colliders
     mass_kg: float
-    center: Vector3
-    inertia: Matrix3
-    friction: float
+    center: Vector3  # of mass [m]
+    inertia: Matrix3  # about the center of mass [kg m²]
+    friction: float  # largest sliding friction of the colliders
 
 
 @dataclass(frozen=True, slots=True)
 class ModelContents:
-    """Objects of a scene.
+    """Objects of a scene."""
 
-    Attributes:
-        objects: Movable ones; in a model without any, every body on the world but the table.
-        still: Static ones, usually the table.
-    """
-
-    objects: tuple[ModelObject, ...]
-    still: tuple[ModelObject, ...]
+    objects: tuple[ModelObject, ...]  # movable ones; in a model without any, every body on the world but the table
+    still: tuple[ModelObject, ...]  # usually the table
 
 
 def read_model_contents(model: mujoco.MjModel) -> ModelContents:
@@ -94,21 +74,17 @@ def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Model
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
     seen = _list_visual_geoms(model, geoms)
-    looks = [_load_visual(model, data, geom, pose) for geom in seen]
-    unseen = (_load_visual(model, data, geom, pose) for geom in find_undrawn_geoms(model, data, seen, solid))
-    hulls = [hull for hull in (_compute_hull(model, data, geom, pose) for geom in solid) if hull is not None]
-    mass, center, inertia = _compute_mass_properties(model, data, root, pose)
+    looks = [look for geom in seen if (look := _load_visual(model, data, geom, pose))]
+    undrawn = find_undrawn_geoms(model, data, seen, solid)
+    unseen = [look.mesh for geom in undrawn if (look := _load_visual(model, data, geom, pose))]
+    hulls = [hull for geom in solid if (hull := _compute_hull(model, data, geom, pose))]
     friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0
-    looks_there = tuple(look for look in looks if look is not None)
-    shape = tuple(look.mesh for look in unseen if look is not None)
-    return ModelObject(body_name(model, root), pose, looks_there, shape, tuple(hulls), mass, center, inertia, friction)
+    properties = _compute_mass_properties(model, data, root, pose)
+    return ModelObject(body_name(model, root), pose, tuple(looks), tuple(unseen), tuple(hulls), *properties, friction)
 
 
 def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:
-    """List geoms that the viewer shows, whether they collide or not.
-
-    Of equal meshes at the same place, one visual and one collider, the first is enough.
-    """
+    """List geoms that the viewer shows, colliding or not; of equal meshes at the same place, the first is enough."""
     once: dict[tuple[object, ...], int] = {}
     for geom in [g for g in geoms if model.geom_group[g] < HIDDEN_GROUP] or geoms:
         place = *model.geom_pos[geom], *model.geom_quat[geom], *model.geom_size[geom]
@@ -117,23 +93,19 @@ def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]
 
 
 def _load_visual(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> VisualMesh | None:
-    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
-    shape: TriangleMesh | None
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        shape = read_geom_mesh(model, geom)
-    elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-        shape = make_geom_box(model, geom)
-    elif kind == mujoco.mjtGeom.mjGEOM_PLANE:
-        shape = _make_plane(size)
-    else:
-        shape = make_geom_mesh(model, geom)
-    return (
-        None if shape is None else VisualMesh(_to_object_frame(shape, data, geom, pose), read_geom_color(model, geom))
-    )
+    makers = {
+        mujoco.mjtGeom.mjGEOM_MESH: read_geom_mesh,
+        mujoco.mjtGeom.mjGEOM_BOX: make_geom_box,
+        mujoco.mjtGeom.mjGEOM_PLANE: _make_plane,
+    }
+    shape = makers.get(mujoco.mjtGeom(model.geom_type[geom]), make_geom_mesh)(model, geom)
+    if shape is None:
+        return None
+    return VisualMesh(_to_object_frame(shape, data, geom, pose), read_geom_color(model, geom))
 
 
-def _make_plane(size: np.ndarray) -> TriangleMesh:
-    x, y = (float(half) if half > 0.0 else UNBOUNDED_PLANE_M for half in size[:2])
+def _make_plane(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    x, y = (float(half) if half > 0.0 else UNBOUNDED_PLANE_M for half in model.geom_size[geom, :2])
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
 
@@ -148,17 +120,14 @@ def _compute_hull(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: P
 
 
 def _to_object_frame(mesh: TriangleMesh, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh:
-    """Transform a geom's mesh to the object's frame."""
-    return place_mesh(
-        mesh,
-        compose_poses(invert_pose(pose), pose_from_rotation(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))),
-    )
+    geom_pose = pose_from_rotation(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3))
+    return place_mesh(mesh, compose_poses(invert_pose(pose), geom_pose))
 
 
 def _compute_mass_properties(
     model: mujoco.MjModel, data: mujoco.MjData, root: int, pose: Pose
 ) -> tuple[float, Vector3, Matrix3]:
-    """Compute mass, center and inertia of a body and all attached bodies, in the object's own frame."""
+    """Compute mass, center and inertia of a body with all attached bodies, in the object's own frame."""
     bodies = [int(b) for b in np.flatnonzero(model.body_rootid == root)] if root else []
     mass = float(model.body_mass[bodies].sum()) if bodies else 0.0
     if mass <= 0.0:

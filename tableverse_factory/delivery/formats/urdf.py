@@ -24,11 +24,7 @@ WORLD = "world"
 
 
 def encode_urdf(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
-    """Encode `scene.urdf`, `<object>.urdf` for each object, and their meshes, by path; `labels` are untrusted text.
-
-    Raises:
-        InputError: `bad_name` if two links or two files would have the same name.
-    """
+    """Encode `scene.urdf`, `<object>.urdf` for each object, and their meshes, by path; `labels` are untrusted text."""
     files: list[tuple[str, bytes]] = []
     scene = _make_robot("scene")
     ET.SubElement(scene, "link", name=WORLD)
@@ -42,8 +38,9 @@ def encode_urdf(contents: ModelContents, labels: Mapping[str, str]) -> dict[str,
         if moves:
             alone = _make_robot(content.name)
             alone.append(link)
-            for root in (alone, scene):
-                _add_label(root, content.name, labels.get(content.name))
+            if (label := labels.get(content.name)) is not None:
+                for root in (alone, scene):
+                    ET.SubElement(root, "label", link=content.name).text = label
             files.append((f"{make_file_stem(content.name)}.urdf", _serialize(alone)))
     files.append(("scene.urdf", _serialize(scene)))
     _check_unique_names("files", [name for name, _ in files])
@@ -54,9 +51,8 @@ def _check_unique_names(what: str, names: Sequence[str]) -> None:
     """Refuse names that differ only in case, or objects named like another's file."""
     counts = Counter(name.lower() for name in names)
     if doubled := [sanitize_line(name, 100) for name, count in counts.items() if count > 1]:
-        raise InputError(
-            f"two {what} of the URDF would be called {', '.join(doubled[:3])}: rename an object", "bad_name"
-        )
+        called = ", ".join(doubled[:3])
+        raise InputError(f"two {what} of the URDF would be called {called}: rename an object", "bad_name")
 
 
 def _make_robot(name: str) -> ET.Element:
@@ -114,20 +110,11 @@ def _build_shape(kind: str, mesh: str) -> ET.Element:
 
 def _build_joint(content: ModelObject, kind: str) -> ET.Element:
     joint = ET.Element("joint", name=f"{WORLD}_to_{_name_link(content)}", type=kind)
-    ET.SubElement(
-        joint,
-        "origin",
-        xyz=_format_numbers(content.pose.position),
-        rpy=_format_numbers(compute_roll_pitch_yaw(content.pose)),
-    )
+    angles = _format_numbers(compute_roll_pitch_yaw(content.pose))
+    ET.SubElement(joint, "origin", xyz=_format_numbers(content.pose.position), rpy=angles)
     ET.SubElement(joint, "parent", link=WORLD)
     ET.SubElement(joint, "child", link=_name_link(content))
     return joint
-
-
-def _add_label(root: ET.Element, name: str, label: str | None) -> None:
-    if label is not None:
-        ET.SubElement(root, "label", link=name).text = label
 
 
 def compute_roll_pitch_yaw(pose: Pose) -> tuple[float, float, float]:
@@ -147,23 +134,18 @@ def _format_numbers(values: Sequence[float] | np.ndarray) -> str:
 def encode_obj_files(look: VisualMesh, stem: str) -> dict[str, bytes]:
     """Encode `stem.obj`, `stem.mtl` and, for a textured mesh, `stem.png`."""
     texture = look.mesh.texture
-    material = [f"newmtl {stem}", "Ks 0.05 0.05 0.05", "Ns 20"]
+    material = f"newmtl {stem}\nKs 0.05 0.05 0.05\nNs 20\nKd "
     head = f"mtllib {stem}.mtl\nusemtl {stem}\n".encode()
     if texture is None:
-        material.append("Kd " + " ".join(f"{channel / 255:.4f}" for channel in look.color))
-        return {f"{stem}.obj": head + encode_obj(look.mesh), f"{stem}.mtl": _join_lines(material)}
+        material += " ".join(f"{channel / 255:.4f}" for channel in look.color) + "\n"
+        return {f"{stem}.obj": head + encode_obj(look.mesh), f"{stem}.mtl": material.encode()}
     picture = encode_png(np.asarray(texture.picture))
     appearance = Appearance.at_corners(picture, np.asarray(texture.corner_uv))
-    material += ["Kd 1 1 1", f"map_Kd {stem}.png"]
     return {
         f"{stem}.obj": head + encode_obj(look.mesh, appearance),
-        f"{stem}.mtl": _join_lines(material),
+        f"{stem}.mtl": f"{material}1 1 1\nmap_Kd {stem}.png\n".encode(),
         f"{stem}.png": picture,
     }
-
-
-def _join_lines(lines: list[str]) -> bytes:
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _serialize(root: ET.Element) -> bytes:

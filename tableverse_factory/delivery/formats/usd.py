@@ -1,7 +1,4 @@
-"""USD with physics: rigid bodies with mass and inertia, convex colliders, preview surfaces; z up, meters.
-
-Needs the package `usd-core`, the optional extra `usd`.
-"""
+"""USD with physics: rigid bodies with mass and inertia, convex colliders, preview surfaces; z up, meters."""
 
 import tempfile
 from collections.abc import Mapping
@@ -29,9 +26,6 @@ def encode_usd(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, 
 
     Prims are named after the objects as far as USD allows; object ids and `labels`, untrusted text, are in
     `customData`.
-
-    Raises:
-        InputError: `no_extra` if usd-core is not installed.
     """
     import_extra("pxr", "USD", "usd")
     from pxr import Usd, UsdGeom, UsdPhysics

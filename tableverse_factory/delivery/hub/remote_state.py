@@ -19,8 +19,7 @@ from tableverse_factory.run_record import diff_run_records
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-HEAD_MESSAGE = "Card, plan and record"
-"""Message of the commit that writes the card; a card last written by another commit was edited on the Hub."""
+HEAD_MESSAGE = "Card, plan and record"  # of the commit with the card; one last written by another commit was edited
 
 _OWN_FOLDERS = (*FOLDERS, *SPARSE, MERGED)
 _EXPECTED = frozenset({".gitattributes", CARD})
@@ -30,26 +29,15 @@ _SHARD = re.compile(r"shard-(\d{5,9})\.[a-z]+")
 
 @dataclass(frozen=True, slots=True)
 class RemoteState:
-    """State of a repository that an upload may continue.
+    """State of a repository that an upload may continue."""
 
-    Attributes:
-        commit: The inspected commit, which the next one must follow.
-        obsolete: What is to be deleted: files, and whole folders with a slash at their end.
-        keep_card: Whether there is a card that was not written by an upload.
-    """
-
-    commit: str
-    obsolete: tuple[str, ...]
-    keep_card: bool
+    commit: str  # inspected, which the next one must follow
+    obsolete: tuple[str, ...]  # to be deleted: files, and whole folders with a slash at their end
+    keep_card: bool  # there is one that was not written by an upload
 
 
 def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, replace: bool) -> RemoteState:
-    """Inspect the repository, and check that `contents` may go there.
-
-    Raises:
-        BuildError: if something else is there, or its visibility is not the requested one.
-        StoreError: if the Hub refuses or fails.
-    """
+    """Inspect the repository, and check that `contents` may go there and that its visibility is the requested one."""
     found = call_hub(name, lambda: api.repo_info(name, repo_type="dataset"))
     if found.private is public:
         what, give = ("private", "without --public") if public else ("public", "with --public")
@@ -73,7 +61,7 @@ def inspect_remote(api: "HfApi", contents: UploadSet, name: str, public: bool, r
 
 
 def _read_remote_run(folder: HubFolder) -> Mapping[str, Any]:
-    """Read run.json of the remote dataset; empty if it is malformed."""
+    """Read run.json; empty if it is malformed."""
     try:
         run = json.loads(folder.cat_file(f"{folder.address}/run.json", 0, _MAX_RUN_BYTES))
     except (ValueError, RecursionError):
@@ -87,11 +75,10 @@ def _find_strays(folder: HubFolder, contents: UploadSet, names: set[str]) -> tup
     found = []
     for own in (own for own in _OWN_FOLDERS if own in names):
         for file in folder.sizes(own):
-            number = _SHARD.fullmatch(file)
-            ours = (
-                whole if own == MERGED else number and (int(number[1]) in shards or int(number[1]) >= contents.n_shards)
-            )
-            if ours and f"{own}/{file}" not in contents.sizes:
+            match = _SHARD.fullmatch(file)
+            number = int(match[1]) if match else None
+            ours = number is not None and (number in shards or number >= contents.n_shards)
+            if (whole if own == MERGED else ours) and f"{own}/{file}" not in contents.sizes:
                 found.append(f"{own}/{file}")
     return tuple(sorted(found))
 

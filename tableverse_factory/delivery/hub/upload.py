@@ -1,9 +1,8 @@
 """Upload of a dataset to the Hugging Face Hub in commits of whole shards, so that every commit is a dataset.
 
-The library's own upload of a folder makes commits wherever its files happen to fall; here the first commit holds
-`run.json`, the plan and the card, and each of the following whole shards. A reader at any commit sees an unfinished
-dataset, as on the disk. An upload resumes from what the Hub has, by content. Every commit must follow the inspected
-one, or the state is inspected anew, so that two uploads under one name do not mix.
+The first commit holds `run.json`, the plan and the card, so that a reader at any commit sees an unfinished dataset, as
+on the disk. An upload resumes from what the Hub has, by content. Every commit must follow the inspected one, or the
+state is inspected anew, so that two uploads under one name do not mix.
 """
 
 import sys
@@ -27,37 +26,20 @@ MAX_BYTES_A_COMMIT = 8 * 1024**3
 
 _SLOWEST_BYTES_PER_S = 200_000
 
-Report = Callable[[str], None]  # takes a line about what is done next
+Report = Callable[[str], None]  # takes a line before every commit
 
 
 @dataclass(frozen=True, slots=True)
 class UploadOptions:
-    """Options of an upload.
-
-    Attributes:
-        public: Whether everybody may read the dataset; an existing one must have this visibility.
-        replace: Whether another dataset under this name is deleted.
-        card: Whether a card that was edited on the Hub is overwritten.
-    """
+    """Options of an upload: its visibility, which an existing dataset must have, and what may be overwritten."""
 
     public: bool = False
-    replace: bool = False
-    card: bool = False
+    replace: bool = False  # another dataset under this name
+    card: bool = False  # a card that was edited on the Hub
 
 
 def upload(contents: UploadSet, name: str, options: UploadOptions, report: Report) -> str:
-    """Upload what the Hub does not have yet; the same call resumes after a kill.
-
-    Args:
-        contents: The dataset.
-        name: Of the dataset on the Hub, as `OWNER/NAME`; created if missing.
-        options: Visibility, and what may be overwritten.
-        report: Called with a line before every commit.
-
-    Raises:
-        BuildError: if something else is there, or the dataset is public and was to be private.
-        StoreError: if the Hub refuses or fails.
-    """
+    """Upload what the Hub does not have yet to `OWNER/NAME`, created if missing; the same call resumes after a kill."""
     with _silence_library():
         api = make_hub_api()
         call_hub(name, lambda: api.create_repo(name, repo_type="dataset", private=not options.public, exist_ok=True))
@@ -97,7 +79,7 @@ def _commit_all(
 
 
 def _plan_commits(contents: UploadSet) -> Iterator[tuple[str, list[str]]]:
-    """Plan the commits: their messages, and the paths of their files."""
+    """Plan the messages of the commits, and the paths of their files."""
     yield HEAD_MESSAGE, [CARD, *contents.head()]
     batch: list[int] = []
     for shard in contents.shards:
@@ -113,13 +95,7 @@ def _plan_commits(contents: UploadSet) -> Iterator[tuple[str, list[str]]]:
 
 
 def _commit(
-    api: "HfApi",
-    contents: UploadSet,
-    name: str,
-    message: str,
-    paths: list[str],
-    obsolete: tuple[str, ...],
-    parent: str,
+    api: "HfApi", contents: UploadSet, name: str, message: str, paths: list[str], obsolete: tuple[str, ...], parent: str
 ) -> "CommitInfo":
     """Commit what differs from the state of the Hub; nothing is sent if nothing does."""
 

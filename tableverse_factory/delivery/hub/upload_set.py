@@ -27,33 +27,23 @@ _COLUMNS = ("licence", "mesh_licences", "uri", "detail", "tar_offset")
 
 @dataclass(frozen=True, slots=True)
 class UploadSet:
-    """Dataset as it would be uploaded.
-
-    Attributes:
-        run: Its `run.json`.
-        shards: Numbers of the committed ones, in order.
-        card: Its `README.md`.
-        sizes: Of every file, by its path below `out` [bytes], without the card.
-        licences: Scenes by name of their licence; empty if none is stated.
-        verdicts: Scenes by what their licences and those of their meshes allow; the freest first.
-        private_values: Number of rows and configuration values that name files or addresses of the building machine.
-    """
+    """Dataset as it would be uploaded."""
 
     out: Path
-    run: Mapping[str, Any]
-    n_shards: int
-    shards: tuple[int, ...]
-    card: bytes
-    sizes: Mapping[str, int]
+    run: Mapping[str, Any]  # `run.json`
+    n_shards: int  # planned
+    shards: tuple[int, ...]  # committed, in order
+    card: bytes  # `README.md`
+    sizes: Mapping[str, int]  # of all other files, by path below `out` [bytes]
     scenes: int
     with_files: int
-    licences: Mapping[str, int]
-    verdicts: Mapping[LicenceVerdict, int]
-    private_values: int
+    licences: Mapping[str, int]  # scenes by name; empty if none is stated
+    verdicts: Mapping[LicenceVerdict, int]  # scenes by what licences of picture and meshes allow, the freest first
+    private_values: int  # rows and configuration values that name files or addresses of the building machine
 
     @property
     def n_bytes(self) -> int:
-        """Size of the whole upload."""
+        """Size of the whole upload [bytes]."""
         return sum(self.sizes.values()) + len(self.card)
 
     def files_of(self, shard: int) -> Iterator[str]:
@@ -71,12 +61,7 @@ class UploadSet:
 
 
 def collect_upload_set(out: Path) -> UploadSet:
-    """Collect everything that would be uploaded; nothing is written or sent.
-
-    Raises:
-        BuildError: if there is no dataset, or a committed shard lacks a file or some of its bytes.
-        InputError: if no shard is committed.
-    """
+    """Collect everything that would be uploaded; nothing is written or sent."""
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     shards = tuple(sorted(number for number in committed_shards(out) if number < plan.n_shards))
     if not shards:
@@ -147,8 +132,7 @@ def _read_or_make_card(out: Path, run: Mapping[str, Any], shards: Collection[int
 
 
 def _list_sizes(out: Path, shards: Collection[int], whole: bool) -> dict[str, int]:
-    """List the sizes of everything that belongs to the dataset, and of nothing else in its folder."""
-    names = [*_HEAD]
-    names += [f"{folder}/{shard_name(folder, shard)}" for shard in shards for folder in FOLDERS | SPARSE]
+    """List the sizes of everything that belongs to the dataset, and of nothing else in its folder [bytes]."""
+    names = [*_HEAD, *(f"{folder}/{shard_name(folder, shard)}" for shard in shards for folder in FOLDERS | SPARSE)]
     names += [f"{MERGED}/{name}" for name in list_names(out / MERGED) if whole and name.endswith(".parquet")]
     return {name: (out / name).stat().st_size for name in names if (out / name).is_file()}

@@ -33,16 +33,8 @@ class RobotCamera:
     ) -> None:
         """Render the still parts; every object of the scene may move.
 
-        Args:
-            scene: With all its objects.
-            arm: Beside it.
-            base: Of the arm, in the table frame.
-            size: Height and width of the pictures [px].
-            table: Seed of a texture for the table; None keeps its own.
-            lighting: Soft daylight by default.
-
-        Raises:
-            InputError: if the scene does not load, or has no table.
+        `base` is the arm's, in the table frame, `size` height and width [px], and `table` the seed of a texture for the
+        table; None keeps its own.
         """
         self._figure, self._base = ArmMeshes(arm), base
         objects = {str(item["object_id"]) for item in scene.meta["objects"]}
@@ -63,9 +55,7 @@ def _retexture_table(still: PaintedMeshes, scene: Scene, seed: int) -> PaintedMe
     board = still.meshes[index]
     c, s = np.cos(slab.yaw), np.sin(slab.yaw)
     along = (board.vertices[:, :2] - slab.center_xy) @ np.array([[c, -s], [s, c]]) / TILE_M
-    covered = TriangleMesh(
-        board.vertices, board.faces, texture=Texture(make_texture(seed, _TEXTURE_PX), along[board.faces])
-    )
+    texture = Texture(make_texture(seed, _TEXTURE_PX), along[board.faces])
     meshes, paints = list(still.meshes), list(still.paints)
-    meshes[index], paints[index] = covered, None
+    meshes[index], paints[index] = TriangleMesh(board.vertices, board.faces, texture=texture), None
     return replace(still, meshes=tuple(meshes), paints=tuple(paints))

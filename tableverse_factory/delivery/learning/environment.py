@@ -70,15 +70,10 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             camera: Height and width of the picture in each observation [px]; none by default.
             render_mode: `rgb_array` or None.
             render_size: Height and width of the pictures of `render` [px].
-
-        Raises:
-            InputError: as `PickPlaceSim`.
-            ConfigError: for an invalid argument, or more objects than `max_objects`.
         """
         if reward not in ("sparse", "dense") or render_mode not in (None, "rgb_array"):
-            raise ConfigError(
-                f"reward {reward!r}, render_mode {render_mode!r}: 'sparse' or 'dense', None or 'rgb_array'"
-            )
+            given = f"reward {reward!r}, render_mode {render_mode!r}"
+            raise ConfigError(f"{given}: 'sparse' or 'dense', None or 'rgb_array'")
         self.render_mode = render_mode
         self.sim = PickPlaceSim(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
         self._scene, self._reward = scene, reward
@@ -98,21 +93,13 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         self.observation_space = self._observation_space(len(arm.lower), arm.max_opening_m)
 
     def action_to_command(self, action: np.ndarray) -> np.ndarray:
-        """Convert an action to targets of the joints [rad] and the opening [m]. Shape (j + 1,).
-
-        Raises:
-            InputError: `bad_action` if it has another shape, or is not finite.
-        """
-        share = (np.clip(self._numbers("action", action), -1.0, 1.0) + 1.0) / 2.0
+        """Convert an action to targets of the joints [rad] and the opening [m]. Shape (j + 1,)."""
+        share = (np.clip(self._check_numbers("action", action), -1.0, 1.0) + 1.0) / 2.0
         return self._low + share * (self._high - self._low)
 
     def command_to_action(self, command: np.ndarray) -> np.ndarray:
-        """Convert a command, as in recorded trajectories, to an action. Shape (j + 1,).
-
-        Raises:
-            InputError: as `action_to_command`.
-        """
-        share = (self._numbers("command", command) - self._low) / (self._high - self._low)
+        """Convert a command, as in recorded trajectories, to an action. Shape (j + 1,)."""
+        share = (self._check_numbers("command", command) - self._low) / (self._high - self._low)
         return np.clip(2.0 * share - 1.0, -1.0, 1.0).astype(np.float32)
 
     def reset(
@@ -120,12 +107,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Restore the exported scene, varied as requested, with the arm at home.
 
-        Args:
-            seed: Seed of all draws from now on.
-            options: `variation` replaces the environment's for this episode.
-
-        Raises:
-            ConfigError: for another option, or an invalid variation.
+        `options["variation"]` replaces the environment's for this episode.
         """
         super().reset(seed=seed)
         if other := [name for name in options or {} if name != "variation"]:
@@ -140,12 +122,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return self._observation(state), self._info(state)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Execute one action for 1/50 s.
-
-        Raises:
-            InputError: as `action_to_command`.
-            gymnasium.error.ResetNeeded: before the first reset, and once the episode has ended.
-        """
+        """Execute one action for 1/50 s; `ResetNeeded` before the first reset, and once the episode has ended."""
         before = self._now.progress
         if self._steps > 0 and any(self._ends(self._now)):
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset()")
@@ -164,7 +141,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         ended = state.success or bool(state.failure)
         return ended, not ended and self._max_steps is not None and self._steps >= self._max_steps
 
-    def _numbers(self, name: str, values: np.ndarray) -> np.ndarray:
+    def _check_numbers(self, name: str, values: np.ndarray) -> np.ndarray:
         numbers = np.asarray(values, dtype=np.float64)
         if numbers.shape != self._low.shape or not np.isfinite(numbers).all():
             said = sanitize_line(np.array2string(numbers, precision=3, threshold=10), 120)
@@ -186,8 +163,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
 
     def _observation(self, state: SimState) -> dict[str, np.ndarray]:
         sample, joints = state.sample, len(self._low) - 1
-        opening = self.sim.opening()
-        robot = np.concatenate([sample.qpos[:joints], sample.qvel[:joints], [opening], sample.tcp])
+        robot = np.concatenate([sample.qpos[:joints], sample.qvel[:joints], [self.sim.opening()], sample.tcp])
         objects = np.zeros((self._rows, 7), dtype=np.float32)
         objects[: len(self.sim.object_ids)] = self.sim.poses()
         seen = {"state": robot.astype(np.float32), "objects": objects}
@@ -197,12 +173,11 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return seen if self._camera is None else {**seen, "camera": self._picture(self._camera)}
 
     def _picture(self, size: tuple[int, int]) -> Picture:
-        sample = self._now.sample
         if size not in self._cameras:
             station = self.sim.station
             self._cameras[size] = RobotCamera(self._scene, station.arm, station.base, size, *self._look)
         poses = dict(zip(self.sim.object_ids, self.sim.poses(), strict=True))
-        return self._cameras[size].picture(poses, sample.qpos)
+        return self._cameras[size].picture(poses, self._now.sample.qpos)
 
     @property
     def _now(self) -> SimState:
@@ -211,27 +186,14 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return self._state
 
     def _info(self, state: SimState) -> dict[str, Any]:
-        return {
-            "success": state.success,
-            "failure": state.failure,
-            "lifted": state.lifted,
-            "at_rest": state.at_rest,
-            "fingers": int(state.sample.pads).bit_count(),
-            "disturbed_m": state.disturbed_m,
-        }
+        told = {name: getattr(state, name) for name in ("success", "failure", "lifted", "at_rest", "disturbed_m")}
+        return {**told, "fingers": int(state.sample.pads).bit_count()}
 
 
 def make_environment(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
     """Make the environment from names alone, for `gymnasium.make` and worker processes.
 
-    Args:
-        dataset: As in `open_dataset`.
-        scene: Id of one of its scenes.
-        task: Id of one of its tasks.
-        options: As in `TableEnv`, except `max_steps`: Gymnasium itself truncates.
-
-    Raises:
-        ConfigError: as `TableEnv`, or for `max_steps`.
+    `scene` and `task` are ids; `options` are those of `TableEnv`, except `max_steps`: Gymnasium itself truncates.
     """
     if "max_steps" in options:
         raise ConfigError(f"max_steps {options['max_steps']!r}: gymnasium.make has max_episode_steps, -1 for no limit")

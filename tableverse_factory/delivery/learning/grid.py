@@ -66,12 +66,9 @@ class SceneGrid(Frozen):
         return render(parts, eye.camera, eye.camera_to_table, paints=colors).color
 
     def _joints(self, number: int) -> list[int]:
-        """List free joints of a scene."""
         free = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-        prefix = self.prefixes[number]
-        return [
-            int(joint) for joint in free if self.model.body(int(self.model.jnt_bodyid[joint])).name.startswith(prefix)
-        ]
+        bodies = [self.model.body(int(body)).name for body in self.model.jnt_bodyid[free]]
+        return [int(j) for j, name in zip(free, bodies, strict=True) if name.startswith(self.prefixes[number])]
 
 
 def build_scene_grid(scenes: Sequence[Scene], spacing_m: float | None = None, visuals: bool = False) -> SceneGrid:
@@ -84,7 +81,6 @@ def build_scene_grid(scenes: Sequence[Scene], spacing_m: float | None = None, vi
 
     Raises:
         InputError: if a scene does not load, or has another timestep than the first.
-        ConfigError: if there is no scene, or `spacing_m` is invalid or too small for the number of scenes.
     """
     if not scenes:
         raise ConfigError("no scenes: give at least one")
@@ -100,11 +96,8 @@ def build_scene_grid(scenes: Sequence[Scene], spacing_m: float | None = None, vi
         if k == 0:
             copy_simulation_settings(whole, child)
         elif child.option.timestep != whole.option.timestep:
-            raise InputError(
-                f"scene {scene.scene_id} has a timestep of {child.option.timestep:g} s, and the first one has "
-                f"{whole.option.timestep:g} s: one model has one",
-                "other_timestep",
-            )
+            steps = f"{child.option.timestep:g} s, and the first one has {whole.option.timestep:g} s"
+            raise InputError(f"scene {scene.scene_id} has a timestep of {steps}: one model has one", "other_timestep")
         _isolate_collisions(child, 1 << k % _BITS, first=k == 0)
         copy_simulation_settings(child, whole)
         whole.attach(child, frame=whole.worldbody.add_frame(pos=origins[k]), prefix=prefixes[k])
@@ -137,11 +130,7 @@ def _isolate_collisions(child: mujoco.MjSpec, bit: int, first: bool) -> None:
 
 
 def _choose_spacing(scenes: Sequence[Scene], asked_m: float | None) -> float:
-    """Check the requested spacing, or choose one that separates circles around whole tables.
-
-    Raises:
-        ConfigError: if it is invalid, or tables that share a collision bit would overlap.
-    """
+    """Check the requested spacing, or choose one that separates circles around whole tables [m]."""
     if asked_m is not None and not 0.0 < asked_m < np.inf:
         raise ConfigError(f"spacing_m {asked_m}: give a length above 0 m, or None")
     if asked_m is not None and len(scenes) <= _BITS:
@@ -149,9 +138,6 @@ def _choose_spacing(scenes: Sequence[Scene], asked_m: float | None) -> float:
     slabs = [read_slab(scene.files()) for scene in scenes]
     width = 2 * max(float(np.linalg.norm(slab.center_xy) + np.linalg.norm(slab.half_size_xy)) for slab in slabs)
     if asked_m is not None and asked_m < width:
-        needed = np.ceil(100 * width) / 100
-        raise ConfigError(
-            f"spacing_m {asked_m:g}: {len(scenes)} scenes would touch one another; "
-            f"give {needed:g} m or more, or at most {_BITS} scenes"
-        )
+        needed = f"give {np.ceil(100 * width) / 100:g} m or more, or at most {_BITS} scenes"
+        raise ConfigError(f"spacing_m {asked_m:g}: {len(scenes)} scenes would touch one another; {needed}")
     return width + _AISLE_M if asked_m is None else asked_m

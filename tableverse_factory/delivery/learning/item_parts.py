@@ -15,13 +15,7 @@ _BOUNDS = ObserveConfig()
 _RECORDED = ("command", "phase", "qpos", "qvel", "tcp", "object_pose")
 
 
-def _load_photograph(scene: Scene) -> np.ndarray | None:
-    """Load the input photograph, sRGB. Shape (h, w, 3) uint8."""
-    return _load_picture(scene, "observation/color.jpg", "RGB")
-
-
 def _load_masks(scene: Scene) -> np.ndarray | None:
-    """Load instance ids of the photograph, 0 = background. Shape (h, w) int32."""
     pixels = _load_picture(scene, "observation/masks.png", None)
     return None if pixels is None else pixels.astype(np.int32)
 
@@ -34,20 +28,9 @@ def _load_picture(scene: Scene, name: str, mode: str | None) -> np.ndarray | Non
     return decode_image(open_image(data, called, _BOUNDS, "bad_picture"), called, mode, "bad_picture")
 
 
-def _list_ids(scene: Scene) -> list[str]:
-    """List object ids, in the order of `labels` and `poses`."""
-    return [str(item["object_id"]) for item in scene.meta["objects"]]
-
-
-def _list_labels(scene: Scene) -> list[str]:
-    return [sanitize_line(str(item.get("label", "")), 200) for item in scene.meta["objects"]]
-
-
 def _list_poses(scene: Scene) -> np.ndarray:
-    """List exported position [m] and quaternion wxyz of each object in the table frame. Shape (n, 7) float64."""
-    return np.array([_read_settled_pose(scene, item) for item in scene.meta["objects"]], dtype=np.float64).reshape(
-        -1, 7
-    )
+    rows = [_read_settled_pose(scene, item) for item in scene.meta["objects"]]
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 def _read_settled_pose(scene: Scene, item: Mapping[str, Any]) -> list[float]:
@@ -75,11 +58,11 @@ def _list_motions(scene: Scene) -> list[dict[str, Any]]:
 
 
 PARTS: Mapping[str, Callable[[Scene], Any]] = {
-    "photograph": _load_photograph,
-    "masks": _load_masks,
-    "ids": _list_ids,
-    "labels": _list_labels,
-    "poses": _list_poses,
+    "photograph": lambda scene: _load_picture(scene, "observation/color.jpg", "RGB"),  # (h, w, 3) uint8, sRGB
+    "masks": _load_masks,  # instance ids, 0 = background, (h, w) int32
+    "ids": lambda scene: [str(item["object_id"]) for item in scene.meta["objects"]],  # in the order of `poses`
+    "labels": lambda scene: [sanitize_line(str(item.get("label", "")), 200) for item in scene.meta["objects"]],
+    "poses": _list_poses,  # settled, in the table frame: position [m] and quaternion wxyz, (n, 7) float64
     "meta": lambda scene: scene.meta,
     "xml": lambda scene: scene.xml,
     "files": lambda scene: scene.files(),
@@ -89,11 +72,7 @@ PARTS: Mapping[str, Callable[[Scene], Any]] = {
 
 
 def check_parts(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names unchanged.
-
-    Raises:
-        ConfigError: for an unknown name.
-    """
+    """Check that these are names of parts, and return them."""
     for name in names:
         if name not in PARTS:
             raise ConfigError(f"no part {sanitize_line(str(name), 60)!r} of a scene; there are {', '.join(PARTS)}")

@@ -21,16 +21,10 @@ class SceneDataset(IterableDataset):  # type: ignore[misc]
     def __init__(
         self, stream: SceneStream, rank: int | None = None, ranks: int | None = None, even: bool = False
     ) -> None:
-        """Take a rank's share.
+        """Take a rank's share of a stream of all scenes.
 
-        Args:
-            stream: Of all scenes.
-            rank: Of this process; by default that of `torch.distributed` when a loader is iterated.
-            ranks: Number of ranks.
-            even: Drop the last few scenes of each epoch, so that all ranks get equally many.
-
-        Raises:
-            ConfigError: if there is no such rank, or one of `rank` and `ranks` is given without the other.
+        By default `rank` and `ranks` are those of `torch.distributed` when a loader is iterated. `even` drops the last
+        few scenes of each epoch, so that all ranks get equally many.
         """
         if (rank is None) != (ranks is None):
             raise ConfigError(f"rank {rank} of ranks {ranks}: give both or neither")
@@ -50,12 +44,7 @@ class SceneDataset(IterableDataset):  # type: ignore[misc]
             self._here[1].set_epoch(epoch)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        """Iterate this process's share.
-
-        Raises:
-            InputError: if a loaded state is not of this share, or is in the middle of another epoch.
-            ConfigError: in a persistent worker's second epoch, and where the ranks are unknown.
-        """
+        """Iterate this process's share."""
         worker, share = get_worker_info(), self._of_rank()
         if worker is not None:
             if self._iterated() is not None:
@@ -68,11 +57,7 @@ class SceneDataset(IterableDataset):  # type: ignore[misc]
         return iter(share)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of this process's share.
-
-        Raises:
-            ConfigError: where nothing was iterated in this process, as with a loader's workers.
-        """
+        """Return the state of this process's share; ConfigError where it iterated nothing, as with workers."""
         if self._loaded is not None:
             return self._loaded
         share = self._iterated()

@@ -36,36 +36,19 @@ _UNMOVED_M = 1e-4  # displacement below which a relation is not recomputed
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimState(Frozen):
-    """State after a command.
-
-    Attributes:
-        sample: Measurements.
-        lifted: Whether the object was ever lifted by the fingers.
-        at_rest: Whether the object was at rest for the last `HOLD_S`.
-        success: Whether the task is done.
-        failure: `disturbed`, `fell` or `simulation_unstable` once it cannot succeed any more; else empty.
-        progress: From 0 to 1 (`learning.reward`).
-        disturbed_m: Largest displacement of any other object so far [m].
-    """
+    """State after a command."""
 
     sample: StateSample
-    lifted: bool
-    at_rest: bool
+    lifted: bool  # by the fingers, now or before
+    at_rest: bool  # for the last `HOLD_S`
     success: bool
-    failure: str
-    progress: float
-    disturbed_m: float
+    failure: str  # `disturbed`, `fell` or `simulation_unstable` once it cannot succeed any more; else empty
+    progress: float  # from 0 to 1 (`learning.reward`)
+    disturbed_m: float  # largest displacement of any other object so far [m]
 
 
 class PickPlaceSim:
-    """Simulation of one arm, scene and task.
-
-    Attributes:
-        station: Scene and arm, compiled.
-        goal: Success criterion.
-        instruction: Foreign text of the task, made printable.
-        step_s: Time between commands [s].
-    """
+    """Simulation of one arm, scene and task; `instruction` is foreign text, made printable."""
 
     def __init__(
         self,
@@ -83,14 +66,9 @@ class PickPlaceSim:
             task: Id of one of its tasks, or one of your own: `x_id`, `y_id` and `relation`.
             robot: As in `robots.registry.load_arm`.
             base: Pose of the arm's base in the table frame; by default that of the task's recorded trajectory, else the
-                best one from which both objects are reached.
+                best one from which both objects are reached (`no_base` if there is none).
             step_s: Time between commands [s].
             max_disturbed_m: Allowed displacement of any other object (`execution.success`) [m].
-
-        Raises:
-            InputError: `bad_task` if the scene has no such task, `no_base` if no base reaches both objects; or if the
-                scene does not load.
-            ConfigError: if there is no such robot, or `max_disturbed_m` is negative.
         """
         if not MIN_STEP_S <= step_s <= MAX_STEP_S:
             raise InputError(f"step_s {step_s}: give {MIN_STEP_S} to {MAX_STEP_S} s", "bad_step")
@@ -146,8 +124,7 @@ class PickPlaceSim:
     def step(self, command: Numbers) -> SimState:
         """Simulate until the servos' targets have moved in straight lines to a command.
 
-        Args:
-            command: Targets of the joints [rad], then the opening [m]; clipped to the arm's limits. Shape (j + 1,).
+        A command holds targets of the joints [rad], then the opening [m], clipped to the arm's limits. Shape (j + 1,).
         """
         arm = self.station.arm
         target = np.clip(command, [*arm.lower, 0.0], [*arm.upper, arm.max_opening_m])
@@ -193,7 +170,6 @@ class PickPlaceSim:
         return held
 
     def _find_recorded_base(self, scene: Scene, row: Mapping[str, Any]) -> Pose | None:
-        """Find this arm's base in the task's own trajectory."""
         for tried in scene.trajectory_rows():
             same = tried["task_id"] == row.get("task_id") and tried["robot"] == self.station.arm.name
             if same and tried["base_yaw_rad"] is not None:

@@ -34,7 +34,7 @@ Indices = Int64[np.ndarray, " n"]
 
 @dataclass(slots=True)
 class _Position:
-    """Progress of one iteration: scenes given, of which epoch."""
+    """Progress of one iteration."""
 
     epoch: int
     given: int = 0
@@ -67,11 +67,6 @@ class SceneStream:
             condition: On the columns of scenes/, as in `tableverse query --where`; scenes without files are skipped.
             shuffle: Size of the shuffle buffer (`shuffle_epoch`); 0 keeps the order of the table.
             seed: Of the shuffle.
-
-        Raises:
-            InputError: if there is no dataset, or its table cannot be read.
-            ConfigError: for an unknown part, or a negative `shuffle` or `seed`.
-            QueryError: for an unknown column, or a condition that does not parse.
         """
         if shuffle < 0 or seed < 0:
             raise ConfigError(f"shuffle {shuffle} and seed {seed}: give whole numbers from 0 on")
@@ -86,15 +81,9 @@ class SceneStream:
         return len(take_part(np.arange(len(self._index)), *self._part))
 
     def part(self, index: int, of: int, even: bool = False) -> Self:
-        """Return a separate stream of every `of`-th item, for one of `of` ranks or workers.
+        """Return a separate stream of every `of`-th item from `index` on, for one of `of` ranks or workers.
 
-        Args:
-            index: Part number, from 0.
-            of: Number of parts.
-            even: Drop the last few scenes of each epoch, so that all parts are equally long.
-
-        Raises:
-            ConfigError: if there is no such part, or a part is to be divided evenly.
+        `even` drops the last few scenes of each epoch, so that all parts are equally long.
         """
         if not 0 <= index < of:
             raise ConfigError(f"part {index} of {of}: parts are counted from 0")
@@ -120,7 +109,9 @@ class SceneStream:
         return self._items(self._place)
 
     def _items(self, place: _Position) -> Iterator[dict[str, Any]]:
-        for number in self._ordered(place.epoch)[place.given :]:
+        shards = self._index["shard"].to_numpy().astype(np.int64)
+        ordered = take_part(shuffle_epoch(shards, self._seed, place.epoch, self._shuffle), *self._part)
+        for number in ordered[place.given :]:
             item = self._item(int(number))
             place.given += 1
             yield item
@@ -132,11 +123,7 @@ class SceneStream:
         return {"epoch": place.epoch, "given": place.given, "part": list(self._part), "order": self._digest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume the next iteration at another stream's position.
-
-        Raises:
-            InputError: if the state is invalid, or of other scenes, another shuffle, seed or division.
-        """
+        """Resume the next iteration at another stream's position."""
         numbers = [state.get(key) if isinstance(state, dict) else None for key in ("epoch", "given")]
         if not all(isinstance(number, int) and number >= 0 for number in numbers):
             raise InputError(f"no state of a stream: it has {', '.join(_STATE_KEYS)}", "bad_state")
@@ -160,10 +147,6 @@ class SceneStream:
             return self._dataset.scenes.to_table(columns=names, filter=chosen).combine_chunks()
         except (pa.ArrowException, OSError) as error:
             raise InputError(f"{self._path}/scenes: does not read: {sanitize_line(str(error), 300)}") from None
-
-    def _ordered(self, epoch: int) -> Indices:
-        shards = self._index["shard"].to_numpy().astype(np.int64)
-        return take_part(shuffle_epoch(shards, self._seed, epoch, self._shuffle), *self._part)
 
     @property
     def _dataset(self) -> Dataset:
@@ -191,9 +174,8 @@ def shuffle_epoch(shards: Indices, seed: int, epoch: int, buffer: int) -> Indice
     """Shuffle all scenes of an epoch: a permutation of 0 to n - 1.
 
     Shards are shuffled, and a buffer mixes the scenes of consecutive shards: each next scene is drawn from `buffer`
-    waiting ones. Only indices wait, so a buffer costs no memory; it is bounded so that scenes read in succession lie in
-    few shards. With `buffer` 0 the order is that of the table, in every epoch. `shards` holds each scene's shard
-    number.
+    waiting ones, so that scenes read in succession lie in few shards. With `buffer` 0 the order is that of the table,
+    in every epoch. `shards` holds each scene's shard number.
     """
     if buffer == 0:
         return np.arange(len(shards), dtype=np.int64)

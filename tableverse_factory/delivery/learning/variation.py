@@ -48,14 +48,13 @@ def displace_objects(station: Station, data: mujoco.MjData, variation: Variation
     """
     if variation.position_m == 0.0 and variation.yaw_rad == 0.0:
         return
-    tried = copy.copy(data)
-    for name in _list_free_standing(station, tried):
-        at, body = station.object_qpos[name], station.object_bodies[name]
-        before, depth, center = (
-            tried.qpos[at : at + 7].copy(),
-            _measure_depth(station, tried, body),
-            tried.xipos[body].copy(),
-        )
+    tried, bodies = copy.copy(data), station.object_bodies
+    table = {int(mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_BODY, TABLE))}
+    free = [name for name in bodies if _find_touched_bodies(station, tried, bodies[name]) == table]
+    for name in free:
+        at, body = station.object_qpos[name], bodies[name]
+        before, center = tried.qpos[at : at + 7].copy(), tried.xipos[body].copy()
+        depth = _measure_depth(station, tried, body)
         standing = np.vstack([center, tried.contact.pos[_mask_contacts(station, tried, body)]])
         offsets = rng.uniform(-variation.position_m, variation.position_m, (_MAX_TRIES, 2))
         turns = rng.uniform(-variation.yaw_rad, variation.yaw_rad, _MAX_TRIES)
@@ -64,10 +63,8 @@ def displace_objects(station: Station, data: mujoco.MjData, variation: Variation
             if not _is_above_table(station, tried, _rotate_about_z(standing - center, turn) + center + shift):
                 continue
             tried.qpos[at : at + 7] = _move_pose(before, center, shift, float(turn))
-            if (
-                _find_touched_bodies(station, tried, body) == {_find_table(station)}
-                and _measure_depth(station, tried, body) <= depth
-            ):
+            touched = _find_touched_bodies(station, tried, body)
+            if touched == table and _measure_depth(station, tried, body) <= depth:
                 break
             tried.qpos[at : at + 7] = before
         mujoco.mj_fwdPosition(station.model, tried)
@@ -93,20 +90,8 @@ def _is_above_table(station: Station, data: mujoco.MjData, points: np.ndarray) -
     return bool((np.abs(along) <= station.model.geom_size[slab])[:, :2].all())
 
 
-def _list_free_standing(station: Station, data: mujoco.MjData) -> list[str]:
-    return [
-        name
-        for name, body in station.object_bodies.items()
-        if _find_touched_bodies(station, data, body) == {_find_table(station)}
-    ]
-
-
-def _find_table(station: Station) -> int:
-    return int(mujoco.mj_name2id(station.model, mujoco.mjtObj.mjOBJ_BODY, TABLE))
-
-
 def _find_touched_bodies(station: Station, data: mujoco.MjData, body: int) -> set[int]:
-    """Find bodies that a body touches now."""
+    """Find bodies that a body touches after positions are recomputed."""
     mujoco.mj_fwdPosition(station.model, data)
     pairs = station.model.geom_bodyid[data.contact.geom]
     return {int(other) for pair in pairs for other in pair if body in pair and other != body}
@@ -123,7 +108,7 @@ def _measure_depth(station: Station, data: mujoco.MjData, body: int) -> float:
 
 
 def draw_table_seed(rng: np.random.Generator) -> int:
-    """Draw a texture seed of the catalog."""
+    """Draw the seed of a texture of the catalog."""
     return int(rng.integers(TEXTURE_COUNT))
 
 

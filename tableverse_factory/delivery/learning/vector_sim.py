@@ -22,25 +22,12 @@ Control = Callable[[int, mujoco.MjModel, mujoco.MjData], None]
 
 
 class VectorSim:
-    """Models and data of scenes, in order, with threads that step them.
-
-    Attributes:
-        scene_ids: In order.
-        models: Compiled.
-        data: A state per scene, initially as exported.
-    """
+    """Models and data of scenes, in order, with threads that step them; `data` is initially as exported."""
 
     def __init__(self, scenes: Sequence[Scene], threads: int | None = None, visuals: bool = False) -> None:
-        """Compile every scene.
+        """Compile the scenes; one may be given several times.
 
-        Args:
-            scenes: May contain a scene more than once.
-            threads: Number of threads; by default the cores available to this process.
-            visuals: Keep visual geoms, for pictures.
-
-        Raises:
-            InputError: if a scene does not load.
-            ConfigError: if there is no scene, or no thread.
+        By default there are as many threads as this process has cores. `visuals` keeps visual geoms, for pictures.
         """
         threads = len(os.sched_getaffinity(0)) if threads is None else threads
         if not scenes or threads < 1:
@@ -51,12 +38,10 @@ class VectorSim:
         self._pool = ThreadPoolExecutor(threads)
 
     def step(self, steps: int = 1, control: Control | None = None) -> None:
-        """Step all scenes; larger batches of steps cost less.
+        """Step all scenes by their own timestep; larger batches of steps cost less.
 
-        Args:
-            steps: Of each model's own timestep.
-            control: Called before, per scene in a thread, with its index, model and data, in which it may set forces,
-                controls or states. Its exceptions are raised once all scenes have been stepped.
+        `control` is called before, per scene in a thread, with its index, model and data, in which it may set forces,
+        controls or states. Its exceptions are raised once all scenes have been stepped.
         """
 
         def advance(number: int) -> None:
@@ -82,11 +67,7 @@ class VectorSim:
 
 
 def load_scene_spec(scene: Scene, visuals: bool) -> mujoco.MjSpec:
-    """Load the specification of a scene, to edit and attach.
-
-    Raises:
-        InputError: if it does not load.
-    """
+    """Load the specification of a scene, to edit and attach."""
     try:
         spec = load_spec(scene.files())
     except InputError as error:
@@ -98,11 +79,7 @@ def load_scene_spec(scene: Scene, visuals: bool) -> mujoco.MjSpec:
 
 
 def compile_scene(scene: Scene, visuals: bool) -> mujoco.MjModel:
-    """Compile a scene, with or without visual geoms.
-
-    Raises:
-        InputError: if it does not load.
-    """
+    """Compile a scene, with or without visual geoms."""
     try:
         return load_scene_spec(scene, visuals).compile()
     except ValueError as error:
