@@ -1,21 +1,12 @@
 """Check of `--robot` against the robot of a dataset, before anything is written or replayed."""
 
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
+
 
 def check_robot_option(out: str, robot: str | None, needed: bool) -> None:
-    """Refuse a robot that has no effect or differs from the dataset's, and a missing one that is needed.
-
-    Args:
-        out: The dataset.
-        robot: Value of `--robot`.
-        needed: Whether the command needs the file of a robot that came from one.
-
-    Raises:
-        InputError: saying what to give; or if the dataset's record is unreadable.
-        ConfigError: if the given file is no MJCF.
-    """
+    """Refuse a robot that has no effect or differs from the dataset's, and a missing one whose file is `needed`."""
     from schemas.config import Config
-    from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.robotics.robots.recorded import record_robot
     from tableverse_factory.robotics.robots.registry import ARMS

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.bench_cpu_time import bench_stages, bench_trajectories
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
-from tableverse_factory.cli.bench_stages import bench_stages
-from tableverse_factory.cli.bench_trajectories import bench_trajectories
-from tableverse_factory.cli.options import AsJson, ConfigFile
-from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
+from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon
+from tableverse_factory.cli.tables import print_figures, print_json
+from tableverse_factory.core.cache_dir import get_cache_dir
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.decompose import PieceScore
@@ -32,10 +32,6 @@ Truth = Annotated[
 Methods = Annotated[
     str, typer.Option(help="Methods, separated by commas; by default all but `settle alone`, the settle stage alone.")
 ]
-Epsilon = Annotated[
-    float,
-    typer.Option("--epsilon", min=0.0, help="Depth beyond which objects collide [m], beside export.epsilon_m."),
-]
 BurstPicture = Annotated[
     Path | None,
     typer.Option(help="Draw the methods side by side, on the layout that the first one bursts most, as a PNG file."),
@@ -55,10 +51,11 @@ def bench_lccr(
 ) -> None:
     """Compare methods that remove collisions: what collides, rests and moves, which relations hold, and the cost.
 
+    Collisions are counted beyond --epsilon and beyond export.epsilon_m.
+
     Example: `tableverse synth demo --kind layouts && tableverse bench lccr demo/layouts --truth demo/truth`
     """
     from tableverse_factory.cli.progress_bar import count_progress
-    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.bench.ablation_picture import write_ablation
     from tableverse_factory.evaluation.bench.layouts import find_layouts
@@ -78,15 +75,9 @@ def bench_lccr(
     if as_json:
         print_json(summaries)
     else:
-        _show_summaries(summaries)
-
-
-def _show_summaries(summaries: dict[str, dict[str, float | None]]) -> None:
-
-    table = make_figures_table("", *summaries)
-    for row in next(iter(summaries.values())):
-        table.add_row(row, *(_format_figure(values[row]) for values in summaries.values()))
-    print_table(table)
+        measures = next(iter(summaries.values()))
+        rows = ([name, *(_format_figure(values[name]) for values in summaries.values())] for name in measures)
+        print_figures(["", *summaries], rows)
 
 
 def _format_figure(value: float | None) -> str:
@@ -108,8 +99,6 @@ def bench_decompose(
 
     Example: `tableverse bench decompose meshes --most 8`
     """
-    from dataclasses import asdict
-
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.evaluation.bench.decompose import bench_decompose, find_meshes, summarize_pieces
 
@@ -119,18 +108,17 @@ def bench_decompose(
         scores = bench_decompose(files, names, done)
     overall = summarize_pieces(scores, names)
     if as_json:
-        print_json({"meshes": [asdict(score) for score in scores], "together": [asdict(score) for score in overall]})
+        print_json({"meshes": scores, "together": overall})
     else:
         _show_pieces([*scores, *overall])
 
 
 def _show_pieces(scores: list["PieceScore"]) -> None:
-
-    figures = ("CPU s", "faster", "pieces", "volume", "error %", "Hausdorff %", "cavity kept %")
-    table = make_figures_table("mesh", "method", *figures)
+    rows = []
     for s in scores:
-        counts = (f"{s.cpu_s:.1f}", f"{s.faster:.1f}", str(s.pieces), f"{s.volume_ratio:.2f}")
+        counts = (f"{s.cpu_s:.1f}", f"{s.faster:.1f}", s.pieces, f"{s.volume_ratio:.2f}")
         shares = (f"{100 * s.volume_error:.0f}", f"{100 * s.hausdorff:.1f}", f"{100 * s.cavity_kept:.0f}")
-        table.add_row(s.mesh, s.method, *counts, *shares)
-    print_table(table)
+        rows.append((s.mesh, s.method, *counts, *shares))
+    figures = ("CPU s", "faster", "pieces", "volume", "error %", "Hausdorff %", "cavity kept %")
+    print_figures(("mesh", "method", *figures), rows)
     print("together: sums of CPU s and pieces, means of the rest; Hausdorff in % of the longest side of the mesh")

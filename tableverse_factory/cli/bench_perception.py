@@ -1,13 +1,14 @@
 """`tableverse bench perception | placement | completion`: comparison of masks, poses and meshes with the truth."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
-from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
+from tableverse_factory.cli.tables import print_figures, print_json
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.completion import CompletionScore
@@ -31,8 +32,6 @@ def bench_perception(
 
     Example: `tableverse bench perception captures --detector geometric`
     """
-    from dataclasses import asdict
-
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
 
@@ -44,7 +43,7 @@ def bench_perception(
     else:
         _show_masks(rows, detector)
         if any(folder.glob("*/truth.json")):
-            _show_placements(folder, (("replay", "carved"),), config)
+            _show_placements(folder, (("replay", "carved"),), config, as_json=False)
 
 
 def bench_placement(
@@ -82,27 +81,23 @@ def bench_completion(
 
     Example: `tableverse bench completion meshes`
     """
-    from dataclasses import asdict
-
     from tableverse_factory.evaluation.bench.completion import bench_completion
 
     scores = bench_completion(folder, seed)
     if as_json:
-        print_json([asdict(score) for score in scores])
+        print_json(scores)
     else:
         _show_completions(scores)
 
 
 def _show_completions(scores: list["CompletionScore"]) -> None:
     title = "two views of each mesh: IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
-    table = make_figures_table("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
+    columns = ("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
     ours = [score for score in scores if score.method.startswith("carved")]
     groups["carved, as chosen"] = ours
     groups |= {name: [s for s in ours if s.method == name] for name in sorted({s.method for s in ours})}
-    for method, of_method in groups.items():
-        table.add_row(method, str(len(of_method)), *_completion_figures(of_method))
-    print_table(table, title)
+    print_figures(columns, ((name, len(its), *_completion_figures(its)) for name, its in groups.items()), title)
     hollow = sorted({score.mesh for score in scores if score.hollow})
     print(f"hollow: {', '.join(hollow) or 'none'}")
 
@@ -130,11 +125,7 @@ def _select_known(name: str, known: tuple[str, ...]) -> tuple[str, ...]:
     return (name,) if name else known
 
 
-def _show_placements(
-    folder: Path, ways: tuple[tuple[str, str], ...], config: Path | None, as_json: bool = False
-) -> None:
-    from dataclasses import asdict
-
+def _show_placements(folder: Path, ways: tuple[tuple[str, str], ...], config: Path | None, as_json: bool) -> None:
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.bench.placement import bench_placement
 
@@ -152,11 +143,11 @@ def _show_placements(
 
 def _show_way(title: str, entries: list["PlacementError"]) -> None:
     placed = [entry for entry in entries if entry.completion]
-    table = make_figures_table("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
     kinds = {kind: [e for e in placed if e.completion == kind] for kind in sorted({e.completion for e in placed})}
-    for kind, of_kind in {**(kinds if len(kinds) > 1 else {}), "all": placed}.items():
-        table.add_row(kind, str(len(of_kind)), *_placement_figures(of_kind))
-    print_table(table, f"{title}: median / 90 % of the errors of position, of heading where turned, and size")
+    groups = {**(kinds if len(kinds) > 1 else {}), "all": placed}
+    columns = ("completion", "n", "mm", "°", "turned", "size %", "fit mm", "mm/std", "°/std")
+    rows = ((kind, len(of_kind), *_placement_figures(of_kind)) for kind, of_kind in groups.items())
+    print_figures(columns, rows, f"{title}: median / 90 % of the errors of position, of heading where turned, and size")
     print(f"not placed: {len(entries) - len(placed)} of {len(entries)} true objects, hidden ones included")
 
 
@@ -182,8 +173,6 @@ def _placement_figures(entries: list["PlacementError"]) -> list[str]:
 
 def _derive_scores(row: "MaskScore") -> dict[str, object]:
     """Compute the scores that follow from the counts of a row."""
-    from dataclasses import asdict
-
     pairs = row.containment
     shares = {"precision": pairs.precision, "recall": pairs.recall} if pairs else {}
     return {
@@ -196,14 +185,14 @@ def _derive_scores(row: "MaskScore") -> dict[str, object]:
 
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:
     known = rows[-1].containment is not None
-    names = ("found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s")
-    table = make_figures_table("capture", *names, *(["contained: true/found/correct"] if known else []))
+    columns = ["capture", "found", "true", "mean IoU", "recall@0.5", "overlap F", "CPU s"]
+    lines = []
     for row in rows:
         figures = [f"{row.mean_iou:.3f}", f"{row.recall:.3f}", f"{row.overlap_f:.3f}", f"{row.cpu_s:.2f}"]
         pairs = row.containment
         counts = [f"{pairs.true}/{pairs.found}/{pairs.correct}" if pairs else ""] if known else []
-        table.add_row(row.name, str(row.found), str(row.truth), *figures, *counts, row.reason)
-    print_table(table, f"masks by {detector}")
+        lines.append((row.name, row.found, row.truth, *figures, *counts, row.reason))
+    print_figures([*columns, *(["contained: true/found/correct"] if known else [])], lines, f"masks by {detector}")
     total = rows[-1].containment
     if total is not None:
         shares = f"precision {total.precision:.3f}, recall {total.recall:.3f}".replace("nan", "-")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.cli.options import AsJson
-from tableverse_factory.cli.tables import make_figures_table, print_json, print_table
+from tableverse_factory.cli.tables import print_figures, print_json
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.factory import FactoryRun
@@ -28,7 +28,6 @@ def bench_factory(
     Example: `tableverse bench factory --sizes 300,1000,3000 --burning 100`
     """
     import sys
-    from dataclasses import asdict
 
     from tableverse_factory.evaluation.bench.factory import bench_factory, compare_runs
 
@@ -39,7 +38,7 @@ def bench_factory(
         runs.append(run)
     ratios = compare_runs(runs)
     if as_json:
-        print_json({"runs": [asdict(run) for run in runs], "ratios": asdict(ratios)})
+        print_json({"runs": runs, "ratios": ratios})
         return
     _show_runs(runs)
     print(f"marginal CPU time per scene, larger builds over smaller ones: {ratios.linear:.2f}")
@@ -50,15 +49,14 @@ def bench_factory(
 
 
 def _show_runs(runs: list["FactoryRun"]) -> None:
-    table = make_figures_table(
-        "build", "workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver", "peak MB", "MB per 10,000"
-    )
+    rows = []
     for run in runs:
         cpu = (f"{run.total_cpu_ms:.2f}", f"{run.cpu_ms.get('driver', 0.0):.2f}")
         rates = (f"{run.rate:.0f}", f"{run.steady_rate:.0f}")
         memory = (f"{run.peak_mb:.0f}", f"{run.growth_mb:+.1f}")
-        table.add_row(run.what, str(run.workers), str(run.scenes), *rates, *cpu, *memory)
-    print_table(table)
+        rows.append((run.what, run.workers, run.scenes, *rates, *cpu, *memory))
+    figures = ("workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver", "peak MB", "MB per 10,000")
+    print_figures(("build", *figures), rows)
     print("CPU ms: per scene over all processes, and the share of the driver; flowing: after the first finished scene")
 
 
@@ -75,7 +73,6 @@ def bench_query(
     """
     import sys
     import tempfile
-    from dataclasses import asdict
 
     from tableverse_factory.dataset.consolidated_tables import write_merged_tables
     from tableverse_factory.evaluation.bench.query import bench_query, write_query_dataset
@@ -90,17 +87,16 @@ def bench_query(
             if (Path(folder) / "out" / "merged").exists():
                 times.append(bench_query(Path(folder) / "out", "the same, merged"))
     if as_json:
-        print_json([asdict(entry) for entry in times])
+        print_json(times)
     else:
         _show_times(times)
 
 
 def _show_times(times: list["QueryTimes"]) -> None:
-    table = make_figures_table(
-        "dataset", "shards", "scenes", "objects", "filter ms", "CPU ms", "anew", "count", "scene", "first scene"
-    )
+    rows = []
     for t in times:
         figures = (t.filter_ms, t.cpu_ms, t.anew_ms, t.count_ms, t.scene_ms, t.first_ms)
-        table.add_row(t.what, str(t.shards), str(t.scenes), str(t.objects), *(f"{value:.1f}" for value in figures))
-    print_table(table)
+        rows.append((t.what, t.shards, t.scenes, t.objects, *(f"{value:.1f}" for value in figures)))
+    names = ("shards", "scenes", "objects", "filter ms", "CPU ms", "anew", "count", "scene", "first scene")
+    print_figures(("dataset", *names), rows)
     print("medians in ms; anew and first scene include opening the dataset")

@@ -5,22 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli import options
 from tableverse_factory.cli.completions import complete_stages
-from tableverse_factory.cli.options import (
-    Address,
-    ConfigFile,
-    Executor,
-    ExecutorName,
-    Limit,
-    Manifest,
-    MaxCalls,
-    MaxUsd,
-    Metrics,
-    Overrides,
-    Pools,
-    Shards,
-    Workers,
-)
 
 if TYPE_CHECKING:
     from workers.progress.tally import DisplayGroup
@@ -31,19 +17,19 @@ OVER_BUDGET = 4
 
 
 def build(
-    manifest: Manifest,
+    manifest: options.Manifest,
     out: Annotated[
         str,
         typer.Argument(
             metavar="OUT", help="The dataset, a folder or s3://bucket/prefix; begun before, the build goes on."
         ),
     ],
-    config: ConfigFile = None,
-    overrides: Overrides = None,
-    executor: Executor = ExecutorName.RAY,
-    workers: Workers = None,
-    address: Address = None,
-    pools: Pools = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    executor: options.Executor = "ray",
+    workers: options.Workers = None,
+    address: options.Address = None,
+    pools: options.Pools = None,
     from_stage: Annotated[
         str | None,
         typer.Option(
@@ -55,18 +41,17 @@ def build(
         ),
     ] = None,
     stages: Annotated[
-        str | None,
-        typer.Option(metavar="+trajectories", help="Add trajectories for the tasks of every scene."),
+        str | None, typer.Option(metavar="+trajectories", help="Add trajectories for the tasks of every scene.")
     ] = None,
-    limit: Limit = None,
-    shards: Shards = None,
-    max_usd: MaxUsd = None,
-    max_calls: MaxCalls = None,
+    limit: options.Limit = None,
+    shards: options.Shards = None,
+    max_usd: options.MaxUsd = None,
+    max_calls: options.MaxCalls = None,
     keep: Annotated[
         bool,
         typer.Option(help="Keep what every stage gave, in OUT/.stages, when its shard is written: --from needs it."),
     ] = True,
-    metrics: Metrics = None,
+    metrics: options.Metrics = None,
 ) -> None:
     """Build the dataset, or go on with it.
 
@@ -88,7 +73,7 @@ def build(
         out,
         config=config,
         overrides=overrides or [],
-        executor=executor.value,
+        executor=executor,
         workers=workers,
         address=address,
         pools=pools,
@@ -118,11 +103,7 @@ def make_display(out: str, metrics: Path | None) -> "DisplayGroup":
 
 
 def report_summary(summary: "BuildSummary", out: str) -> None:
-    """Print how a build ended.
-
-    Raises:
-        typer.Exit: with the exit code, unless it is 0.
-    """
+    """Print how a build ended, and end the process with its exit code unless that is 0."""
     from tableverse_factory.core.text import pluralize
     from tableverse_factory.dataset.model_costs import format_cost
     from workers.driver.signals import STOPPED_MESSAGE
@@ -132,12 +113,11 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
         print(f"{tally.accounted} of {pluralize(tally.total, 'scene')} accounted for; {STOPPED_MESSAGE}")
         raise typer.Exit(128 + summary.signal)
     state = summary.read_state()
+    left = pluralize(state.remaining, "scene")
     if summary.over_budget is not None:
         print(f"the budget is spent: {format_cost(summary.over_budget)}, in all runs of this dataset")
-        left = pluralize(state.remaining, "scene")
         print(f"still to do: {left}; run the same command with a larger --max-usd or --max-calls")
     elif state.remaining > tally.postponed:
-        left = pluralize(state.remaining, "scene")
         print(f"still to do: {left}; run it again, without --limit or --shards for all of them")
         print(f"rows and files appear when their shard is whole: {state.committed} of {state.shards} shards are")
     if tally.before == tally.total:
@@ -149,8 +129,8 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
     if state.failed:
         print(f"see why: tableverse failures {out}")
     if tally.postponed:
-        left = pluralize(tally.postponed, "scene")
-        print(f"left for a later run: {left}, because a model did not answer; run it again for them")
+        later = pluralize(tally.postponed, "scene")
+        print(f"left for a later run: {later}, because a model did not answer; run it again for them")
     if summary.over_budget is not None:
         raise typer.Exit(OVER_BUDGET)
     if state.failed or tally.postponed:

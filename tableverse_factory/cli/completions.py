@@ -5,8 +5,7 @@ from pathlib import Path
 
 from typer import Context
 
-MAX_WORDS = 200
-"""Most words that are offered at once."""
+MAX_WORDS = 200  # offered at once
 
 
 def complete_scene_ids(context: Context, incomplete: str) -> list[str]:

@@ -5,12 +5,11 @@ from pathlib import Path
 import typer
 
 from tableverse_factory.cli.options import AsJson
+from tableverse_factory.cli.tables import print_json
 from tableverse_factory.core.cache_dir import get_cache_dir
 
 
-def doctor(
-    as_json: AsJson = False,
-) -> None:
+def doctor(as_json: AsJson = False) -> None:
     """Check this machine, and say what to do about what is missing.
 
     Checks rendering, system libraries, Ray, GPU, extras, cache and disk. Exit code 0 only if everything that a build
@@ -18,9 +17,6 @@ def doctor(
 
     Example: `tableverse doctor`
     """
-    import json
-    from dataclasses import asdict
-
     from rich.console import Console
     from rich.text import Text
 
@@ -37,7 +33,7 @@ def doctor(
                 console.print(Text(f"    {check.advice}"))
     ready = all(check.ok for check in checks if check.required)
     if as_json:
-        print(json.dumps({"ready": ready, "checks": [asdict(check) for check in checks]}, indent=2))
+        print_json({"ready": ready, "checks": checks})
     else:
         console.print("ready to build" if ready else "not ready: mend what has a ✗")
     raise typer.Exit(0 if ready else 1)

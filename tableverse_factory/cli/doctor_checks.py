@@ -83,16 +83,10 @@ print(ray.__version__, "starts and answers")
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check.
-
-    Attributes:
-        required: Whether a build needs it.
-        found: What was found, or the error.
-        advice: Remedy; empty if all is well.
-    """
+    """Result of one check, with a remedy unless all is well."""
 
     name: str
-    required: bool
+    required: bool  # by a build
     ok: bool
     found: str
     advice: str = ""
@@ -100,7 +94,9 @@ class Check:
 
 def run_checks(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
     """Run the checks one after another; takes some seconds, mostly for Ray."""
-    yield _check_python()
+    is_new = sys.version_info >= (3, 11)
+    found = ".".join(map(str, sys.version_info[:3]))
+    yield Check("Python", True, is_new, found, "" if is_new else "install 3.11 or newer")
     yield from _check_libraries()
     yield _check_script("simulator (MuJoCo)", _SIMULATOR, "pip install --force-reinstall mujoco")
     yield _check_script("renderer (Embree, on the CPU)", _RENDERER, "install the system libraries above")
@@ -118,11 +114,6 @@ def run_checks(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
     yield _check_free_space("disk, cache", cache_dir)
     yield _check_free_space("disk, here", out_dir)
     yield _check_memory()
-
-
-def _check_python() -> Check:
-    ok = sys.version_info >= (3, 11)
-    return Check("Python", True, ok, ".".join(map(str, sys.version_info[:3])), "" if ok else "install 3.11 or newer")
 
 
 def _check_libraries() -> Iterator[Check]:
@@ -171,7 +162,6 @@ def _check_gpu() -> Check:
 
 
 def _check_extras() -> Iterator[Check]:
-    """Check the extras and other optional packages."""
     for extra, (packages, gives) in EXTRAS.items():
         found = {package: _find_version(package) for package in packages}
         ok = all(found.values())
@@ -201,13 +191,8 @@ def _check_writable(folder: Path) -> Check:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")
     except OSError as error:
-        return Check(
-            "cache",
-            True,
-            False,
-            f"{folder}: {error.strerror}",
-            "make it writable, or set TABLEVERSE_CACHE to another folder",
-        )
+        advice = "make it writable, or set TABLEVERSE_CACHE to another folder"
+        return Check("cache", True, False, f"{folder}: {error.strerror}", advice)
     return Check("cache", True, True, str(folder))
 
 

@@ -1,10 +1,14 @@
 """`tableverse estimate`: cost of a larger build, from the timings of this one."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.options import AsJson, BuiltOut, Pools
+from tableverse_factory.cli.tables import make_table, print_json
+from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.text import describe_validation_error, sanitize_line
 
 if TYPE_CHECKING:
     from schemas.config import Config
@@ -39,7 +43,7 @@ def estimate(
     """
     from tableverse_factory.core.pools_file import load_pools
     from tableverse_factory.core.storage.files import parse_path
-    from tableverse_factory.dataset.cost_estimate import PRICES, parse_amounts
+    from tableverse_factory.dataset.cost_estimate import LEVEL, PRICES, parse_amounts
     from tableverse_factory.dataset.cost_estimate import estimate_cost as compute
     from tableverse_factory.pipeline import WITH_TRAJECTORIES
     from workers.progress.stage_costs import collect_measurements
@@ -51,20 +55,15 @@ def estimate(
     timings = collect_measurements(place, pool_of)
     found = compute(timings, scenes, load_pools(pools, _read_config(place)), stated, given)
     if as_json:
-        import json
-
-        print(json.dumps(_to_dict(found), indent=2, allow_nan=False))
+        print_json({"level": LEVEL, **asdict(found)})
     else:
         _print_estimate(found, stated)
 
 
 def _read_config(place: "StoragePath") -> "Config":
-    """Read the configuration of the build in OUT."""
     from pydantic import ValidationError
 
     from schemas.config import Config
-    from tableverse_factory.core.errors import ConfigError
-    from tableverse_factory.core.text import describe_validation_error
     from tableverse_factory.run_record import read_run
 
     path = place / "run.json"
@@ -75,8 +74,6 @@ def _read_config(place: "StoragePath") -> "Config":
 
 
 def _parse_cluster(text: str | None) -> "ClusterSize | None":
-    """Parse `--cluster`."""
-    from tableverse_factory.core.errors import ConfigError
     from tableverse_factory.dataset.cost_estimate import ClusterSize, parse_amounts
 
     if text is None:
@@ -87,32 +84,18 @@ def _parse_cluster(text: str | None) -> "ClusterSize | None":
     return ClusterSize(**amounts)
 
 
-def _to_dict(found: "CostEstimate") -> dict[str, Any]:
-    from dataclasses import asdict
-
-    from tableverse_factory.dataset.cost_estimate import LEVEL
-
-    return {"level": LEVEL, **asdict(found)}
-
-
 def _print_estimate(found: "CostEstimate", cluster: "ClusterSize | None") -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    from tableverse_factory.core.text import sanitize_line
     from workers.progress.table import format_seconds
 
     console = Console(markup=False)
-    table = Table("", box=None, pad_edge=False)
-    for name in ("estimate", "from", "to"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = make_table("", figures=("estimate", "from", "to"))
     for name, cells in _make_rows(found, cluster):
         table.add_row(name, *cells)
     console.print(f"{found.scenes} scenes, estimated from {found.measured}", highlight=False)
     console.print(table)
-    stages = Table("stage", box=None, pad_edge=False, title="per scene that enters the build", title_justify="left")
-    for name in ("CPU", "wall", "from", "to"):
-        stages.add_column(name, justify="right", no_wrap=True)
+    stages = make_table("stage", figures=("CPU", "wall", "from", "to"), title="per scene that enters the build")
     for name, (cpu, wall) in found.stages.items():
         stages.add_row(name, *(format_seconds(value) for value in (cpu.value, wall.value, wall.low, wall.high)))
     console.print(stages)
@@ -139,12 +122,8 @@ def _make_rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tup
     where = "" if cluster is None else f"{cluster.cpus:g} CPUs" + (f", {cluster.gpus:g} GPUs" if cluster.gpus else "")
     for name, hours in ((f"wall time on {where}", found.wall_hours), ("  without waiting", found.least_wall_hours)):
         if hours is not None:
-            cells = (
-                format_duration(hours.value * 3600),
-                format_duration(hours.low * 3600),
-                format_duration(hours.high * 3600),
-            )
-            rows.append((name, cells))
+            low, high = format_duration(hours.low * 3600), format_duration(hours.high * 3600)
+            rows.append((name, (format_duration(hours.value * 3600), low, high)))
     rows += [(f"cost of {name}", _format_range(cost)) for name, cost in found.costs.items()]
     return rows
 

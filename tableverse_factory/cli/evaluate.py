@@ -7,6 +7,11 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon, Overrides
+from tableverse_factory.cli.tables import print_figures, print_json
+from tableverse_factory.core.cache_dir import get_cache_dir
+from tableverse_factory.core.text import sanitize_line
+
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.methods.collisions import MethodCollisions
     from tableverse_factory.evaluation.methods.layout import SceneLayout
@@ -22,15 +27,11 @@ Methods = Annotated[
 ]
 Paths = Annotated[list[Path] | None, typer.Argument(help="Methods, as in `evaluate collisions`.")]
 Reference = Annotated[
-    Path | None,
-    typer.Option(help="Folder of the real pictures; by default, those in a dataset.", file_okay=False),
+    Path | None, typer.Option(help="Folder of the real pictures; by default, those in a dataset.", file_okay=False)
 ]
 Rounds = Annotated[int, typer.Option(min=1, max=12, help="Questions per scene, at most one per method.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the order of columns and of the intervals.")]
 Cell = Annotated[int, typer.Option(min=64, max=1024, help="Side of a cell of the grid [px].")]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML whose section `curate` names the judge.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", help="A key of the configuration.", metavar="KEY=VALUE")]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON document instead of a table.")]
 
 
 @evaluate.command("collisions")
@@ -40,9 +41,7 @@ def evaluate_collisions(
         typer.Argument(help="Datasets, layouts, GLB or MJCF scenes, or folders of them; named after their folder."),
     ] = None,
     method: Methods = None,
-    epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="Depth beyond which objects collide [m].")
-    ] = 0.0001,
+    epsilon_m: Epsilon = 0.0001,
     meshes_only: Annotated[
         bool, typer.Option("--meshes-only", help="Skip the convex pieces, which take time to make.")
     ] = False,
@@ -54,9 +53,6 @@ def evaluate_collisions(
 
     Example: `tableverse evaluate collisions --method ours=out --method midi=midi/ --epsilon 0.001`
     """
-    import json
-
-    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.evaluation.methods.collisions import measure_method
     from tableverse_factory.evaluation.methods.methods import parse_methods
     from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, find_scenes
@@ -69,7 +65,7 @@ def evaluate_collisions(
         for name, its in sources.items()
     ]
     if as_json:
-        print(json.dumps({"epsilon_m": epsilon_m, "methods": [each.as_json() for each in measured]}, indent=1))
+        print_json({"epsilon_m": epsilon_m, "methods": [each.as_json() for each in measured]}, indent=1)
     else:
         _show_collisions(measured, epsilon_m)
     if any(scene.error for each in measured for scene in each.scenes):
@@ -79,28 +75,23 @@ def evaluate_collisions(
 def _show_collisions(methods: "list[MethodCollisions]", epsilon_m: float) -> None:
     import numpy as np
 
-    from tableverse_factory.cli.tables import make_figures_table, print_table
-
-    title = f"scenes in which two objects overlap by more than {1e3 * epsilon_m:g} mm"
-    figures = ("scenes", "objects", "colliding %", "95 %", "on pieces %", "median mm", "deepest mm")
-    table = make_figures_table("method", *figures)
+    rows = []
     for each in methods:
         depths = [1e3 * scene.depth_m for scene in each.measured] or [float("nan")]
         low, high = each.interval() or (float("nan"), float("nan"))
         interval = f"{100 * low:.0f}–{100 * high:.0f}"
         rates = _percent(each.rate()), interval, _percent(each.piece_rate())
         spread = f"{np.median(depths):.2f}", f"{max(depths):.2f}"
-        counts = str(len(each.measured)), str(sum(scene.objects for scene in each.measured))
-        table.add_row(_one_line(each.method, 40), *counts, *rates, *spread)
-    print_table(table, title)
+        counts = len(each.measured), sum(scene.objects for scene in each.measured)
+        rows.append((sanitize_line(each.method, 40), *counts, *rates, *spread))
+    figures = ("scenes", "objects", "colliding %", "95 %", "on pieces %", "median mm", "deepest mm")
+    title = f"scenes in which two objects overlap by more than {1e3 * epsilon_m:g} mm"
+    print_figures(("method", *figures), rows, title)
     for each in methods:
         if each.dropped:
-            print(_one_line(f"{each.method}: without {each.dropped} scenes that the factory dropped"))
-        _print_first(
-            _one_line(f"not measured: {each.method}: {scene.name}: {scene.error}")
-            for scene in each.scenes
-            if scene.error
-        )
+            print(sanitize_line(f"{each.method}: without {each.dropped} scenes that the factory dropped", 300))
+        failed = [scene for scene in each.scenes if scene.error]
+        _print_first(f"not measured: {each.method}: {scene.name}: {scene.error}" for scene in failed)
 
 
 def _percent(share: float | None) -> str:
@@ -123,13 +114,12 @@ def evaluate_gpt_score(
 ) -> None:
     """Let a model mark the scenes of every method against the real picture, columns shuffled.
 
-    Writes grids/, answers/ (for `curate.judge=replay`) and gpt-score.json, for the scenes that all methods have. Exit
-    code 1 if a question got no valid answer.
+    The section `curate` of the configuration names the judge. Writes grids/, answers/ (for `curate.judge=replay`) and
+    gpt-score.json, for the scenes that all methods have. Exit code 1 if a question got no valid answer.
 
     Example: `tableverse evaluate gpt-score --method ours=out --method midi=midi/ --reference pictures --out score
     --rounds 2 --set curate.judge=gemini --set curate.model=gemini-2.5-pro --set curate.key_env=GEMINI_API_KEY`
     """
-    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.methods.comparison import check_shared_scenes, match_methods
     from tableverse_factory.evaluation.methods.grid_judges import make_grid_judge
@@ -167,28 +157,24 @@ def _report_score(votes: "VoteResults", seed: int, out: Path, as_json: bool) -> 
 
 
 def _show_score(votes: "VoteResults", seed: int) -> None:
-    from tableverse_factory.cli.tables import make_figures_table, print_table
     from tableverse_factory.evaluation.methods.score import compute_rank_by_column, compute_results, format_interval
     from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
     title = f"marks of 1 to 10 and mean rank, with 95 % intervals, from {len(votes.votes)} answers"
-    table = make_figures_table("method", *(name.replace("_", " ") for name in METRICS))
-    for method, by_metric in compute_results(votes, seed).items():
-        table.add_row(_one_line(method, 40), *(format_interval(by_metric[metric]) for metric in METRICS))
-    print_table(table, title)
+    rows = (
+        (sanitize_line(method, 40), *(format_interval(marks[metric]) for metric in METRICS))
+        for method, marks in compute_results(votes, seed).items()
+    )
+    print_figures(["method", *(name.replace("_", " ") for name in METRICS)], rows, title)
     places = (f"{letter} {rank:.2f}" for letter, rank in compute_rank_by_column(votes).items())
     print(f"mean rank by column over all methods: {', '.join(places)}")
-    _print_first(
-        _one_line(f"no valid answer: {refused.scene}, round {refused.round}: {refused.reason}")
-        for refused in votes.refused
-    )
+    _print_first(f"no valid answer: {its.scene}, round {its.round}: {its.reason}" for its in votes.refused)
 
 
 @evaluate.command("layout")
 def evaluate_layout(
     truth: Annotated[
-        Path,
-        typer.Option(help="Folder of the truth: poses (*.json), synthetic captures, or scenes.", exists=True),
+        Path, typer.Option(help="Folder of the truth: poses (*.json), synthetic captures, or scenes.", exists=True)
     ],
     paths: Paths = None,
     method: Methods = None,
@@ -200,10 +186,6 @@ def evaluate_layout(
 
     Example: `tableverse evaluate layout layouts --truth layouts/truth`, or `… layout out --truth captures`
     """
-    from dataclasses import asdict
-
-    from tableverse_factory.cli.tables import print_json
-    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.evaluation.methods.comparison import index_by_shared_name
     from tableverse_factory.evaluation.methods.layout import compare_layouts, summarize_layouts
     from tableverse_factory.evaluation.methods.methods import parse_methods
@@ -217,8 +199,7 @@ def evaluate_layout(
     }
     summaries = {name: summarize_layouts(scenes) for name, scenes in compared.items()}
     if as_json:
-        found = {name: {"summary": its, "scenes": [*map(asdict, compared[name])]} for name, its in summaries.items()}
-        print_json(found, indent=1)
+        print_json({name: {"summary": its, "scenes": compared[name]} for name, its in summaries.items()}, indent=1)
     else:
         _show_layouts(summaries, compared)
     if any(scene.error for scenes in compared.values() for scene in scenes):
@@ -228,20 +209,16 @@ def evaluate_layout(
 def _show_layouts(
     summaries: "dict[str, dict[str, float | None]]", compared: "Mapping[str, Sequence[SceneLayout]]"
 ) -> None:
-    from tableverse_factory.cli.tables import make_figures_table, print_table
     from tableverse_factory.evaluation.methods.layout import NO_RESULT
 
-    table = make_figures_table("", *map(_one_line, summaries))
+    rows = []
     for row in next(iter(summaries.values())):
         cells = (its[row] for its in summaries.values())
-        table.add_row(row, *("–" if cell is None else f"{cell:.4g}" for cell in cells))
-    print_table(table)
+        rows.append((row, *("–" if cell is None else f"{cell:.4g}" for cell in cells)))
+    print_figures(["", *(sanitize_line(name, 300) for name in summaries)], rows)
     for name, scenes in compared.items():
-        _print_first(
-            _one_line(f"not compared: {name}: {scene.name}: {scene.error}")
-            for scene in sorted(scenes, key=lambda its: its.error == NO_RESULT)
-            if scene.error
-        )
+        failed = sorted((scene for scene in scenes if scene.error), key=lambda its: its.error == NO_RESULT)
+        _print_first(f"not compared: {name}: {scene.name}: {scene.error}" for scene in failed)
 
 
 @evaluate.command("tables")
@@ -254,9 +231,7 @@ def evaluate_tables(
         Path | None,
         typer.Option(help="Answers that `evaluate gpt-score` recorded, if elsewhere.", exists=True, file_okay=False),
     ] = None,
-    epsilon_m: Annotated[
-        float, typer.Option("--epsilon", min=0.0, help="Depth beyond which objects collide [m].")
-    ] = 0.0001,
+    epsilon_m: Epsilon = 0.0001,
     pieces: Annotated[bool, typer.Option("--pieces", help="Add rates on convex pieces to tables.json.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the bootstrap.")] = 0,
 ) -> None:
@@ -268,7 +243,6 @@ def evaluate_tables(
 
     Example: `tableverse evaluate tables results --out results/tables`
     """
-    from tableverse_factory.core.cache_dir import get_cache_dir
     from tableverse_factory.evaluation.methods.tables import make_tables, write_tables
 
     tables = make_tables(folder, epsilon_m, seed, answers, get_cache_dir() if pieces else None)
@@ -284,7 +258,7 @@ def _track(items: Sequence[T], name: str) -> Iterator[T]:
     """Yield the items with a progress bar on stderr."""
     from tableverse_factory.cli.progress_bar import count_progress
 
-    with count_progress(_one_line(name), len(items)) as done:
+    with count_progress(sanitize_line(name, 300), len(items)) as done:
         for item in items:
             yield item
             done()
@@ -294,12 +268,6 @@ def _print_first(lines: Iterable[str]) -> None:
     """Print the first lines and the number of the others: a wrong folder would print one per scene."""
     found = list(lines)
     for line in found[:_SHOWN_LINES]:
-        print(line)
+        print(sanitize_line(line, 300))
     if len(found) > _SHOWN_LINES:
         print(f"… and {len(found) - _SHOWN_LINES} more like this; --json names all")
-
-
-def _one_line(text: str, most: int = 300) -> str:
-    from tableverse_factory.core.text import sanitize_line
-
-    return sanitize_line(text, most)

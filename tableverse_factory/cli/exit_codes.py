@@ -31,14 +31,7 @@ _EXAMPLE = re.compile(r"Example: `([^`]+)`")
 
 
 def run_command(command: Callable[[], object]) -> int:
-    """Run a command and print its error, if any.
-
-    Args:
-        command: Raises what a Typer app raises outside its stand-alone mode; an integer that it returns is the code.
-
-    Returns:
-        The exit code (docs/command-line.md).
-    """
+    """Run a command of a Typer app outside its stand-alone mode, print its error, if any, and return the exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal without a letter shows its code, not a traceback

@@ -5,13 +5,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
 
 from tableverse_factory.cli.arm import check_robot_option
 from tableverse_factory.cli.options import FinishedOut, Robot, require_local_path
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 
 _DEFAULT = "dataset"
+_Camera = StrEnum("_Camera", ["ROBOT", "SCENE"])  # Typer takes no list of literals
 
 
 class _DefaultCommandGroup(TyperGroup):
@@ -43,21 +45,6 @@ export = typer.Typer(
 Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are marked.")]
 
 
-class Profile(StrEnum):
-    """Terms that the licences of the scenes may have."""
-
-    PERMISSIVE = "permissive"
-    SHARE_ALIKE = "share-alike"
-    NON_COMMERCIAL = "non-commercial"
-
-
-class CameraChoice(StrEnum):
-    """A camera of the episodes."""
-
-    ROBOT = "robot"
-    SCENE = "scene"
-
-
 @export.command(_DEFAULT)
 def export_dataset(
     out: FinishedOut,
@@ -68,14 +55,14 @@ def export_dataset(
         ),
     ],
     profile: Annotated[
-        Profile, typer.Option(help="permissive: credit at most; share-alike and non-commercial allow these terms too.")
-    ] = Profile.PERMISSIVE,
+        Literal["permissive", "share-alike", "non-commercial"],
+        typer.Option(help="permissive: credit at most; share-alike and non-commercial allow these terms too."),
+    ] = "permissive",
 ) -> None:
     """Write the scenes whose licences allow it as a dataset of their own, without any trace of the others.
 
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.delivery.license_filter import write_filtered_dataset
     from workers.state.ledger import WORK
@@ -85,7 +72,7 @@ def export_dataset(
     if place == parse_path(out):
         raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
     with _remove_if_unused(place), create_writer_lock(place / WORK / LOCK):
-        result = write_filtered_dataset(parse_path(out), place, profile.value)
+        result = write_filtered_dataset(parse_path(out), place, profile)
     print(f"{pluralize(result.kept, 'scene')}, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")
@@ -118,7 +105,7 @@ def export_lerobot(
         ),
     ] = None,
     camera: Annotated[
-        list[CameraChoice] | None,
+        list[_Camera] | None,
         typer.Option(help="robot: stands with it, and the default; scene: the photograph's. May be repeated."),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, metavar="N", help="Processes that draw.")] = 1,
@@ -134,7 +121,7 @@ def export_lerobot(
     from tableverse_factory.delivery.episodes.lerobot import export_lerobot as write
 
     check_robot_option(out, robot, needed=True)
-    cameras = tuple(dict.fromkeys(view.value for view in camera or (CameraChoice.ROBOT,)))
+    cameras = tuple(dict.fromkeys(view.value for view in camera or (_Camera.ROBOT,)))
     options = LeRobotOptions(failed, width, height, fps, cameras, jobs, robot)
     with count_progress("episodes") as count:
         written = write(open_dataset(out), dest, options, count.update)

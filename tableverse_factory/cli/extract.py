@@ -1,27 +1,19 @@
 """`tableverse extract`: write one scene as files."""
 
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from tableverse_factory.cli.options import NewFolder, ReadableOut, SceneId, Texture
 
 
-class FileFormat(StrEnum):
-    """File formats of a scene (`tableverse_factory.delivery.formats.extract.FORMATS`)."""
-
-    MJCF = "mjcf"
-    GLB = "glb"
-    URDF = "urdf"
-    USD = "usd"
-
-
 def extract(
     out: ReadableOut,
     scene_id: SceneId,
     dest: NewFolder,
-    file_format: Annotated[FileFormat, typer.Option("--format", help="What to write.")] = FileFormat.MJCF,
+    file_format: Annotated[
+        Literal["mjcf", "glb", "urdf", "usd"], typer.Option("--format", help="What to write.")
+    ] = "mjcf",
     texture: Texture = None,
     lights: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="Other lights.")] = None,
     camera: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="A slightly moved camera.")] = None,
@@ -41,5 +33,5 @@ def extract(
     from tableverse_factory.delivery.formats.extract import extract_scene
 
     scene = open_dataset(out).scene(scene_id).restyle(texture, lights, camera)
-    paths = extract_scene(scene, dest, file_format.value)
+    paths = extract_scene(scene, dest, file_format)
     print(f"{pluralize(len(paths), 'file')} in {dest}")

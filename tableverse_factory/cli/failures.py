@@ -1,11 +1,15 @@
 """`tableverse failures`: reasons of lost scenes, and how to retry them."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.completions import complete_stages
+from tableverse_factory.cli.exit_codes import TROUBLESHOOTING
 from tableverse_factory.cli.options import AsJson, BuiltOut
+from tableverse_factory.cli.tables import make_table, print_json
+from tableverse_factory.core import errors
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
     from workers.progress.build_state import SceneStatus
@@ -16,9 +20,7 @@ def failures(
     stage: Annotated[
         str | None,
         typer.Option(
-            metavar="STAGE",
-            autocompletion=complete_stages,
-            help="Only scenes lost at this stage, also dropped ones.",
+            metavar="STAGE", autocompletion=complete_stages, help="Only scenes lost at this stage, also dropped ones."
         ),
     ] = None,
     reason: Annotated[
@@ -35,21 +37,22 @@ def failures(
 
     Example: `tableverse failures out --reason timeout --retry`
     """
-    import json
-
     from tableverse_factory.core.storage.files import parse_path
-    from tableverse_factory.core.text import pluralize
     from workers.plan.invalidate import reopen_scenes
     from workers.progress.build_state import read_build_state
 
     place = parse_path(out)
     state = read_build_state(place)
     lost = [scene for scene in state.scenes if scene.status != "done"]
-    selected = [scene for scene in lost if _is_selected(scene, stage, reason)]
+    if stage is None and reason is None:
+        selected = [scene for scene in lost if scene.status == "failed"]
+    else:
+        selected = [its for its in lost if stage in (None, its.stage) and reason in (None, its.why)]
     if not selected:
         _check_filters(lost, [cost.stage for cost in state.compute_stage_costs()], stage, reason)
     if as_json:
-        print(json.dumps([_to_dict(scene) for scene in selected], indent=2))
+        names = ("scene_id", "status", "stage", "why", "detail", "attempts", "shard")
+        print_json([{**{n: getattr(its, n) for n in names}, "help": _find_help(its.why)} for its in selected])
     else:
         _print_scenes(selected, "none" if stage or reason else _format_none_failed(lost, out))
     if retry and selected:
@@ -58,38 +61,24 @@ def failures(
         typer.echo(f"{where} put back: run the same `tableverse build` to try again", err=as_json)
 
 
-def _to_dict(scene: "SceneStatus") -> dict[str, Any]:
-    names = ("scene_id", "status", "stage", "why", "detail", "attempts", "shard")
-    return {**{name: getattr(scene, name) for name in names}, "help": _find_help(scene.why)}
-
-
 def _find_help(why: str) -> str:
     """Find the entry of the troubleshooting page: a reason is its own anchor, an error class has a topic."""
-    from tableverse_factory.cli.exit_codes import TROUBLESHOOTING
-    from tableverse_factory.core import errors
-
     return f"{TROUBLESHOOTING}#{getattr(getattr(errors, why, None), 'topic', why)}"
 
 
 def _check_filters(lost: list["SceneStatus"], ran: list[str], stage: str | None, reason: str | None) -> None:
     """Refuse a stage that does not exist, or a reason for which no scene was lost."""
     from schemas.config import Config
-    from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import sanitize_line
 
     usual = [name for name in Config.model_fields if name != "run"]
     stages, reasons = {*usual, *ran, *(scene.stage for scene in lost)}, {scene.why for scene in lost}
     if stage is not None and stage not in stages:
-        raise InputError(f"--stage {sanitize_line(stage, 60)!r}: no such stage; there are {', '.join(ran or usual)}")
+        raise errors.InputError(
+            f"--stage {sanitize_line(stage, 60)!r}: no such stage; there are {', '.join(ran or usual)}"
+        )
     if reason is not None and reasons and reason not in reasons:
         names = ", ".join(sanitize_line(name, 60) for name in sorted(reasons)[:10])
-        raise InputError(f"--reason {sanitize_line(reason, 60)!r}: nothing was lost for that, but for {names}")
-
-
-def _is_selected(scene: "SceneStatus", stage: str | None, reason: str | None) -> bool:
-    if stage is None and reason is None:
-        return scene.status == "failed"
-    return stage in (None, scene.stage) and reason in (None, scene.why)
+        raise errors.InputError(f"--reason {sanitize_line(reason, 60)!r}: nothing was lost for that, but for {names}")
 
 
 def _format_none_failed(lost: list["SceneStatus"], out: str) -> str:
@@ -100,9 +89,7 @@ def _format_none_failed(lost: list["SceneStatus"], out: str) -> str:
 
 def _print_scenes(selected: list["SceneStatus"], nothing: str) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.viz.gallery.formatting import explain_reasons
 
     if not selected:
@@ -111,8 +98,7 @@ def _print_scenes(selected: list["SceneStatus"], nothing: str) -> None:
     groups: dict[tuple[str, str, str], list["SceneStatus"]] = {}
     for scene in selected:
         groups.setdefault((scene.status, scene.stage, scene.why), []).append(scene)
-    table = Table("status", "stage", "why", box=None, pad_edge=False)
-    table.add_column("scenes", justify="right")
+    table = make_table("status", "stage", "why", figures=["scenes"])
     table.add_column("for example", overflow="fold")
     for (status, stage, why), scenes in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
         example = f"{scenes[0].scene_id}: {sanitize_line(scenes[0].detail)}"

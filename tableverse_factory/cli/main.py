@@ -1,11 +1,11 @@
-"""The command `tableverse`: the table of its commands."""
+"""The command `tableverse`: the table of its commands, and its text without one."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from tableverse_factory.cli.app import OrderedGroup, format_first_steps
 from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
@@ -33,6 +33,22 @@ from tableverse_factory.cli.view import view
 from tableverse_factory.core.open3d_import import stub_plotly
 from tableverse_factory.core.version import __version__
 
+FIRST_STEPS = f"""\
+TableVerse Factory {__version__}: table-top pictures become certified MuJoCo scenes.
+
+First steps:
+  tableverse doctor                                   check this machine
+  tableverse synth captures                           synthetic captures to try it with
+  tableverse manifest captures --out images.parquet   check the captures
+  tableverse build images.parquet out                 build the dataset
+  tableverse report out                               a gallery for the browser
+  tableverse view out                                 an interactive 3D view of a scene
+  tableverse status out                               progress of the build
+
+With pictures of your own: tableverse init FOLDER says where they belong.
+All commands: tableverse --help. One of them, with an example: tableverse build --help
+"""
+
 # Commands import heavy modules inside their function, so that `tableverse --help` is fast.
 PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
     "Make: from pictures to a dataset": {
@@ -52,29 +68,23 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
         "config": config,
         "doctor": doctor,
     },
-    "Look: what came out": {
-        "report": report,
-        "view": view,
-        "stats": stats,
-        "query": query,
-    },
-    "Use: take it elsewhere": {
-        "extract": extract,
-        "export": export,
-        "publish": publish,
-    },
-    "Measure: is it true, is it good": {
-        "verify": verify,
-        "evaluate": evaluate,
-        "bench": bench,
-    },
+    "Look: what came out": {"report": report, "view": view, "stats": stats, "query": query},
+    "Use: take it elsewhere": {"extract": extract, "export": export, "publish": publish},
+    "Measure: is it true, is it good": {"verify": verify, "evaluate": evaluate, "bench": bench},
 }
 COMMANDS = {name: command for panel in PANELS.values() for name, command in panel.items()}
-OrderedGroup.order = (*COMMANDS,)
+
+
+class _OrderedGroup(TyperGroup):
+    """Group of commands that lists them in the order of their table."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return sorted(super().list_commands(ctx), key=[*COMMANDS].index)
+
 
 app = typer.Typer(
     name="tableverse",
-    cls=OrderedGroup,
+    cls=_OrderedGroup,
     help="Table-top pictures become simulation-ready, certified MuJoCo scenes.",
     invoke_without_command=True,
     pretty_exceptions_enable=False,
@@ -103,7 +113,7 @@ def _without_a_command(
     ] = False,
 ) -> None:
     if context.invoked_subcommand is None:
-        print(format_first_steps(), end="")
+        print(FIRST_STEPS, end="")
 
 
 def main() -> None:

@@ -1,11 +1,18 @@
 """`tableverse manifest`: image manifest of folders, files and lists of addresses."""
 
+import math
+from collections import Counter, defaultdict
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, require_local_path
+from tableverse_factory.cli.tables import make_table, print_json
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
     from schemas.config import ObserveConfig
@@ -16,8 +23,8 @@ if TYPE_CHECKING:
     from tableverse_factory.sources.urls.image_filter import FilterCriteria
 
 _SHOWN_REJECTIONS = 20
-_FETCH_PANEL = "Fetching, with a list of addresses"
-_FILTER_PANEL = "Sifting bare pictures"
+_fetching = partial(typer.Option, rich_help_panel="Fetching, with a list of addresses")
+_filtering = partial(typer.Option, rich_help_panel="Sifting bare pictures")
 
 
 def manifest(
@@ -32,60 +39,32 @@ def manifest(
     ],
     pictures: Annotated[
         Path | None,
-        typer.Option(
+        _fetching(
             metavar="DIR",
             callback=require_local_path,
             help="Where fetched pictures go and are found again; FILE without its ending, and -pictures.",
-            rich_help_panel=_FETCH_PANEL,
         ),
     ] = None,
-    allow_private: Annotated[
-        bool, typer.Option("--allow-private", help="Fetch from this network too.", rich_help_panel=_FETCH_PANEL)
-    ] = False,
-    max_mb: Annotated[
-        float | None, typer.Option(min=0.001, metavar="MB", help="Of one picture; 32.", rich_help_panel=_FETCH_PANEL)
-    ] = None,
-    timeout: Annotated[
-        float | None,
-        typer.Option(min=0.1, metavar="S", help="For one picture, in all; 60.", rich_help_panel=_FETCH_PANEL),
-    ] = None,
-    parallel: Annotated[
-        int | None, typer.Option(min=1, max=256, help="At a time; 16.", rich_help_panel=_FETCH_PANEL)
-    ] = None,
-    per_host: Annotated[
-        int | None, typer.Option(min=1, max=32, help="At a time from one host; 2.", rich_help_panel=_FETCH_PANEL)
-    ] = None,
+    allow_private: Annotated[bool, _fetching("--allow-private", help="Fetch from this network too.")] = False,
+    max_mb: Annotated[float | None, _fetching(min=0.001, metavar="MB", help="Of one picture; 32.")] = None,
+    timeout: Annotated[float | None, _fetching(min=0.1, metavar="S", help="For one picture, in all; 60.")] = None,
+    parallel: Annotated[int | None, _fetching(min=1, max=256, help="At a time; 16.")] = None,
+    per_host: Annotated[int | None, _fetching(min=1, max=32, help="At a time from one host; 2.")] = None,
     filter_pictures: Annotated[
         bool | None,
-        typer.Option(
+        _filtering(
             "--filter/--no-filter",
             help="Whether small, blurred, odd or repeated pictures are rejected; with a list or a key below they are.",
-            rich_help_panel=_FILTER_PANEL,
         ),
     ] = None,
-    min_side: Annotated[
-        int | None, typer.Option(min=0, metavar="PX", help="Shorter side; 256.", rich_help_panel=_FILTER_PANEL)
-    ] = None,
-    max_aspect: Annotated[
-        float | None, typer.Option(min=1.0, metavar="RATIO", help="Of the sides; 3.", rich_help_panel=_FILTER_PANEL)
-    ] = None,
+    min_side: Annotated[int | None, _filtering(min=0, metavar="PX", help="Shorter side; 256.")] = None,
+    max_aspect: Annotated[float | None, _filtering(min=1.0, metavar="RATIO", help="Of the sides; 3.")] = None,
     min_contrast: Annotated[
-        float | None,
-        typer.Option(min=0.0, metavar="LEVELS", help="Deviation of grey, of 255; 8.", rich_help_panel=_FILTER_PANEL),
+        float | None, _filtering(min=0.0, metavar="LEVELS", help="Deviation of grey, of 255; 8.")
     ] = None,
-    min_sharpness: Annotated[
-        float | None,
-        typer.Option(min=0.0, metavar="X", help="See docs/sourcing.md; 0.01.", rich_help_panel=_FILTER_PANEL),
-    ] = None,
+    min_sharpness: Annotated[float | None, _filtering(min=0.0, metavar="X", help="See docs/sourcing.md; 0.01.")] = None,
     near_bits: Annotated[
-        int | None,
-        typer.Option(
-            min=-1,
-            max=7,
-            metavar="N",
-            help="Of 64, for repeated pictures; 6, -1 for none.",
-            rich_help_panel=_FILTER_PANEL,
-        ),
+        int | None, _filtering(min=-1, max=7, metavar="N", help="Of 64, for repeated pictures; 6, -1 for none.")
     ] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
@@ -99,12 +78,9 @@ def manifest(
 
     Example: `tableverse manifest photos/ captures/ --out images.parquet`
     """
-    import json
-
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.storage.files import parse_path
-    from tableverse_factory.core.text import pluralize
     from tableverse_factory.sources.manifest import create_manifest
     from tableverse_factory.sources.urls.lists import is_list
 
@@ -121,7 +97,7 @@ def manifest(
         made = create_manifest(folders, out, bounds, gathered, image_filter, count.update)
     if as_json:
         fetched = {"fetched": {"now": gathered.fetched, "earlier": gathered.earlier}} if lists else {}
-        print(json.dumps({"counts": _count_rows(made), "ignored": made.ignored, **fetched}))
+        print_json({"counts": _count_rows(made), "ignored": made.ignored, **fetched}, indent=None)
         return
     _print_manifest(made, out)
     if lists:
@@ -134,7 +110,6 @@ def _drop_none(options: dict[str, Any]) -> dict[str, Any]:
 
 def _make_filter(wanted: bool | None, from_lists: bool, criteria: dict[str, Any]) -> "FilterCriteria | None":
     """Make the filter of bare pictures: on with a list, a criterion or `--filter`, unless it is refused."""
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.sources.urls.image_filter import FilterCriteria
 
     if wanted is False and criteria:
@@ -146,9 +121,6 @@ def _make_fetch_bounds(
     lists: list[str], folder: Path | None, max_mb: float | None, limits: dict[str, Any]
 ) -> "FetchBounds":
     """Make the bounds of fetching; its options are refused without a list."""
-    import math
-
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.sources.urls.fetch import FetchBounds
 
     if not lists and (limits or folder is not None or max_mb is not None):
@@ -160,15 +132,13 @@ def _make_fetch_bounds(
 
 def _choose_folder(lists: list[str], given: Path | None, out: "StoragePath") -> Path:
     """Choose the folder of fetched pictures; by default beside the manifest."""
-    from tableverse_factory.core.errors import InputError
-
     if given is not None:
         return given
-    if not isinstance(out, Path):
-        if lists:
-            raise InputError("--pictures is missing: say in which folder of this machine fetched pictures are kept")
-        return Path()
-    return out.with_name(f"{out.stem}-pictures")
+    if isinstance(out, Path):
+        return out.with_name(f"{out.stem}-pictures")
+    if lists:
+        raise InputError("--pictures is missing: say in which folder of this machine fetched pictures are kept")
+    return Path()
 
 
 def _fetch_lists(lists: list[str], folder: Path, fetching: "FetchBounds", bounds: "ObserveConfig") -> "FetchedLists":
@@ -181,22 +151,18 @@ def _fetch_lists(lists: list[str], folder: Path, fetching: "FetchBounds", bounds
         return fetch_lists(lists, folder, fetching, bounds, count.update)
 
 
-def _count_rows(made: "Manifest") -> dict[str, dict[str, int]]:
+def _count_rows(made: "Manifest") -> Mapping[str, Mapping[str, int]]:
     """Count the rows of each kind, by reason of rejection or `accepted`."""
-    counts: dict[str, dict[str, int]] = {}
+    counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for row in made.rows:
-        of_kind = counts.setdefault(row.kind.value, {})
-        of_kind[row.rejected or "accepted"] = of_kind.get(row.rejected or "accepted", 0) + 1
+        counts[row.kind.value][row.rejected or "accepted"] += 1
     return counts
 
 
 def _print_manifest(made: "Manifest", out: str) -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    from tableverse_factory.core.text import pluralize, sanitize_line
-
-    table = Table("kind", "what", "rows", box=None, pad_edge=False)
+    table = make_table("kind", "what", "rows")
     for kind, reasons in sorted(_count_rows(made).items()):
         for reason, count in sorted(reasons.items(), key=lambda item: (item[0] != "accepted", item)):
             table.add_row(kind, reason, str(count))

@@ -1,19 +1,11 @@
 """Arguments and options that several commands share."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from tableverse_factory.cli.completions import complete_config_keys, complete_scene_ids, complete_textures
-
-
-class ExecutorName(StrEnum):
-    """Executor of the stages."""
-
-    LOCAL = "local"
-    RAY = "ray"
 
 
 def require_local_path(path: Path | None) -> Path | None:
@@ -53,14 +45,15 @@ Overrides = Annotated[
         autocompletion=complete_config_keys,
     ),
 ]
+Epsilon = Annotated[float, typer.Option("--epsilon", min=0.0, help="Depth beyond which objects collide [m].")]
+Jobs = Annotated[int | None, typer.Option(min=1, metavar="N", help="Processes; one per CPU by default.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document, for scripts.")]
-Executor = Annotated[ExecutorName, typer.Option(help="One process, or Ray.")]
+Executor = Annotated[Literal["local", "ray"], typer.Option(help="One process, or Ray.")]
 Workers = Annotated[
     int | None, typer.Option(min=1, metavar="N", help="Calls in flight on Ray; one per CPU by default.")
 ]
 Address = Annotated[
-    str | None,
-    typer.Option(envvar="RAY_ADDRESS", metavar="HOST:PORT", help="A running Ray cluster, or auto."),
+    str | None, typer.Option(envvar="RAY_ADDRESS", metavar="HOST:PORT", help="A running Ray cluster, or auto.")
 ]
 Pools = Annotated[
     Path | None, typer.Option(metavar="FILE", help="YAML: what the actors of each pool hold (docs/building.md).")
@@ -75,8 +68,7 @@ MaxCalls = Annotated[
     int | None, typer.Option(min=0, metavar="N", help="Most requests to models, over all runs of OUT.")
 ]
 Metrics = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Keep figures for Prometheus in this file (docs/monitoring.md)."),
+    Path | None, typer.Option(metavar="FILE", help="Keep figures for Prometheus in this file (docs/monitoring.md).")
 ]
 Robot = Annotated[
     str | None,

@@ -38,12 +38,7 @@ class ProgressCounter:
 
 @contextmanager
 def count_progress(what: str, total: int | None = None) -> Iterator[ProgressCounter]:
-    """Show the number of finished items while the block lasts.
-
-    Args:
-        what: Name of the items, in the plural.
-        total: Their number, if known.
-    """
+    """Show the number of finished items, named in the plural, while the block lasts."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

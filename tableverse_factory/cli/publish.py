@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ def publish(
 
     Example: `tableverse publish out-public --repo me/table-tops --upload`
     """
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.dataset.hub_names import check_hub_name, make_hub_api
     from tableverse_factory.delivery.hub.upload_set import collect_upload_set, find_refusals
 
@@ -62,8 +62,6 @@ def _print_contents(contents: "UploadSet") -> None:
     print(f"  {contents.scenes} scenes, {contents.with_files} of them with files")
     shown = list(contents.licences.items())[:_SHOWN_LICENCES]
     print("  licences: " + ", ".join(f"{sanitize_line(name, 60) or 'not stated'} ({count})" for name, count in shown))
-    strict = {
-        verdict: count for verdict, count in contents.verdicts.items() if verdict is not LicenceVerdict.PERMISSIVE
-    }
-    kinds = f" ({', '.join(f'{count} {verdict.value}' for verdict, count in strict.items())})" if strict else ""
-    print(f"  not permissive: {sum(strict.values())} scenes{kinds}")
+    strict = [(each, count) for each, count in contents.verdicts.items() if each is not LicenceVerdict.PERMISSIVE]
+    kinds = f" ({', '.join(f'{count} {verdict.value}' for verdict, count in strict)})" if strict else ""
+    print(f"  not permissive: {sum(count for _, count in strict)} scenes{kinds}")

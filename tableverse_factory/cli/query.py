@@ -6,58 +6,34 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from tableverse_factory.cli import completions
 from tableverse_factory.cli.options import ReadableOut
+from tableverse_factory.cli.tables import to_strict_json
 from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
-class TableName(StrEnum):
-    """The tables of a dataset."""
-
-    SCENES = "scenes"
-    OBJECTS = "objects"
-    TASKS = "tasks"
-    TRAJECTORIES = "trajectories"
-
-
-class Format(StrEnum):
-    """Output format of rows."""
-
-    TABLE = "table"
-    JSON = "json"
-    CSV = "csv"
-
-
 SHOWN_ROWS = 100
 SHOWN_CHARS = 60
 SHOWN_COLUMNS = {
-    TableName.SCENES: ("scene_id", "kind", "status", "stage", "reason", "n_objects", "usable", "quality_score"),
-    TableName.OBJECTS: (
-        "scene_id",
-        "object_id",
-        "relabel_name",
-        "mass_kg",
-        "size_x_m",
-        "size_y_m",
-        "size_z_m",
-        "contained_in",
-    ),
-    TableName.TASKS: ("scene_id", "task_id", "instruction", "accepted", "refusal"),
-    TableName.TRAJECTORIES: ("scene_id", "task_id", "instruction", "success", "failed_phase", "reason", "duration_s"),
+    "scenes": ("scene_id", "kind", "status", "stage", "reason", "n_objects", "usable", "quality_score"),
+    "objects": ("scene_id", "object_id", "relabel_name", "mass_kg", "size_x_m", "size_y_m", "size_z_m", "contained_in"),
+    "tasks": ("scene_id", "task_id", "instruction", "accepted", "refusal"),
+    "trajectories": ("scene_id", "task_id", "instruction", "success", "failed_phase", "reason", "duration_s"),
 }
 
 
 def query(
     out: ReadableOut,
-    table: Annotated[TableName, typer.Option("--table", "-t", help="Which table.")] = TableName.SCENES,
+    table: Annotated[
+        Literal["scenes", "objects", "tasks", "trajectories"], typer.Option("--table", "-t", help="Which table.")
+    ] = "scenes",
     where: Annotated[str, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = "",
     columns: Annotated[
         str,
@@ -66,9 +42,10 @@ def query(
         ),
     ] = "",
     limit: Annotated[int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="Most rows to print.")] = None,
-    output: Annotated[Format, typer.Option("--format", "-f", help="A table for people, or all rows for a script.")] = (
-        Format.TABLE
-    ),
+    output: Annotated[
+        Literal["table", "json", "csv"],
+        typer.Option("--format", "-f", help="A table for people, or all rows for a script."),
+    ] = "table",
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
 ) -> None:
     """Print the rows of a table that meet a condition.
@@ -82,15 +59,15 @@ def query(
     from tableverse_factory.dataset.query_parser import check_columns
     from tableverse_factory.dataset.query_parser import parse_filter as condition
 
-    output = Format.JSON if as_json else output
+    output = "json" if as_json else output
     rows_of = open_dataset(out).table(table)
     asked = [name.strip() for name in columns.split(",") if name.strip()]
-    default = SHOWN_COLUMNS[table] if output is Format.TABLE else rows_of.schema.names
+    default = SHOWN_COLUMNS[table] if output == "table" else rows_of.schema.names
     names = rows_of.schema.names if asked == ["all"] else check_columns(asked or default, rows_of.schema)
     scanner = rows_of.scanner(columns=names, filter=condition(where, rows_of.schema) if where else None)
-    if output is Format.TABLE:
+    if output == "table":
         _print_table(list(_iter_rows(scanner, SHOWN_ROWS + 1 if limit is None else limit)), names, limit is None)
-    elif output is Format.JSON:
+    elif output == "json":
         _print_json(_iter_rows(scanner, limit))
     else:
         _print_csv(_iter_rows(scanner, limit), names)
@@ -146,13 +123,9 @@ def _print_json(rows: Iterable[dict[str, Any]]) -> None:
     """Print an array, a row per line, with non-ASCII characters escaped so that no text can control the terminal."""
     separator = "[\n"
     for row in rows:
-        print(separator + json.dumps({name: _replace_non_finite(value) for name, value in row.items()}), end="")
+        print(separator + json.dumps(to_strict_json(row)), end="")
         separator = ",\n"
     print("[]" if separator == "[\n" else "\n]")
-
-
-def _replace_non_finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _print_csv(rows: Iterable[dict[str, Any]], names: Sequence[str]) -> None:

@@ -1,13 +1,17 @@
 """`tableverse report`: a gallery of a dataset as static HTML."""
 
+import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
 
 from tableverse_factory.cli.arm import check_robot_option
+from tableverse_factory.cli.options import Jobs, Robot
 
 
 def report(
@@ -16,21 +20,18 @@ def report(
         Path | None,
         typer.Option(help="Folder of the gallery; by default OUT-gallery beside the dataset, or here for s3://…."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes that draw; one per CPU by default.")] = None,
+    jobs: Jobs = None,
     renders: Annotated[
         int | None,
         typer.Option(
-            min=0,
-            help="Scenes to draw from every side, the first ones; by default all, or 6 of more than 60.",
+            min=0, help="Scenes to draw from every side, the first ones; by default all, or 6 of more than 60."
         ),
     ] = None,
     films: Annotated[
         int | None,
         typer.Option(min=0, help="Most films per drawn scene; by default 6, or none for more than 60 scenes."),
     ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
-    ] = None,
+    robot: Robot = None,
 ) -> None:
     """Write a gallery of a dataset as static HTML.
 
@@ -38,7 +39,6 @@ def report(
 
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
-    from tableverse_factory.cli.cleanup_on_sigterm import unwind_on_sigterm
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
@@ -47,18 +47,26 @@ def report(
 
     dataset = open_dataset(out)
     check_robot_option(out, robot, needed=False)
-    with unwind_on_sigterm(), count_progress("drawn") as count:
-        index = write_gallery(
-            dataset,
-            dest or choose_destination(out, "gallery"),
-            jobs or count_available_cpus(),
-            count.update,
-            renders=renders,
-            films=films,
-            robot=robot,
-        )
+    dest, processes = dest or choose_destination(out, "gallery"), jobs or count_available_cpus()
+    with _unwind_on_sigterm(), count_progress("drawn") as count:
+        index = write_gallery(dataset, dest, processes, count.update, renders=renders, films=films, robot=robot)
     _report_damage(out, dataset.shards)
     print(index)
+
+
+@contextmanager
+def _unwind_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM unwind the block as Ctrl-C does, once, to remove its large temporary files; the exit code is 143."""
+
+    def leave(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # a second one would interrupt the cleanup
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _report_damage(out: str, shards: Iterable[int]) -> None:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tableverse_factory.cli.options import AsJson, BuiltOut
+from tableverse_factory.cli.tables import make_table
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,7 +55,8 @@ def status(
     verdicts, motions = summarize_judgements(place, state.published), summarize_trajectories(place, state.published)
     asked = read_model_costs(place, state.published), sum_costs(place)
     if as_json:
-        print(_dump_json({**_to_dict(state, verdicts, motions), **_costs_as_dict(*asked)}))
+        costs = {"costs": {asker: asdict(cost) for asker, cost in asked[0].items()}, "spent": asdict(asked[1])}
+        print(_dump_json({**_to_dict(state, verdicts, motions), **costs}))
     else:
         _print_state(state, place)
         _print_judgements(verdicts)
@@ -96,15 +99,9 @@ def _dump_json(figures: dict[str, Any]) -> str:
 
 
 def _to_dict(state: "BuildState", verdicts: "JudgeSummary", motions: "TrajectorySummary") -> dict[str, Any]:
+    counts = ("total", "done", "dropped", "failed", "remaining", "shards", "committed", "fingerprint")
     return {
-        "total": state.total,
-        "done": state.done,
-        "dropped": state.dropped,
-        "failed": state.failed,
-        "remaining": state.remaining,
-        "shards": state.shards,
-        "committed": state.committed,
-        "fingerprint": state.fingerprint,
+        **{name: getattr(state, name) for name in counts},
         "funnel": [
             {"status": status, "stage": stage, "why": why, "scenes": count}
             for (status, stage, why), count in state.count_losses().items()
@@ -132,9 +129,7 @@ def _to_dict(state: "BuildState", verdicts: "JudgeSummary", motions: "Trajectory
 
 def _print_state(state: "BuildState", out: "StoragePath") -> None:
     from rich.console import Console
-    from rich.table import Table
 
-    from tableverse_factory.core.text import pluralize, sanitize_line
     from tableverse_factory.viz.gallery.formatting import explain_reasons
     from workers.plan.rerun import read_rerun_stage
     from workers.state.ledger import WORK
@@ -148,8 +143,7 @@ def _print_state(state: "BuildState", out: "StoragePath") -> None:
     )
     losses = state.count_losses()
     if losses:
-        table = Table("status", "stage", "why", box=None, pad_edge=False, title="lost", title_justify="left")
-        table.add_column("scenes", justify="right")
+        table = make_table("status", "stage", "why", figures=["scenes"], title="lost")
         for (status, stage, why), count in losses.items():
             table.add_row(status, stage, sanitize_line(why, 80), str(count))
         console.print(table)
@@ -157,9 +151,7 @@ def _print_state(state: "BuildState", out: "StoragePath") -> None:
             print(line)
     if costs := state.compute_stage_costs():
         total = sum(cost.total_cpu_s for cost in costs) or 1.0
-        table = Table("stage", box=None, pad_edge=False, title="CPU seconds", title_justify="left")
-        for name in ("scenes", "median", "p90", "total", "share"):
-            table.add_column(name, justify="right")
+        table = make_table("stage", figures=("scenes", "median", "p90", "total", "share"), title="CPU seconds")
         for cost in costs:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
@@ -181,8 +173,6 @@ def _suggest_command(state: "BuildState", out: "StoragePath") -> str:
 
 
 def _print_judgements(verdicts: "JudgeSummary") -> None:
-    from tableverse_factory.core.text import pluralize, sanitize_line
-
     for name, count in verdicts.judges.items():
         print(f"judged by {sanitize_line(name, 100)}: {pluralize(count, 'scene')}")
     if (agreement := verdicts.agreement) is not None:
@@ -193,10 +183,6 @@ def _print_judgements(verdicts: "JudgeSummary") -> None:
         )
     for code, count in verdicts.remarks.items():
         print(f"not taken as answered: {sanitize_line(code, 60)} × {count}")
-
-
-def _costs_as_dict(answers: "Mapping[str, ModelCost]", spent: "ModelCost") -> dict[str, Any]:
-    return {"costs": {asker: asdict(cost) for asker, cost in answers.items()}, "spent": asdict(spent)}
 
 
 def _print_costs(answers: "Mapping[str, ModelCost]", spent: "ModelCost") -> None:
@@ -210,17 +196,13 @@ def _print_costs(answers: "Mapping[str, ModelCost]", spent: "ModelCost") -> None
 
 def _print_trajectories(motions: "TrajectorySummary") -> None:
     from rich.console import Console
-    from rich.table import Table
-
-    from tableverse_factory.core.text import pluralize, sanitize_line
 
     if not motions.tasks:
         return
     share = motions.succeeded / motions.tasks
     print(f"trajectories: {pluralize(motions.tasks, 'task')} tried, {motions.succeeded} succeeded ({share:.0%})")
     if motions.failed:
-        table = Table("failed in", "why", box=None, pad_edge=False)
-        table.add_column("tasks", justify="right")
+        table = make_table("failed in", "why", figures=["tasks"])
         for (phase, reason), count in motions.failed.items():
             table.add_row(sanitize_line(phase, 40), sanitize_line(reason, 80), str(count))
         Console(markup=False).print(table)

@@ -5,6 +5,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -71,15 +72,10 @@ def submit(
 
 
 def build_command(manifest: str, out: str, options: Sequence[str]) -> list[str]:
-    """Make the command of the job, after the command line of `build` has accepted it.
-
-    Raises:
-        BuildError: if it would run on another cluster.
-        click.UsageError: if an option is wrong.
-    """
+    """Make the command of the job, after the command line of `build` has accepted it."""
     arguments = [manifest, out, "--executor", "ray", *options]
     parsed = parse_build(arguments)
-    if parsed["executor"].value != "ray":
+    if parsed["executor"] != "ray":
         raise BuildError("a job runs on its cluster: leave --executor out")
     if any(option.partition("=")[0] == "--address" for option in options):
         raise BuildError("a job joins the cluster that it is submitted to: give --address before the --")
@@ -87,11 +83,7 @@ def build_command(manifest: str, out: str, options: Sequence[str]) -> list[str]:
 
 
 def parse_build(arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse arguments as `tableverse build` would, without running it.
-
-    Raises:
-        click.UsageError: if it would refuse them.
-    """
+    """Parse arguments as `tableverse build` would, without running it."""
     app = typer.Typer()
     app.command("build")(build)
     context = typer.main.get_command(app).make_context("tableverse build", list(arguments))
@@ -154,12 +146,8 @@ def _stop(server: Any, out: str) -> None:
 
 
 def _follow(server: Any, job: str) -> int:
-    def write(text: str) -> None:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-
     try:
-        code: int = server.follow(job, write)
+        code: int = server.follow(job, partial(print, end="", flush=True))
     except KeyboardInterrupt:
         print(f"\nnot followed any more; job {job} goes on (the same command with --stop ends it)")
         return 130

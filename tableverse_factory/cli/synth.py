@@ -1,19 +1,11 @@
 """`tableverse synth`: synthetic captures or layouts with ground truth."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from tableverse_factory.cli.options import require_local_path
-
-
-class SynthKind(StrEnum):
-    """Kind of synthetic scenes."""
-
-    CAPTURES = "captures"
-    LAYOUTS = "layouts"
 
 
 def synth(
@@ -26,8 +18,9 @@ def synth(
         int, typer.Option("--seed", min=0, metavar="N", help="Same seed, same bytes, whatever the number.")
     ] = 0,
     kind: Annotated[
-        SynthKind, typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise.")
-    ] = SynthKind.CAPTURES,
+        Literal["captures", "layouts"],
+        typer.Option(help="RGB-D captures, or layouts: meshes and poses under registration noise."),
+    ] = "captures",
 ) -> None:
     """Make synthetic captures, or layouts, with known truth.
 
@@ -42,6 +35,6 @@ def synth(
     from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
     with count_progress("scenes", scenes) as done:
-        make = synthesize_captures if kind is SynthKind.CAPTURES else synthesize_layouts
+        make = synthesize_captures if kind == "captures" else synthesize_layouts
         made = make(out, scenes, seed, lambda *_: done())
     print(f"{len(made)} {kind} in {out}")

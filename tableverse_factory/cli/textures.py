@@ -1,5 +1,6 @@
 """`tableverse textures`: table textures from a repository of PBR maps or from a seed."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -7,6 +8,9 @@ import typer
 
 from tableverse_factory.cli import completions
 from tableverse_factory.cli.options import AsJson, require_local_path
+from tableverse_factory.cli.tables import print_json
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -19,8 +23,7 @@ _SHOWN_REJECTIONS = 20
 @textures.command("index")
 def index(
     folder: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="Unpacked repository, searched recursively without links."),
+        Path, typer.Argument(metavar="FOLDER", help="Unpacked repository, searched recursively without links.")
     ],
     out: Annotated[
         Path,
@@ -35,10 +38,6 @@ def index(
 
     Example: `tableverse textures index ambientcg/ --out textures.parquet`
     """
-    import json
-
-    from tableverse_factory.core.errors import InputError
-    from tableverse_factory.core.text import sanitize_line
     from tableverse_factory.sources.textures.library import write_index
     from tableverse_factory.sources.textures.repository import index_textures
 
@@ -48,7 +47,7 @@ def index(
     write_index(out, table)
     counts = _counts(table)
     if as_json:
-        print(json.dumps({"usable": table["rejected"].null_count, "counts": counts}))
+        print_json({"usable": table["rejected"].null_count, "counts": counts}, indent=None)
         return
     for what, count in counts.items():
         print(f"{count:6d}  {what}")
@@ -88,8 +87,8 @@ def make(
 
 def _counts(table: "pa.Table") -> dict[str, int]:
     """Count usable sets by licence, the others by reason; largest first."""
-    counts: dict[str, int] = {}
-    for row in table.select(["rejected", "licence"]).to_pylist():
-        what = f"rejected: {row['rejected']}" if row["rejected"] else f"licence {row['licence'] or 'not stated'}"
-        counts[what] = counts.get(what, 0) + 1
+    counts = Counter(
+        f"rejected: {row['rejected']}" if row["rejected"] else f"licence {row['licence'] or 'not stated'}"
+        for row in table.select(["rejected", "licence"]).to_pylist()
+    )
     return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))

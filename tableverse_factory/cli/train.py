@@ -16,8 +16,7 @@ train = typer.Typer(name="train", help="Train networks on synthetic scenes.", no
 @train.command("segmenter")
 def train_segmenter(
     folder: Annotated[
-        Path,
-        typer.Argument(metavar="DIR", callback=require_local_path, help="New folder, or one to continue."),
+        Path, typer.Argument(metavar="DIR", callback=require_local_path, help="New folder, or one to continue.")
     ],
     scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, max=1_000_000, help="Training scenes.")] = 2000,
     steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps, of --batch views each.")] = 20_000,

@@ -4,44 +4,27 @@ from typing import Annotated
 
 import typer
 
+from tableverse_factory.cli import options
 from tableverse_factory.cli.build import make_display, report_summary
-from tableverse_factory.cli.completions import complete_config_keys
-from tableverse_factory.cli.options import (
-    Address,
-    Executor,
-    ExecutorName,
-    FinishedOut,
-    Limit,
-    Metrics,
-    Pools,
-    Shards,
-    Workers,
-)
 
 
 def trajectories(
-    out: FinishedOut,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            autocompletion=complete_config_keys,
-            help="A key of the section trajectories; may repeat. All else is as it was built.",
-        ),
-    ] = None,
-    executor: Executor = ExecutorName.RAY,
-    workers: Workers = None,
-    address: Address = None,
-    pools: Pools = None,
+    out: options.FinishedOut,
+    overrides: options.Overrides = None,
+    executor: options.Executor = "ray",
+    workers: options.Workers = None,
+    address: options.Address = None,
+    pools: options.Pools = None,
     again: Annotated[
         bool, typer.Option("--again", help="Compute all trajectories again; needed where --set changed a value.")
     ] = False,
-    limit: Limit = None,
-    shards: Shards = None,
-    metrics: Metrics = None,
+    limit: options.Limit = None,
+    shards: options.Shards = None,
+    metrics: options.Metrics = None,
 ) -> None:
     """Add motions, proven in simulation, to a finished dataset.
+
+    `--set` changes keys of the section trajectories; all else is as it was built.
 
     The same command again goes on. Needs neither the manifest nor the pictures: a downloaded dataset will do. Nothing
     that is in it is computed again, and each shard stays as it is until all of its scenes are through. The result has
@@ -56,7 +39,7 @@ def trajectories(
         None,
         out,
         overrides=overrides or [],
-        executor=executor.value,
+        executor=executor,
         workers=workers,
         address=address,
         pools=pools,

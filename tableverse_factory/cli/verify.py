@@ -1,28 +1,27 @@
 """`tableverse verify`: measure certificates again, and replay trajectories."""
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.arm import check_robot_option
-from tableverse_factory.cli.options import AsJson
+from tableverse_factory.cli.options import AsJson, Jobs, Robot
+from tableverse_factory.cli.tables import print_json
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.scene_audit import SceneAudit
-
-EPSILON_M = 0.001
 
 
 def verify(
     path: Annotated[
         str,
         typer.Argument(
-            metavar="PATH",
-            help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of those.",
+            metavar="PATH", help="OUT of a build, any MJCF file, a folder that `extract` wrote, or a folder of those."
         ),
     ],
     epsilon_m: Annotated[
@@ -37,22 +36,14 @@ def verify(
     root: Annotated[
         Path | None,
         typer.Option(
-            help="For MJCF files: folder that contains all files they name, if not PATH.",
-            exists=True,
-            file_okay=False,
+            help="For MJCF files: folder that contains all files they name, if not PATH.", exists=True, file_okay=False
         ),
     ] = None,
     trajectories: Annotated[
         bool, typer.Option("--trajectories", help="Of a dataset: also replay every trajectory from its arrays.")
     ] = False,
-    robot: Annotated[
-        str | None,
-        typer.Option(metavar="ARM", help="With --trajectories: the arm of those whose robot came from a file (*.xml)."),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Of a dataset: processes that measure; one per CPU by default."),
-    ] = None,
+    robot: Robot = None,
+    jobs: Jobs = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure every certificate again; replay trajectories.
@@ -75,16 +66,15 @@ def verify(
     if trajectories and _is_dataset(path):
         check_robot_option(path, robot, needed=True)
     audits = []
-    for audit in _run_audits(
-        path, EPSILON_M if epsilon_m is None else epsilon_m, root, jobs or count_available_cpus(), trajectories, robot
-    ):
+    depth_m, processes = 0.001 if epsilon_m is None else epsilon_m, jobs or count_available_cpus()
+    for audit in _run_audits(path, depth_m, root, processes, trajectories, robot):
         audits.append(audit)
         if not as_json:
             _print_audit(audit, first=len(audits) == 1)
     good = sum(audit.ok for audit in audits)
     if as_json:
         scenes = [{"scene_id": a.scene_id, "ok": a.ok, "problems": a.problems, **a.measured} for a in audits]
-        print(json.dumps({"ok": good == len(audits), "verified": good, "scenes": scenes}, indent=1))
+        print_json({"ok": good == len(audits), "verified": good, "scenes": scenes}, indent=1)
     else:
         print(f"{good} of {len(audits)} scenes verified")
     if good < len(audits):
@@ -99,7 +89,6 @@ def _is_dataset(path: str) -> bool:
 def _run_audits(
     path: str, epsilon_m: float, root: Path | None, jobs: int, trajectories: bool, robot: str | None
 ) -> Iterator["SceneAudit"]:
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.delivery.formats.folders import find_mjcf, list_scene_folders
     from tableverse_factory.evaluation.verify import verify_scenes
 
@@ -131,7 +120,6 @@ def _audit_file(path: Path, epsilon_m: float, root: Path) -> "SceneAudit":
 
 
 def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "SceneAudit":
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.delivery.formats.folders import SCENE_GLB, find_mjcf
     from tableverse_factory.evaluation.scene_audit import SceneAudit, audit_scene, read_scene_folder
 
@@ -147,20 +135,17 @@ def _audit_folder(folder: Path, epsilon_m: float, root: Path) -> "SceneAudit":
 
 
 def _print_audit(audit: "SceneAudit", first: bool) -> None:
-    from tableverse_factory.core.text import sanitize_line
-
     if first:
         print(f"{'scene':40} {'verdict':8} {'pieces':>8} {'meshes':>8} {'drift':>8} {'turn':>8}")
         print(f"{'':40} {'':8} {'[mm]':>8} {'[mm]':>8} {'[mm]':>8} {'[deg]':>8}")
     m = audit.measured
     verdict = "ok" if audit.ok else "BAD"
-    print(f"{sanitize_line(audit.scene_id, 40):40} {verdict:8}" + (_cells(m) if "drift_m" in m else ""))
+    cells = ""
+    if "drift_m" in m:
+        lengths = (m["piece_penetration_m"], m["mesh_penetration_m"], m["drift_m"])
+        cells = "".join(f" {1e3 * value:8.3f}" for value in lengths) + f" {57.29578 * m['drift_rad']:8.3f}"
+    print(f"{sanitize_line(audit.scene_id, 40):40} {verdict:8}{cells}")
     if replayed := m.get("trajectories", ()):
         print(f"    {sum(it['reproduced'] for it in replayed)} of {len(replayed)} trajectories reproduced")
     for problem in audit.problems:
         print(f"    {sanitize_line(problem, 500)}")
-
-
-def _cells(measured: Mapping[str, Any]) -> str:
-    lengths = (measured["piece_penetration_m"], measured["mesh_penetration_m"], measured["drift_m"])
-    return "".join(f" {1e3 * value:8.3f}" for value in lengths) + f" {57.29578 * measured['drift_rad']:8.3f}"

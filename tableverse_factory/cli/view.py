@@ -1,11 +1,14 @@
 """`tableverse view`: scenes in the browser."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from tableverse_factory.cli.arm import check_robot_option
+from tableverse_factory.cli.options import Robot
+from tableverse_factory.core.errors import InputError
 
 
 def view(
@@ -17,9 +20,7 @@ def view(
         "127.0.0.1"
     ),
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one.")] = 8080,
-    robot: Annotated[
-        str | None, typer.Option(help="The arm of trajectories whose robot is a file (*.xml) or menagerie:NAME.")
-    ] = None,
+    robot: Robot = None,
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(help="Address of the viewer behind a proxy: https://NAME.github.dev; may repeat."),
@@ -35,7 +36,6 @@ def view(
     import signal
     import threading
 
-    from tableverse_factory.core.errors import InputError
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.viz.viewer.loaded_scene import load_scene_file
     from tableverse_factory.viz.viewer.scene_cache import SceneCache
@@ -58,8 +58,7 @@ def view(
     viewer = Viewer(scenes, first, host, port, robot, allow_origin or ())
     print(viewer.url, flush=True)
     try:
-        ended.wait()
-    except KeyboardInterrupt:
-        pass
+        with suppress(KeyboardInterrupt):
+            ended.wait()
     finally:
         viewer.stop()

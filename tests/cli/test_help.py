@@ -6,8 +6,7 @@ import shlex
 import pytest
 import typer
 
-from tableverse_factory.cli.app import format_first_steps
-from tableverse_factory.cli.main import COMMANDS, PANELS, app
+from tableverse_factory.cli.main import COMMANDS, FIRST_STEPS, PANELS, app
 
 ROOF = typer.main.get_command(app)
 CONTEXT = ROOF.make_context("tableverse", [], resilient_parsing=True)
@@ -80,7 +79,7 @@ def test_every_command_has_an_example_of_its_own():
 
 def test_the_first_steps_are_understood_in_their_order(tableverse):
     answer = tableverse()
-    assert (answer.code, answer.out, answer.err) == (0, format_first_steps(), "")
+    assert (answer.code, answer.out, answer.err) == (0, FIRST_STEPS, "")
     lines = [line.split("   ")[0].strip() for line in answer.out.splitlines() if line.startswith("  tableverse ")]
     steps = [words for line in lines for words in typed(line)]
     assert [step[0] for step in steps] == ["doctor", "synth", "manifest", "build", "report", "view", "status"]
