@@ -1,8 +1,7 @@
-"""Protocol of the models that complete the objects of a picture to closed meshes, and their answer."""
+"""Interface of the models that complete the objects of a picture to closed meshes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -16,11 +15,10 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Completion(Frozen):
-    """A closed mesh and, where the model knows it, its pose.
+    """A closed mesh in its own frame.
 
     Attributes:
-        mesh: Mesh in its own frame, metric where `pose` is given.
-        pose: Its own frame in the table frame; None where registration has to find pose and size.
+        pose: Its frame in the table frame, with a mesh in metres; None where registration has to find pose and size.
         method: Backend and method, e.g. `carved/box`.
         licence: Licence of the mesh, where a model made it and names one.
     """
@@ -31,20 +29,9 @@ class Completion(Frozen):
     licence: str | None = None
 
 
-class MeshModel(Protocol):
-    """Completes all objects of a scene at once: a model on a GPU needs them together."""
-
-    def __call__(
-        self,
-        scene: PerceivedObjects,
-        views: Sequence[ObjectView],
-        config: PlaceConfig,
-        rng: np.random.Generator,
-        services: Services,
-    ) -> Sequence[Completion | GeometryError]:
-        """Complete each object, or return the error that says why it has no mesh.
-
-        Raises:
-            ModelError: if the model is out of reach for all of them.
-        """
-        ...
+# Completes all objects of a scene at once, as a model on a GPU needs them together; an error says why one has no mesh.
+# It raises ModelError if it is out of reach for all of them.
+MeshModel = Callable[
+    [PerceivedObjects, Sequence[ObjectView], PlaceConfig, np.random.Generator, Services],
+    Sequence[Completion | GeometryError],
+]

@@ -1,13 +1,14 @@
 """The stage `place`: each object of the picture becomes a closed metric mesh in the table frame."""
 
 import io
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from PIL import Image
 
 from schemas.config import Config
-from schemas.geometry import Points, TriangleMesh
+from schemas.geometry import TriangleMesh
 from schemas.objects import Evidence, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import GeometryError
@@ -29,8 +30,7 @@ from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 
 MIN_POINTS = 30
 MIN_BREADTH_M = 0.001
-LEANING_STD_M, HIDDEN_STD_M = 0.005, 0.03
-"""Standard deviation of the height on which contents stand: of long ones, which reach the floor, and of others [m]."""
+LEANING_STD_M, HIDDEN_STD_M = 0.005, 0.03  # of the height on which contents stand: of long ones at the floor, of others
 MAX_MASK_VALUE = 65_535
 
 
@@ -61,7 +61,7 @@ def place(
             scene_id=item.scene_id,
             table=item.table,
             objects=tuple(o if o.contained_in in names else replace(o, contained_in=None) for o in placed),
-            evidence=encode_evidence(item, tuple(kept), config.export.jpeg_quality),
+            evidence=_encode_evidence(item, kept, config.export.jpeg_quality),
             perception=item.perception,
             left_out=tuple(left_out),
             detection=item.detection,
@@ -84,7 +84,9 @@ def _view_objects(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> l
 def _view_one(scene: PerceivedObjects, perceived: PerceivedObject, support: DepthSupport) -> ObjectView:
     if len(perceived.points_camera) < MIN_POINTS:
         raise GeometryError(f"{len(perceived.points_camera)} points are too few; at least {MIN_POINTS} are needed")
-    if _measure_breadth(perceived.points_camera) < MIN_BREADTH_M:
+    centred = perceived.points_camera - perceived.points_camera.mean(axis=0)
+    across = np.linalg.eigvalsh(centred.T @ centred / len(centred))[1]  # from the line that fits the points best [m²]
+    if np.sqrt(max(across, 0.0)) < MIN_BREADTH_M:
         raise GeometryError(f"its {len(perceived.points_camera)} points lie on a line: no shape can be read from them")
     view = view_object(scene, perceived, support)
     if len(view.points) < MIN_POINTS:
@@ -94,12 +96,10 @@ def _view_one(scene: PerceivedObjects, perceived: PerceivedObject, support: Dept
 
 def _register_object(perceived: PerceivedObject, view: ObjectView, completion: Completion) -> PlacedObject:
     mesh, pose = completion.mesh, completion.pose
+    hidden_std_m = LEANING_STD_M if view.support.leaning else HIDDEN_STD_M
+    support_std_m = STANDS_STD_M if perceived.contained_in is None else hidden_std_m
     partial = PartialView(
-        view.points,
-        view.eye,
-        view.support_z,
-        _estimate_support_std(perceived, view.support),
-        lambda points: measure_free_space(view, points),
+        view.points, view.eye, view.support_z, support_std_m, lambda points: measure_free_space(view, points)
     )
     if pose is None:
         found = register(mesh, partial)
@@ -123,24 +123,8 @@ def _register_object(perceived: PerceivedObject, view: ObjectView, completion: C
     )
 
 
-def _estimate_support_std(perceived: PerceivedObject, support: DepthSupport) -> float:
-    if perceived.contained_in is None:
-        return STANDS_STD_M
-    return LEANING_STD_M if support.leaning else HIDDEN_STD_M
-
-
-def _measure_breadth(points: Points) -> float:
-    """Measure the standard deviation of points across the line that fits them best [m]."""
-    centred = points - points.mean(axis=0)
-    return float(np.sqrt(max(np.linalg.eigvalsh(centred.T @ centred / len(points))[1], 0.0)))
-
-
-def encode_evidence(scene: PerceivedObjects, objects: tuple[PerceivedObject, ...], jpeg_quality: int) -> Evidence:
-    """Encode the picture, its instance ids and the camera for the dataset; `object_pixels` follows `objects`.
-
-    Raises:
-        GeometryError: if an instance id does not fit into 16 bits.
-    """
+def _encode_evidence(scene: PerceivedObjects, objects: Sequence[PerceivedObject], jpeg_quality: int) -> Evidence:
+    """Encode the picture, its instance ids and the camera for the dataset; `object_pixels` follows `objects`."""
     color = io.BytesIO()
     Image.fromarray(np.asarray(scene.observation.color)).save(color, "JPEG", quality=jpeg_quality)
     ids = np.maximum(scene.instance_ids, 0)

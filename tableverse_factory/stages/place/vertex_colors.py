@@ -10,20 +10,17 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NEIGHBOURS = 5
 SOURCES = 8000
-NORMAL_M = 0.03
-"""Half the extra distance of a surface that faces the opposite way [m]."""
-COPY_M = 0.008
-"""Extra distance of a colour borrowed from the opposite side [m]."""
+NORMAL_M = 0.03  # half the extra distance of a surface that faces the opposite way [m]
+COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
+# Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame.
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
-"""Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame."""
 
 
 def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> TriangleMesh:
-    """Paint each vertex of the mesh.
+    """Paint each vertex with the colours of the observed points nearest in position and direction.
 
-    A vertex takes the colours of the observed points nearest in position and direction. The points also count turned
-    by half and mirrored in the object's own upright frame, a little farther away: so the back
-    looks like the front, and the outside of a cup does not run into its inside.
+    The points also count turned by half and mirrored in the object's own upright frame, a little farther away: so the
+    back looks like the front, and the outside of a cup does not run into its inside.
     """
     step = max(1, len(view.points) // SOURCES)
     upright = Pose(pose.position, _extract_heading(pose))
@@ -36,13 +33,13 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> Triangle
     )
     rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
     vertices = mesh.vertices @ rotation.T
-    targets = _stack_features(vertices, compute_vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
+    targets = _stack_features(vertices, _compute_vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
     colors = _mix_colors(sources, np.tile(view.colors[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
 
-def compute_vertex_normals(mesh: TriangleMesh) -> Points:
-    """Compute unit normals, the area-weighted mean of adjacent faces; zero where a vertex has none. Shape (n, 3)."""
+def _compute_vertex_normals(mesh: TriangleMesh) -> Points:
+    """Compute the area-weighted mean normals of adjacent faces, unit length; zero where a vertex has none."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     weighted = np.cross(b - a, c - a)
     normals = np.zeros_like(mesh.vertices)

@@ -22,13 +22,7 @@ PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolidBox(Frozen):
-    """A box in the table frame.
-
-    Attributes:
-        pose: Frame at its centre, along its sides.
-        half_size: Half of each side [m].
-        misfit: Mean disagreement with the picture [m].
-    """
+    """A box: its frame at the centre, along its sides, in the table frame; half sizes and misfit to the picture [m]."""
 
     pose: Pose
     half_size: Vector3
@@ -36,13 +30,8 @@ class SolidBox(Frozen):
 
 
 def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
-    """Fit the best box that stands flat on the object's support.
-
-    Raises:
-        GeometryError: if the points span no area.
-    """
-    fits = [_fit_upright(view, rays, yaw) for yaw in _propose_yaws(view)]
-    return min(fits, key=lambda box: box.misfit)
+    """Fit the best box that stands flat on the object's support."""
+    return min((_fit_upright(view, rays, yaw) for yaw in _propose_yaws(view)), key=lambda box: box.misfit)
 
 
 def build_box_mesh(box: SolidBox) -> TriangleMesh:
@@ -71,14 +60,10 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
     start = np.array([*middle, *np.log(np.maximum(high - low, MIN_SIDE_M)), np.log(top - view.support_z), yaw])
 
     def cost(x: Float64[np.ndarray, "6"]) -> float:
-        box_pose, half = _decode_box(x, view.support_z)
-        sides = np.sort(half)
-        prior = PRIOR_M * float(np.abs(np.log(half[:2] / sides[1])).sum())
-        return (
-            compute_misfit(rays, intersect_box(rays, box_pose, half))
-            + prior
-            + _penalize_uncarried(view, box_pose, half)
-        )
+        pose, half = _decode_box(x, view.support_z)
+        prior = PRIOR_M * float(np.abs(np.log(half[:2] / np.sort(half)[1])).sum())
+        misfit = compute_misfit(rays, intersect_box(rays, pose, half))
+        return misfit + prior + _penalize_uncarried(view, pose, half)
 
     steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
     simplex = np.vstack([start, start + steps])

@@ -3,13 +3,12 @@
 import numpy as np
 from manifold3d import Manifold
 
-from schemas.geometry import Points, Pose, TriangleMesh, Vector3
+from schemas.geometry import Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
 
-END_SHARE = 0.15
-"""Share of the length over which the thickness of the lower end is measured."""
+END_SHARE = 0.15  # share of the length over which the thickness of the lower end is measured
 RADIUS_RANGE_M = (0.002, 0.008)
 MIN_GAP_M = 0.008
 MIN_SLOPE = 0.4
@@ -23,7 +22,8 @@ def extend_to_floor(mesh: TriangleMesh, pose: Pose, points: Points, support_z: f
     """
     vertices = transform_points(pose, mesh.vertices)
     gap = float(vertices[:, 2].min()) - support_z
-    down = _find_downward_axis(points)
+    _, _, directions = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    down = -directions[0] if directions[0, 2] > 0.0 else directions[0]
     if gap < MIN_GAP_M or -down[2] < MIN_SLOPE:
         return mesh
     along = vertices @ down
@@ -43,8 +43,3 @@ def extend_to_floor(mesh: TriangleMesh, pose: Pose, points: Points, support_z: f
     except GeometryError:
         return mesh
     return TriangleMesh(transform_points(invert_pose(pose), whole.vertices), whole.faces)
-
-
-def _find_downward_axis(points: Points) -> Vector3:
-    _, _, directions = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    return -directions[0] if directions[0, 2] > 0.0 else directions[0]

@@ -18,11 +18,10 @@ from tableverse_factory.geometry.mesh.voxel_solids import (
     make_grid,
     to_manifold,
 )
-from tableverse_factory.stages.place.completion.half_width import compute_half_width
+from tableverse_factory.stages.place.completion.underside import compute_half_width
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
-AWAY_M = 0.004
-"""Distance outside the body from which points belong to another part [m]."""
+AWAY_M = 0.004  # distance outside the body from which points belong to another part [m]
 MIN_PIXELS = 30
 MIN_SHARE = 0.025
 RADIUS_RANGE_M = (0.002, 0.012)
@@ -57,8 +56,7 @@ def _join_part(body: Manifold, part: Manifold) -> Manifold:
         return body
     start, end = ours[index[nearest]], theirs[nearest]
     ball = Manifold.sphere(BRIDGE_RADIUS_M, 12)
-    bridge = Manifold.batch_hull([ball.translate(tuple(start)), ball.translate(tuple(end))])
-    return joined + bridge
+    return joined + Manifold.batch_hull([ball.translate(tuple(start)), ball.translate(tuple(end))])
 
 
 def _find_protrusions(view: ObjectView, body: Manifold) -> IdImage:

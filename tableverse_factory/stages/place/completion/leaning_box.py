@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.optimize import minimize
 
-from schemas.geometry import Matrix3, Points, Pose, Vector3
+from schemas.geometry import Matrix3, Pose, Vector3
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
@@ -25,11 +25,7 @@ _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z i
 
 
 def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
-    """Fit the best box in any orientation, started along the faces that the normals show.
-
-    Raises:
-        GeometryError: if the points span no area.
-    """
+    """Fit the best box in any orientation, started along the faces that the normals show."""
     rotation = _estimate_axes(view)
     local = view.points @ rotation
     low, high = np.quantile(local, 0.005, axis=0), np.quantile(local, 0.995, axis=0)
@@ -68,7 +64,8 @@ def _estimate_axes(view: ObjectView) -> Matrix3:
     step = max(1, len(view.normals) // NORMALS)
     normals = view.normals[::step]
     agreement = np.abs(normals @ normals.T) > AGREE_COS
-    first = _average_direction(normals[agreement[int(np.argmax(agreement.sum(axis=1)))]])
+    alike = normals[agreement[int(np.argmax(agreement.sum(axis=1)))]]
+    first = np.linalg.eigh(alike.T @ alike)[1][:, 2]
     side = np.cross(first, [0.0, 0.0, 1.0] if abs(first[2]) < 0.9 else [1.0, 0.0, 0.0])
     side /= np.linalg.norm(side)
     up = np.cross(first, side)
@@ -80,8 +77,3 @@ def _estimate_axes(view: ObjectView) -> Matrix3:
         turn = fit_min_rectangle(np.stack([view.points @ side, view.points @ up], axis=1)).yaw
     second = np.cos(turn) * side + np.sin(turn) * up
     return np.stack([first, second, np.cross(first, second)], axis=1)
-
-
-def _average_direction(normals: Points) -> Vector3:
-    _, vectors = np.linalg.eigh(normals.T @ normals)
-    return vectors[:, 2]

@@ -23,18 +23,13 @@ SLICE_M = 0.002
 DETAIL_M = 0.0002
 HIDDEN_SHARE = 0.3
 SWELLINGS = (0.0, 0.4, 0.8)
-NOISY_HOLLOW_SHARE = 0.25
-"""Least depth of a cavity in noise, as a share of the height."""
-
-BORED_SHARE = 0.6
-"""Widest hole in a solid as a share of the body's width; a wider cavity has a wall around it."""
-LID_WIDTH, LID_DEPTH, LID_POINTS = 0.6, 0.25, 20
-"""Middle of a mouth as a share of its radius; depth of a lid below the rim as a share of the cavity's; and least points
-of a lid. A wall that slants from the middle of the floor to the rim is no lid."""
-FOOT_RING_M = 0.0025
-"""Least width of the ring on which a floor above the support stands [m]."""
-HOLLOW_FOOT_M = (0.0008, 0.008)
-"""Range of hollow gaps below a floor [m]: narrower ones are filled, taller ones are no foot ring."""
+NOISY_HOLLOW_SHARE = 0.25  # least depth of a cavity in noise, as a share of the height
+BORED_SHARE = 0.6  # widest hole in a solid as a share of the body's width; a wider cavity has a wall around it
+LID_WIDTH = 0.6  # middle of a mouth, as a share of its radius
+LID_DEPTH = 0.25  # of a lid below the rim, as a share of the cavity's: a wall that slants up from the floor is no lid
+LID_POINTS = 20
+FOOT_RING_M = 0.0025  # least width of the ring on which a floor above the support stands [m]
+HOLLOW_FOOT_M = (0.0008, 0.008)  # hollow gaps below a floor: narrower ones are filled, taller ones are no foot ring
 
 Field = Float64[np.ndarray, "nr nz"]
 Cells = Bool[np.ndarray, "nr nz"]
@@ -43,21 +38,13 @@ Profile = Float64[np.ndarray, "n 2"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Votes(Frozen):
-    """A field over distance from the axis and height along it.
+    """A field: sample (i, k) lies (i + 1/2) cell from the axis, at the height bottom + (k + 1/2) cell along it."""
 
-    Attributes:
-        field: Mean signed distance to the surface over the observed azimuths [m], positive inside; else NaN.
-        hidden: Cells hidden by another object.
-        cell: Spacing [m]; sample (i, k) lies at distance (i + 1/2) cell and height bottom + (k + 1/2) cell.
-        bottom: Height of the bottom [m].
-        band: Clamp of the field [m].
-    """
-
-    field: Field
-    hidden: Cells
-    cell: float
-    bottom: float
-    band: float
+    field: Field  # mean signed distance to the surface over the observed azimuths [m], positive inside; else NaN
+    hidden: Cells  # by another object
+    cell: float  # spacing [m]
+    bottom: float  # [m]
+    band: float  # clamp of the field [m]
 
 
 def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
@@ -81,8 +68,7 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
                 body, hole = _build_solid(votes), _build_cavity(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
             if cavity is not None:
-                wall = _measure_wall(profile, outward)
-                return _build_thin_wall(swollen, cavity, profile, outward, wall, swelling * votes.band)
+                return _build_thin_wall(swollen, cavity, profile, outward, swelling * votes.band)
     section = _build_solid(votes)
     return None if section.is_empty() else (section, CrossSection())
 
@@ -156,14 +142,10 @@ def _measure_wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float
 
 
 def _build_thin_wall(
-    votes: _Votes,
-    cavity: Cells,
-    profile: Profile,
-    outward: Float64[np.ndarray, " n"],
-    wall: float,
-    swelling: float,
+    votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], swelling: float
 ) -> tuple[CrossSection, CrossSection]:
     """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
+    wall = _measure_wall(profile, outward)
     outer = _find_outer_profile(profile, outward)
     completed, floor_z = _complete_cavity(votes, cavity, outer, wall)
     hole = _build_cavity(votes, completed, swelling)
@@ -183,9 +165,8 @@ def _build_thin_wall(
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
     carved = _build_solid(votes)
     rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
-    least = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24) ^ _build_rectangle(
-        2.0, votes.bottom, rim
-    )
+    thin = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24)
+    least = thin ^ _build_rectangle(2.0, votes.bottom, rim)
     sealed = hole - _build_rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
     return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
 
@@ -226,16 +207,15 @@ def _find_outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) ->
 
 def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) -> tuple[Cells, float]:
     """Complete the cavity by cells that its own wall hid, down to the visible floor or to a wall above the bottom."""
-    nr = cavity.shape[0]
     unknown = np.isnan(votes.field)
     rows = np.flatnonzero(cavity.any(axis=0))
-    walled = [k for k in rows if _touches_wall(votes, cavity, int(k))]
+    edges = {int(k): int(np.flatnonzero(cavity[:, k])[-1]) for k in rows}
+    walled = [k for k, edge in edges.items() if (votes.field[edge + 1 : edge + 3, k] > 0.0).any()]
     lowest = walled[0] if walled else int(rows[0])
     completed = cavity.copy()
-    index = np.arange(nr)
+    index = np.arange(cavity.shape[0])
     for k in range(lowest, int(rows[-1]) + 1):
-        edge = int(np.flatnonzero(cavity[:, k])[-1]) if cavity[:, k].any() else -1
-        completed[:, k] |= unknown[:, k] & (index <= edge)
+        completed[:, k] |= unknown[:, k] & (index <= edges.get(k, -1))
     radius = int(completed[:, lowest].sum())
     below = votes.field[: max(int(0.7 * radius), 1), max(lowest - 3, 0) : lowest + 1]
     if float((below > 0.0).any(axis=1).mean()) > 0.3:
@@ -248,11 +228,6 @@ def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) 
             limit = min(limit, float(np.interp(z, outer[:, 1], outer[:, 0])) - wall)
         completed[:, k] |= (index + 0.5) * votes.cell <= limit
     return completed, votes.bottom + votes.cell * floor
-
-
-def _touches_wall(votes: _Votes, cavity: Cells, row: int) -> bool:
-    edge = int(np.flatnonzero(cavity[:, row])[-1])
-    return bool((votes.field[edge + 1 : edge + 3, row] > 0.0).any())
 
 
 def _trace_outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSection:

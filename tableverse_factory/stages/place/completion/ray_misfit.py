@@ -12,35 +12,25 @@ from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, p
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 RAYS = 1200
-WORST_M = 0.012
-"""Greatest cost of one ray [m]: of one that misses though the object was seen, or the reverse."""
+WORST_M = 0.012  # greatest cost of one ray [m]: of one that misses though the object was seen, or the reverse
 PAST_MARGIN_M = 0.004
+# Least cost of a ray that meets the shape though the picture shows something else there [m]: a sheet no higher than the
+# noise of the depth is wrong by its silhouette alone.
 SILHOUETTE_M = 0.003
-"""Least cost of a ray that meets the shape though the picture shows something else there [m]: a sheet no higher than
-the noise of the depth is wrong by its silhouette alone."""
 
 Depths = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaySample(Frozen):
-    """Regular sample of the window's rays, in the table frame.
+    """Regular sample of the window's rays, in the table frame."""
 
-    Attributes:
-        eye: Common origin [m].
-        directions: Scaled so that a parameter along a ray is the depth of the point. Shape (n, 3).
-        end: Observed depth of the ray's end [m]; 0 where it is unknown.
-        facing: Cosine of incidence where the object was seen.
-        own: Rays of the object's pixels.
-        past: Rays that pass the object.
-    """
-
-    eye: Vector3
-    directions: Points
-    end: Depths
-    facing: Depths
-    own: Bool[np.ndarray, " n"]
-    past: Bool[np.ndarray, " n"]
+    eye: Vector3  # common origin [m]
+    directions: Points  # scaled so that a parameter along a ray is the depth of the point
+    end: Depths  # observed depth of the ray's end [m]; 0 where it is unknown
+    facing: Depths  # cosine of incidence where the object was seen
+    own: Bool[np.ndarray, " n"]  # rays of the object's pixels
+    past: Bool[np.ndarray, " n"]  # rays that pass the object
 
 
 def sample_rays(view: ObjectView, count: int = RAYS) -> RaySample:
@@ -59,11 +49,9 @@ def sample_rays(view: ObjectView, count: int = RAYS) -> RaySample:
 
 
 def compute_misfit(rays: RaySample, hit: Depths) -> float:
-    """Compute the mean disagreement of a shape with the picture over the object's rays [m].
+    """Compute the mean disagreement with the picture [m] of a shape that rays meet at a depth [m], infinite for a miss.
 
-    Args:
-        rays: Observed rays.
-        hit: Depth at which each ray meets the shape [m], infinite where it misses.
+    It is a mean over the object's rays.
     """
     met = np.isfinite(hit)
     gap = np.abs(np.where(met, hit, 0.0) - rays.end) * rays.facing
@@ -74,11 +62,11 @@ def compute_misfit(rays: RaySample, hit: Depths) -> float:
     return float(cost.sum() / max(int(rays.own.sum()), 1))
 
 
-def cast_on_mesh(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> Depths:
-    """Cast the rays on a placed mesh: the depth of each hit [m], infinite for a miss."""
+def compute_mesh_misfit(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> float:
+    """Compute the misfit of a placed mesh [m]."""
     scene = make_raycasting_scene(TriangleMesh(transform_points(pose, mesh.vertices), mesh.faces))
     packed = pack_rays(rays.eye, rays.directions)
-    return scene.cast_rays(packed, nthreads=1)["t_hit"].numpy().astype(np.float64)
+    return compute_misfit(rays, scene.cast_rays(packed, nthreads=1)["t_hit"].numpy().astype(np.float64))
 
 
 def intersect_box(rays: RaySample, pose: Pose, half_size: Vector3) -> Depths:

@@ -21,8 +21,7 @@ FIT_POINTS = 1500
 SLICES = 24
 WORST_SPREAD_M = 0.01
 UPRIGHT_COS = 0.998
-KEPT_SHARE = 0.8
-"""Share of the points that has to agree: the rest may be a handle."""
+KEPT_SHARE = 0.8  # share of the points that has to agree: the rest may be a handle
 
 
 def propose_axes(view: ObjectView) -> list[tuple[Pose, float]]:
@@ -32,17 +31,13 @@ def propose_axes(view: ObjectView) -> list[tuple[Pose, float]]:
     """
     step = max(1, len(view.points) // FIT_POINTS)
     points, normals = view.points[::step], view.normals[::step]
-    directions = [np.array([0.0, 0.0, 1.0]), _find_long_direction(points)]
+    flat = points[:, :2] - points[:, :2].mean(axis=0)
+    long = np.linalg.eigh(flat.T @ flat)[1][:, 1]
+    directions = [np.array([0.0, 0.0, 1.0]), np.array([*long, 0.0])]
     free = _fit_normal_line(points, normals)
     if free is not None and abs(free[2]) < UPRIGHT_COS:
         directions.append(free)
     return [_refine_axis(points, normals, _fit_axis_position(points, normals, direction)) for direction in directions]
-
-
-def _find_long_direction(points: Points) -> Vector3:
-    flat = points[:, :2] - points[:, :2].mean(axis=0)
-    _, vectors = np.linalg.eigh(flat.T @ flat)
-    return np.array([vectors[0, 1], vectors[1, 1], 0.0])
 
 
 def _fit_normal_line(points: Points, normals: Points) -> Vector3 | None:

@@ -11,35 +11,25 @@ from tableverse_factory.geometry.mesh.surface_samples import compute_surface_are
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
-from tableverse_factory.stages.place.completion.ray_misfit import RaySample, cast_on_mesh, compute_misfit, sample_rays
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.voxel_carving import carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
-BOX_DISCOUNT_M = 0.0008
-"""Most misfit forgiven to boxes [m]: flat faces carry the whole error of a depth camera, which a free shape follows."""
 BOX_DISCOUNT = 0.4
-HOLLOW_BONUS_M = 0.0012
-"""Bonus of an observed cavity [m]: a thin wall in noise must not lose against a solid that follows the noise."""
-UNAVOIDABLE_M = 0.0003
-"""Misfit of even the true shape [m]: a kind whose freedom alone costs more is not tried."""
+BOX_DISCOUNT_M = 0.0008  # most forgiven to boxes [m]: flat faces carry all error of the depth, free shapes follow it
+HOLLOW_BONUS_M = 0.0012  # of a cavity seen [m]: a thin wall in noise must not lose to a solid that follows the noise
+UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedom alone costs more is not tried
 
-RAGGED_M = 0.002
-"""Cost of surface area beyond a smooth solid's, per area of the hull [m]."""
-SMOOTH = 1.03
-"""Surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones."""
+RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
+SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
 
-Shape = tuple[TriangleMesh, Pose, float]
-"""Mesh, pose, and cost: disagreement with the picture [m]."""
+Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
 
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
-    """Fit boxes, a surface of revolution, a half-turn symmetric solid and columns, and select the best.
-
-    Raises:
-        GeometryError: if no shape fits the points.
-    """
+    """Fit boxes, a surface of revolution, a half-turn symmetric solid and columns, and select the best."""
     rays = sample_rays(view)
     best: tuple[float, str, TriangleMesh, Pose] | None = None
     reasons: list[str] = []
@@ -66,29 +56,29 @@ def _discount_box(box: SolidBox) -> Shape:
 
 
 def _make_revolution(view: ObjectView, rays: RaySample) -> Shape | None:
-    fit = fit_revolution(view, rays)
-    return None if fit is None else (fit.mesh, fit.pose, fit.cost - (HOLLOW_BONUS_M if fit.hollow else 0.0))
+    if (fit := fit_revolution(view, rays)) is None:
+        return None
+    mesh, pose, cost, hollow = fit
+    return mesh, pose, cost - (HOLLOW_BONUS_M if hollow else 0.0)
 
 
 def _make_half_turn(view: ObjectView, rays: RaySample) -> Shape:
     mesh, pose = carve_half_turn(view)
-    return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose)) + _measure_raggedness(mesh)
-
-
-def _measure_raggedness(mesh: TriangleMesh) -> float:
-    """Compute the cost of a solid torn by free space around an occluder [m]."""
     try:
         hull = float(ConvexHull(mesh.vertices).area)
     except QhullError as error:
         raise GeometryError("what free space leaves is flat") from error
-    return RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)
+    raggedness = RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)  # torn by free space at an occluder
+    return mesh, pose, compute_mesh_misfit(rays, mesh, pose) + raggedness
 
 
 def _make_columns(view: ObjectView, rays: RaySample) -> Shape:
     mesh, pose = carve_columns(view)
-    return mesh, pose, compute_misfit(rays, cast_on_mesh(rays, mesh, pose))
+    return mesh, pose, compute_mesh_misfit(rays, mesh, pose)
 
 
+# Name in the dataset, cost of its freedom to follow the picture [m] and best fit of each kind, in the order of trial:
+# the fewer freedoms a kind has, the earlier and the cheaper.
 KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Shape | None]], ...] = (
     ("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
     ("carved/revolution", 1e-4, _make_revolution),
@@ -96,5 +86,3 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Shape | None]],
     ("carved/half_turn", 5e-4, _make_half_turn),
     ("carved/columns", 2.0e-3, _make_columns),
 )
-"""Name in the dataset, cost of its freedom to follow the picture [m] and best fit of each kind, in the order of trial:
-the fewer freedoms a kind has, the earlier and the cheaper."""

@@ -6,6 +6,7 @@ edges are sheets of that thickness; all else reaches the support.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -13,24 +14,21 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Vector3
-from tableverse_factory.stages.place.completion.half_width import compute_half_width
 
 MIN_THICKNESS_M = 0.002
-BAR_HALF_WIDTH_M = 0.0125
-"""Greatest half width of a bar [m]; wider parts are sheets or solids."""
-BAR_SHAPE = 3.2
-"""Most thickness of a bar in half widths: a thicker part stands, and is no bar."""
-SHEET_SHARE = 0.3
-SHEET_M = 0.008
-"""Most thickness of a sheet's edge, in half widths and [m]: round bodies have thicker ones."""
-SETTLED_M = 0.004
-"""Height above the support up to which an edge rests on it [m]."""
-FACING_COS = 0.1
-"""Least cosine between an edge's outward direction and the camera: others hide their end."""
+BAR_HALF_WIDTH_M = 0.0125  # greatest half width of a bar [m]; wider parts are sheets or solids
+BAR_SHAPE = 3.2  # most thickness of a bar in half widths: a thicker part stands, and is no bar
+SHEET_SHARE, SHEET_M = (
+    0.3,
+    0.008,
+)  # most thickness of a sheet's edge, in half widths and [m]: round bodies have more
+SETTLED_M = 0.004  # height above the support up to which an edge rests on it [m]
+FACING_COS = 0.1  # least cosine between an edge's outward direction and the camera: others hide their end
 EDGES = 12
 MEDIAN_CELLS = 5
 STEEP = 0.35
 SMOOTHING_CELLS = 1.5
+LEVELS = 12  # of the radius of discs
 
 Map = Float64[np.ndarray, "nx ny"]
 Cells = Bool[np.ndarray, "nx ny"]
@@ -39,42 +37,24 @@ Values = Float64[np.ndarray, " n"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint(Frozen):
-    """Observations from above over a grid of columns.
-
-    Attributes:
-        cell: Spacing [m].
-        closed: Columns of the object.
-        top: Highest point seen in each column, of the nearest one where none was [m].
-        lowest: Lowest point seen in each column, infinite where none was [m].
-        empty_to: Highest point below the top of each column that was seen empty, the support where none was [m].
-        to_eye: Direction to the camera, unit length.
-    """
+    """Observations from above over a grid of columns with a spacing of `cell` [m]."""
 
     cell: float
-    closed: Cells
-    top: Map
-    lowest: Map
-    empty_to: Map
-    to_eye: Vector3
+    closed: Cells  # columns of the object
+    top: Map  # highest point seen in each column, of the nearest one where none was [m]
+    lowest: Map  # lowest point seen in each column, infinite where none was [m]
+    empty_to: Map  # highest point below the top of each column that was seen empty, the support where none was [m]
+    to_eye: Vector3  # direction to the camera, unit length
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Edges(Frozen):
-    """The visible border of a footprint, one entry per column.
+class _Edges(NamedTuple):
+    """The visible border of a footprint, one entry per column."""
 
-    Attributes:
-        at: Row and column. Shape (n, 2).
-        raised: Whether it was seen to end above the support.
-        bar: Thickness, were the part a bar [m].
-        twice_middle: Top and bottom of such a bar together [m].
-        sheet: Thickness across it, were the part a sheet [m].
-    """
-
-    at: Int64[np.ndarray, "n 2"]
-    raised: Values
-    bar: Values
-    twice_middle: Values
-    sheet: Values
+    at: Int64[np.ndarray, "n 2"]  # row and column
+    raised: Values  # whether it was seen to end above the support
+    bar: Values  # thickness, were the part a bar [m]
+    twice_middle: Values  # top and bottom of such a bar together [m]
+    sheet: Values  # thickness across it, were the part a sheet [m]
 
 
 def estimate_underside(footprint: Footprint, support: float) -> Map:
@@ -98,6 +78,18 @@ def estimate_underside(footprint: Footprint, support: float) -> Map:
     thin = top - np.maximum(across, MIN_THICKNESS_M) / upright[at]
     under[at] = np.maximum(np.where(bar, mirrored, np.where(sheet, thin, support)), support)
     return ndimage.median_filter(under, size=MEDIAN_CELLS)
+
+
+def compute_half_width(inside: Map) -> Map:
+    """Compute the radius of the largest disc in a shape that covers each cell, of each cell's distance to its border.
+
+    Both are in cells; the distance is 0 outside.
+    """
+    result = inside.copy()
+    for radius in np.linspace(0.0, float(inside.max()), LEVELS)[1:]:
+        covered = ndimage.distance_transform_edt(inside < radius) < radius
+        result = np.maximum(result, np.where(covered, radius, 0.0))
+    return result
 
 
 def _find_edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _Edges:

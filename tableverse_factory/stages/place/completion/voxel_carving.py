@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.planes import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import Rectangle, fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     invert_pose,
     multiply_quaternions,
@@ -48,28 +48,11 @@ WORST_TURN_M = 0.01
 SLACK = 0.05  # weight of distance from free space against depth in it, in the search for the axis of the half turn
 
 
-def fit_own_frame(view: ObjectView) -> tuple[Pose, Vector3, Vector3]:
-    """Fit the object's upright frame with the yaw of its smallest rectangle, and its bounds in that frame [m].
-
-    Raises:
-        GeometryError: if the points span no area.
-    """
-    rectangle = fit_min_rectangle(view.points[:, :2])
-    top = max(float(np.quantile(view.points[:, 2], 0.998)), view.support_z + MIN_THICKNESS_M)
-    height = top - view.support_z
-    center = np.array([*rectangle.center, view.support_z + height / 2])
-    half = np.array([*rectangle.half_size, height / 2])
-    return Pose(center, quaternion_about_z(rectangle.yaw)), -half, half
-
-
 def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
-    """Carve the solid below the observed points by free space, down to the support or its underside.
-
-    Raises:
-        GeometryError: if the points span no area or nothing is left.
-    """
-    pose, low, high = fit_own_frame(view)
-    grid, stretch = _build_flat_grid(view, low, high)
+    """Carve the solid below the observed points by free space, down to the support or its underside."""
+    rectangle = fit_min_rectangle(view.points[:, :2])
+    pose, half = _place_frame(view, rectangle, rectangle.center)
+    grid, stretch = _build_flat_grid(view, half)
     local = grid.points() / np.array([1.0, 1.0, stretch])
     free = measure_free_space(view, local, pose).reshape(grid.shape)
     field = np.minimum(_compute_column_field(view, pose, grid, stretch, free), free)
@@ -80,18 +63,13 @@ def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
 
 
 def carve_half_turn(view: ObjectView) -> tuple[TriangleMesh, Pose]:
-    """Carve the solid by free space, and by the same turned by half about a vertical axis for the hidden side.
-
-    Raises:
-        GeometryError: if the points span no area or nothing is left.
-    """
+    """Carve the solid by free space, and by the same turned by half about a vertical axis for the hidden side."""
     center = _find_turn_center(view)
     turned = 2 * center - view.points[:, :2]
     rectangle = fit_min_rectangle(np.concatenate([view.points[:, :2], turned]))
-    top = max(float(np.quantile(view.points[:, 2], 0.998)), view.support_z + MIN_THICKNESS_M)
-    half = np.array([*rectangle.half_size, (top - view.support_z) / 2])
-    pose = Pose(np.array([*center, view.support_z + half[2]]), quaternion_about_z(rectangle.yaw))
-    grid = _build_grid(-half, half)
+    pose, half = _place_frame(view, rectangle, center)
+    cell = float(np.clip((2 * half).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
+    grid = make_grid(-half - cell, half + cell, cell)
     local = grid.points()
     turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
     free = np.minimum(measure_free_space(view, local, pose), measure_free_space(view, local, turned_pose))
@@ -105,9 +83,11 @@ def carve_half_turn(view: ObjectView) -> tuple[TriangleMesh, Pose]:
     return _extract_mesh(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
 
 
-def _build_grid(low: Vector3, high: Vector3) -> VoxelGrid:
-    cell = float(np.clip((high - low).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
-    return make_grid(low - cell, high + cell, cell)
+def _place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndarray, "2"]) -> tuple[Pose, Vector3]:
+    """Place an upright frame about a centre with the yaw of a rectangle; returns it and half the object's size [m]."""
+    top = max(float(np.quantile(view.points[:, 2], 0.998)), view.support_z + MIN_THICKNESS_M)
+    half = np.array([*rectangle.half_size, (top - view.support_z) / 2])
+    return Pose(np.array([*center, view.support_z + half[2]]), quaternion_about_z(rectangle.yaw)), half
 
 
 def _extract_mesh(field: Field, grid: VoxelGrid) -> TriangleMesh:
@@ -123,15 +103,13 @@ def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
     def cost(center: Float64[np.ndarray, "2"]) -> float:
         turned = np.column_stack([2 * center - points[:, :2], points[:, 2]])
         gap = np.clip(measure_free_space(view, turned), -WORST_TURN_M, WORST_TURN_M)
-        outside = frame.distance(center)
-        return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + outside
+        return float(np.where(gap < 0.0, -gap, SLACK * gap).mean()) + frame.distance(center)
 
     frame = fit_min_rectangle(points[:, :2])
     away = points[:, :2].mean(axis=0) - view.eye[:2]
     away /= max(float(np.linalg.norm(away)), 1e-9)
-    start = frame.center
     reach = 0.25 * float(np.ptp(points[:, :2], axis=0).max())
-    best = min((start + k * reach * away for k in (-0.5, 0.0, 0.5, 1.0)), key=cost)
+    best = min((frame.center + k * reach * away for k in (-0.5, 0.0, 0.5, 1.0)), key=cost)
     simplex = best + np.array([[0.0, 0.0], [0.008, 0.0], [0.0, 0.008]])
     options = {"initial_simplex": simplex, "maxfev": 60, "xatol": 2e-4, "fatol": 1e-6}
     return np.asarray(minimize(cost, best, method="Nelder-Mead", options=options).x)
@@ -143,15 +121,15 @@ def _is_torn(field: Field) -> bool:
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
 
 
-def _build_flat_grid(view: ObjectView, low: Vector3, high: Vector3) -> tuple[VoxelGrid, float]:
+def _build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]:
     """Build a grid and the stretch of its heights: flat objects need finer vertical steps."""
-    size = high - low
+    size = 2 * half
     pixel = float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) / view.camera.fx
     cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
     cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
     stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
     scale = np.array([1.0, 1.0, stretch])
-    return make_grid(low * scale - cell, high * scale + cell, cell), stretch
+    return make_grid(-half * scale - cell, half * scale + cell, cell), stretch
 
 
 def _compute_column_field(
@@ -162,8 +140,7 @@ def _compute_column_field(
     z = grid.axes()[2] / stretch
     index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
     index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
-    top = np.full(grid.shape[:2], -np.inf)
-    lowest = np.full(grid.shape[:2], np.inf)
+    top, lowest = np.full(grid.shape[:2], -np.inf), np.full(grid.shape[:2], np.inf)
     np.maximum.at(top, (index[:, 0], index[:, 1]), local[:, 2])
     np.minimum.at(lowest, (index[:, 0], index[:, 1]), local[:, 2])
     seen = np.isfinite(top)

@@ -18,21 +18,13 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.mesh_service.daemon import build_spec, request_meshes
 
 _VERSION = b"meshes 2"
-_MAX_ROUNDS = 4
-"""Rounds of cache lookup and request: to learn who answers, to request meshes, to read them, and one to spare."""
-_MODEL_CACHE: dict[str, dict[str, Any]] = {}
-"""Model behind each command, as last received by this worker."""
+_MAX_ROUNDS = 4  # of cache lookup and request: to learn who answers, to request meshes, to read them, one to spare
+_MODEL_CACHE: dict[str, dict[str, Any]] = {}  # model behind each command, as last received by this worker
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RgbdImage(Frozen):
-    """Picture and depth of a scene.
-
-    Attributes:
-        color: Shape (h, w, 3) sRGB.
-        depth: Shape (h, w), along the optical axis [m]; 0 where unknown.
-        camera: Intrinsics of both.
-    """
+    """Picture, shape (h, w, 3) sRGB, and depth along the optical axis, shape (h, w) [m], 0 where unknown."""
 
     color: Picture
     depth: DepthImage
@@ -41,12 +33,7 @@ class RgbdImage(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeshQuery(Frozen):
-    """One object of a picture.
-
-    Attributes:
-        mask: Pixels of the object. Shape (h, w).
-        seed: Random seed for the model.
-    """
+    """Pixels of one object, shape (h, w), and the seed for the model."""
 
     mask: Mask
     seed: int
@@ -54,15 +41,7 @@ class MeshQuery(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class MeshFile:
-    """Mesh file of a model; untrusted.
-
-    Attributes:
-        data: Bytes of the file.
-        format: One of `requests.FORMATS`.
-        up: Axis of the file's coordinates that points up.
-        model: Name and version of the model.
-        licence: Licence of the mesh, as the model's process names it.
-    """
+    """Untrusted mesh file, one of `requests.FORMATS` and `requests.UPS`; `model` has its version."""
 
     data: bytes
     format: str
@@ -71,18 +50,11 @@ class MeshFile:
     licence: str
 
 
-MeshAnswer = MeshFile | str
-"""A mesh, or the reason why there is none, in one line."""
+MeshAnswer = MeshFile | str  # a mesh, or the reason why there is none, in one line
 
 
 class MeshClient:
-    """Client of the process of one command.
-
-    Args:
-        command: Program and arguments.
-        silence_s: Longest wait for an answer of the process [s].
-        services: Names the cache folder.
-    """
+    """Client of the process of one command (program and arguments), which is silent for at most `silence_s` [s]."""
 
     def __init__(self, command: tuple[str, ...], silence_s: float, services: Services) -> None:
         self._command, self._silence_s = command, silence_s
@@ -125,7 +97,6 @@ class MeshClient:
     def _build_request(
         self, model: Mapping[str, Any] | None, view: RgbdImage, queries: Sequence[MeshQuery], missing: Mapping[int, str]
     ) -> dict[str, Any]:
-        """Build the request to the daemon: the view once, and the mask of each missing object."""
         camera = view.camera
         picture = {
             "picture": _encode(encode_png(view.color, compress_level=1)) if missing else "",

@@ -19,10 +19,8 @@ from tableverse_factory.models.local.model_daemon import Spec, ask_daemon, run_d
 from tableverse_factory.stages.place.mesh_service.process import MeshProcess, ProcessFaultError, select_environment
 from tableverse_factory.stages.place.mesh_service.requests import MeshRequest, SceneRequest, build_question
 
-SCENES = 8
-"""Maximum number of scenes in a batch."""
-_CLOSE_S = 2.0
-"""Time for the process to end by itself [s]."""
+SCENES = 8  # maximum number of scenes in a batch
+_CLOSE_S = 2.0  # time for the process to end by itself [s]
 
 
 def build_spec(command: tuple[str, ...]) -> Spec:
@@ -52,18 +50,9 @@ def decode_json(arrays: Arrays) -> Any:
 
 
 class MeshDaemon:
-    """Owner of a mesh process, which it replaces after a fault."""
+    """Owner of a mesh process, which it replaces after a fault; `heartbeat` is called every second of any wait."""
 
     def __init__(self, command: tuple[str, ...], heartbeat: Callable[[], None] = lambda: None) -> None:
-        """Start the process.
-
-        Args:
-            command: Program and arguments.
-            heartbeat: Called every second of any wait.
-
-        Raises:
-            ModelAccessError: if the process cannot be started.
-        """
         self._command, self._heartbeat = command, heartbeat
         self._process: MeshProcess | None = None
         self._model: dict[str, Any] = {}
@@ -111,7 +100,6 @@ class MeshDaemon:
         """Request the objects whose scenes expect this process, and cache their meshes.
 
         Raises:
-            ModelAccessError: if the process cannot be started, or cannot load its weights.
             ProcessFaultError: if the process failed; it has been ended then.
         """
         process = self.ensure_process()
@@ -133,7 +121,7 @@ class MeshDaemon:
             process.close()
             if not isinstance(error, ProcessFaultError):
                 raise
-            line = process.read_last_line()
+            line = process.output.read_last_line()
             raise ProcessFaultError(f"{error}; it says: {line}" if line else str(error)) from error
 
     def ensure_process(self) -> MeshProcess:

@@ -31,7 +31,9 @@ def main() -> NoReturn:
         _exec_command(command, kernel)
     os.close(0)
     os.close(1)
-    status = _wait_for(child)
+    pid = status = 0
+    while pid != child:  # orphans that end meanwhile are reaped
+        pid, status = os.waitpid(-1, 0)
     _kill_descendants()
     if os.WIFSIGNALED(status):
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -48,14 +50,6 @@ def _exec_command(command: list[str], kernel: ctypes.CDLL) -> NoReturn:
     except OSError as error:
         os.write(2, f"{command[0]}: {error.strerror}\n".encode(errors="replace"))
     os._exit(1)
-
-
-def _wait_for(child: int) -> int:
-    """Wait for the child and return its status; orphans that end meanwhile are reaped."""
-    while True:
-        pid, status = os.waitpid(-1, 0)
-        if pid == child:
-            return status
 
 
 def _terminate(*_: object) -> NoReturn:

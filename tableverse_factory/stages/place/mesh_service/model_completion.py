@@ -34,12 +34,7 @@ def complete_with_model(
     rng: np.random.Generator,
     services: Services,
 ) -> list[Completion | GeometryError]:
-    """Complete all objects of a scene; pose and size are left to registration, for models have no metric scale.
-
-    Raises:
-        ModelAccessError: if the process does not start.
-        ModelError: if it made no mesh.
-    """
+    """Complete all objects of a scene; pose and size are left to registration, for models have no metric scale."""
     seen = scene.observation
     view = RgbdImage(seen.color, seen.depth, seen.camera)
     draw = int(rng.integers(2**63)).to_bytes(8, "little")
@@ -99,7 +94,6 @@ def _sample_vertex_colors(mesh: TriangleMesh) -> Colors | None:
 
 
 def _transfer_colors(mesh: TriangleMesh, original: TriangleMesh) -> TriangleMesh:
-    """Give each vertex the colour of the nearest original vertex, if the original has colours."""
     if original.vertex_colors is None:
         return mesh
     _, nearest = cKDTree(original.vertices, balanced_tree=False).query(mesh.vertices)

@@ -6,11 +6,12 @@ import re
 import shlex
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import IO, Annotated, Any, Literal
 
 import psutil
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
@@ -21,20 +22,16 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.models.remote.endpoint import Endpoint
 from tableverse_factory.models.remote.http import BoundedClient, send_with_retries
 from tableverse_factory.models.remote.http_errors import format_host
-from tableverse_factory.stages.place.mesh_service.process_output import ProcessOutput
 
 PROTOCOL = 2
-HELLO_S = 120.0
-"""Limit until the process says hello: interpreters, containers and imports, but no weights [s]."""
-LOAD_S = 900.0
-"""Limit for loading weights [s]."""
-MAX_ANSWER_BYTES = 352 * 1024 * 1024
-"""Maximum size of an answer: meshes of 256 MiB and a little more, in base64; longer ones are not read."""
-MAX_BATCH = 32
-"""Maximum number of objects in one request."""
+HELLO_S = 120.0  # limit until the process says hello: interpreters, containers and imports, but no weights [s]
+LOAD_S = 900.0  # limit for loading weights [s]
+MAX_ANSWER_BYTES = 352 * 1024 * 1024  # meshes of 256 MiB and a little more, in base64; longer answers are not read
+MAX_BATCH = 32  # maximum number of objects in one request
 
-_END_S = 1.0
-"""Time in which a process that closed its connection ends [s]."""
+_END_S = 1.0  # time in which a process that closed its connection ends [s]
+_OUTPUT_S = 0.5  # time in which the output of a process that ended is read [s]
+_MAX_LINE = 1 << 16
 _SHOWN = 200
 _PASSED_VARIABLES = re.compile(
     "PATH|HOME|USER|LOGNAME|SHELL|TMPDIR|TZ|LANG|LANGUAGE|LC_(ALL|COLLATE|CTYPE|MESSAGES|MONETARY|NUMERIC|TIME)"
@@ -48,10 +45,8 @@ _PASSED_VARIABLES = re.compile(
     "|CONDA_(EXE|PREFIX|DEFAULT_ENV|ENVS_PATH|PKGS_DIRS)|MAMBA_(EXE|ROOT_PREFIX)"
     "|(APPTAINER|SINGULARITY)_(BIND|CACHEDIR|TMPDIR)"
 )
-_USER_IN_URL = re.compile(r"://\S*@")
-"""Most often with a password, and messages of the process are quoted in records and errors."""
-_POLL_S = 1.0
-"""Interval of the heartbeat during waits [s]."""
+_USER_IN_URL = re.compile(r"://\S*@")  # often with a password, and records and errors quote what the process says
+_POLL_S = 1.0  # interval of the heartbeat during waits [s]
 _LAUNCH = Path(__file__).with_name("launcher.py")
 
 
@@ -78,12 +73,8 @@ class Hello(BaseModel, frozen=True):
     """Line of JSON with which a process says that it listens.
 
     Attributes:
-        protocol: Version of the protocol.
-        url: Address on this machine at which it answers.
-        model: Name of the model.
         version: Version of code and weights; part of the cache key.
-        licence: Licence of the meshes.
-        wants: Further inputs of the model besides picture and mask: `depth`, `seed`.
+        wants: Further inputs of the model besides picture and mask.
         batch: Number of objects that it makes at a time.
     """
 
@@ -100,19 +91,41 @@ class Hello(BaseModel, frozen=True):
         return {"model": self.model, "version": self.version, "licence": self.licence, "wants": sorted(self.wants)}
 
 
-class MeshProcess:
-    """A running mesh process.
+class ProcessOutput:
+    """Output of a process, read in a thread so that it never blocks.
 
     Attributes:
-        hello: What the process said when it began to listen.
+        hello: First line that begins with a brace; empty if there is none yet.
+        is_settled: Set when `hello` is known, or the output has ended without one.
     """
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self.hello, self.is_settled = b"", threading.Event()
+        self._pipe, self._last = pipe, ""
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        with self._pipe:
+            while line := self._pipe.readline(_MAX_LINE):
+                if not self.hello and line.startswith(b"{"):
+                    self.hello = line
+                    self.is_settled.set()
+                elif shown := [text for text in line.decode(errors="replace").splitlines() if text.strip()]:
+                    self._last = shown[-1]
+        self.is_settled.set()
+
+    def read_last_line(self) -> str:
+        """Return the last line besides the hello; it is complete when the process has ended."""
+        self._thread.join(_OUTPUT_S)
+        return sanitize_line(self._last.strip(), _SHOWN)
+
+
+class MeshProcess:
+    """A mesh process and its hello; `heartbeat` is called every second of any wait, which an exception of it ends."""
 
     def __init__(self, command: tuple[str, ...], heartbeat: Callable[[], None] = lambda: None) -> None:
         """Start the process and wait for its hello.
-
-        Args:
-            command: Program and arguments.
-            heartbeat: Called every second of any wait, which an exception ends.
 
         Raises:
             ModelAccessError: if the process does not start, or speaks another protocol.
@@ -129,7 +142,7 @@ class MeshProcess:
         )
         assert self._process.stdin is not None  # noqa: S101 for the type checker
         assert self._process.stdout is not None  # noqa: S101
-        self._stdin, self._output = self._process.stdin, ProcessOutput(self._process.stdout)
+        self._stdin, self.output = self._process.stdin, ProcessOutput(self._process.stdout)
         self.hello = self._require("start", self._await_hello)
 
     @property
@@ -138,11 +151,7 @@ class MeshProcess:
         return self._process.poll() is None
 
     def load(self) -> None:
-        """Let the process load its weights, unless it has.
-
-        Raises:
-            ModelAccessError: if it cannot.
-        """
+        """Let the process load its weights, unless it has, or raise ModelAccessError."""
         if not self._loaded:
             self._require("load", lambda: self.post_question({"pictures": [], "objects": []}, LOAD_S))
             self._loaded = True
@@ -153,18 +162,13 @@ class MeshProcess:
         Raises:
             ProcessFaultError: if it does not come in time, is too long, or is no JSON object.
         """
+        url, model = self.hello.url, self.hello.model
         endpoint = Endpoint(
-            "meshes",
-            self.hello.url,
-            self.hello.model,
-            timeout_s=within_s,
-            read_s=within_s,
-            max_body_bytes=MAX_ANSWER_BYTES,
-            attempts=1,
+            "meshes", url, model, timeout_s=within_s, read_s=within_s, max_body_bytes=MAX_ANSWER_BYTES, attempts=1
         )
 
         async def send(client: BoundedClient) -> Mapping[str, Any]:
-            post = asyncio.ensure_future(client.post(f"{self.hello.url.rstrip('/')}/meshes", json=question))
+            post = asyncio.ensure_future(client.post(f"{url.rstrip('/')}/meshes", json=question))
             try:
                 while not (await asyncio.wait([post], timeout=_POLL_S))[0]:
                     self._heartbeat()
@@ -194,20 +198,16 @@ class MeshProcess:
         self._process.kill()
         self._process.wait()
 
-    def read_last_line(self) -> str:
-        """Return the last line of output; call it after `close`."""
-        return self._output.read_last_line()
-
     def _await_hello(self) -> Hello:
         until = time.monotonic() + HELLO_S
-        while not self._output.is_settled.wait(max(0.0, min(_POLL_S, until - time.monotonic()))):
+        while not self.output.is_settled.wait(max(0.0, min(_POLL_S, until - time.monotonic()))):
             if time.monotonic() >= until:
                 raise ProcessFaultError(f"it was silent for {HELLO_S:g} s")
             self._heartbeat()
-        if not self._output.hello:
+        if not self.output.hello:
             raise ProcessFaultError(self._describe_exit() or "it closed its output without a hello")
         try:
-            return Hello.model_validate_json(self._output.hello)
+            return Hello.model_validate_json(self.output.hello)
         except ValidationError as error:
             first = error.errors()[0]
             problem = sanitize_line(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", _SHOWN)
@@ -221,7 +221,7 @@ class MeshProcess:
             return result
         except ProcessFaultError as fault:
             self.close()
-            line = self.read_last_line()
+            line = self.output.read_last_line()
             shown = sanitize_line(shlex.join(self._command), _SHOWN)
             raise ModelAccessError(
                 f"the mesh process `{shown}` does not {step}: {fault}" + (f"; it says: {line}" if line else "")

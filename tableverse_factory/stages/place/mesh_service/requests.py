@@ -13,28 +13,26 @@ from tableverse_factory.stages.place.mesh_service.process import ProcessFaultErr
 
 FORMATS = ("glb", "obj", "ply", "stl")
 UPS = ("y", "z")
-MAX_FAULTS_IN_A_ROW = 3
-"""Consecutive objects of a scene at which the process fails twice, after which the scene is given up."""
+MAX_FAULTS_IN_A_ROW = 3  # objects of a scene at which the process fails twice, after which the scene is given up
 _MAX_REASON = 300
 
 
 class SceneRequest:
-    """Request of a worker for the objects of a scene.
+    """Request of a worker's `client.MeshClient` for the objects of a scene.
 
     Attributes:
         silence_s: Longest wait for an answer [s].
         picture: Picture with depth and intrinsics, as the process gets them.
-        cache: Cache of meshes.
+        refused: Why the cache folder takes no meshes, which a person must resolve; else empty.
     """
 
     def __init__(self, request: Mapping[str, Any]) -> None:
-        """Read a request of `client.MeshClient`."""
         self._model: dict[str, Any] | None = request["model"]
         self.silence_s, self.picture, self._count = float(request["silence_s"]), request["picture"], request["count"]
         self.cache = DiskCache(Path(request["cache"]), ".json", durable=True)
         self._meshes = [MeshRequest(self, **entry) for entry in request["objects"]]
         self._faults: dict[int, str] = {}
-        self._given_up = self._refused = ""
+        self._given_up = self.refused = ""
 
     def check_model(self, model: dict[str, Any]) -> None:
         """Drop the objects if the worker expects another model; the answer tells it which this one is."""
@@ -43,7 +41,7 @@ class SceneRequest:
 
     def open_meshes(self) -> list["MeshRequest"]:
         """List the objects that still need a mesh."""
-        return [] if self._given_up or self._refused else [mesh for mesh in self._meshes if mesh.reason is None]
+        return [] if self._given_up or self.refused else [mesh for mesh in self._meshes if mesh.reason is None]
 
     def fail(self, number: int, reason: str, fault: ProcessFaultError) -> None:
         """Note that an object has no mesh, and give the scene up after too many of them."""
@@ -54,14 +52,10 @@ class SceneRequest:
         elif len(self._faults) == self._count:
             self._given_up = f"the mesh process made none of {self._count} meshes: {self._faults[0]}"
 
-    def refuse(self, reason: str) -> None:
-        """Note that the cache folder takes no meshes, which a person must resolve."""
-        self._refused = reason
-
     def build_answer(self, model: dict[str, Any]) -> dict[str, Any]:
         """Build the answer to the worker."""
         reasons = {str(mesh.number): mesh.reason for mesh in self._meshes if mesh.reason}
-        return {"model": model, "reasons": reasons, "given_up": self._given_up, "refused": self._refused}
+        return {"model": model, "reasons": reasons, "given_up": self._given_up, "refused": self.refused}
 
 
 @dataclass(slots=True, eq=False)
@@ -69,11 +63,9 @@ class MeshRequest:
     """Request for the mesh of one object.
 
     Attributes:
-        scene: Request that it belongs to.
         mask: PNG file in base64.
         number: Index in the scene.
         key: Cache key of the mesh.
-        seed: Random seed for the model.
         reason: Why there is no mesh; empty if one is cached, None until that is known.
     """
 
@@ -117,7 +109,7 @@ class MeshRequest:
         try:
             self.scene.cache.put(self.key, json.dumps(entry).encode())
         except OSError as error:
-            self.scene.refuse(
+            self.scene.refused = (
                 f"meshes cannot be kept in {self.scene.cache.folder}: {error.strerror or error}. Free space, or set "
                 "TABLEVERSE_CACHE to another folder"
             )

@@ -6,15 +6,17 @@ from skimage.color import rgb2lab
 
 from schemas.geometry import Camera, DepthImage, Mask, Picture
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.stages.place.view.color_model import INSET_PX, RARITY, compute_color_share
-from tableverse_factory.stages.place.view.object_pixels import compute_pixel_normals, filter_depth
+from tableverse_factory.stages.place.view.object_pixels import (
+    INSET_PX,
+    RARITY,
+    compute_color_share,
+    compute_pixel_normals,
+    filter_depth,
+)
 
-CORE_SHARE = 0.35
-"""Depth of a mask's core below its outline, as a share of the deepest pixel's."""
-MIN_OFF = 0.05
-"""Least share of the colours beside the object that are like a flying pixel's."""
-SAME_HUE = 6.0
-"""Least median difference of hue between object and surroundings; below it, shade alone tells nothing."""
+CORE_SHARE = 0.35  # depth of a mask's core below its outline, as a share of the deepest pixel's
+MIN_OFF = 0.05  # least share of the colours beside the object that are like a flying pixel's
+SAME_HUE = 6.0  # least median difference of hue between object and surroundings; below it, shade alone tells nothing
 SMEARED_PX = 4
 MOST_SMEARED = 0.5
 RAMP_FACING = 0.25
@@ -25,16 +27,10 @@ MOSTLY = 0.6
 
 
 def find_flying_pixels(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
-    """Find the object's pixels with the colours of what lies beside it: their readings were smeared over its edge.
+    """Find the object's own pixels with the colours of the background beside it, whose readings [m] were smeared.
 
     Sensors and their filters interpolate between an object and its background. Such pixels lie near the outline, or in
     whole patches whose readings continue into the background without a step; never more than half of the object.
-
-    Args:
-        color: Picture of the window.
-        raw: Depth of the window [m].
-        own: The object's pixels.
-        beside: Pixels of the table and of the unlabelled background.
     """
     nothing = np.zeros(own.shape, dtype=bool)
     inset = ndimage.distance_transform_edt(np.pad(own, 1))[1:-1, 1:-1]
@@ -49,22 +45,15 @@ def find_flying_pixels(color: Picture, raw: DepthImage, own: Mask, beside: Mask)
     foreign[own] = (off > MIN_OFF) & (RARITY * on < off)
     foreign = ndimage.binary_opening(foreign) & own
     at_edge = foreign & (inset <= SMEARED_PX)
-    result = ndimage.binary_propagation(
-        at_edge, mask=foreign & (at_edge | _find_continuous_patches(foreign, raw, beside))
-    )
+    smeared = foreign & (at_edge | _find_continuous_patches(foreign, raw, beside))
+    result = ndimage.binary_propagation(at_edge, mask=smeared)
     return result if result.sum() <= MOST_SMEARED * own.sum() else nothing
 
 
 def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
-    """Find readings near the outline on a surface seen almost edge-on: a sensor's ramp to the background.
+    """Find trusted readings [m] near the outline on a surface seen almost edge-on: a sensor's ramp to the background.
 
     A real surface at such an angle tells little about the shape; a ramp is no surface.
-
-    Args:
-        raw: Depth of the window [m].
-        own: The object's pixels.
-        trusted: Its pixels with a denoised reading.
-        window: Intrinsics of the window.
     """
     depth = filter_depth(raw, trusted)
     cloud = backproject(depth, window)

@@ -1,28 +1,29 @@
-"""Pixels around one object: its own, those that see past it, their depth and normals."""
+"""Pixels around one object: its own, those that see past it, their depth, normals and colours."""
 
 import numpy as np
 from jaxtyping import Float64
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from skimage.color import rgb2lab
 
 from schemas.geometry import Camera, DepthImage, IdImage, Mask, Picture, Points, Pose
 from tableverse_factory.geometry.math.camera import backproject, project
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.stages.place.view.color_model import find_foreign_colors
 
 TABLE_ID = -1
 THINNED_PX = 2.0
 THINNED_STEP_M = 0.006
 LOST_HEIGHT_M = 0.01
-FAR_M = 10.0
-"""End of a ray that passes the object and meets no table [m]."""
+FAR_M = 10.0  # end of a ray that passes the object and meets no table [m]
 LOST_STEP_M = 0.03
-OCCLUDER_STEP_M = 0.01
-"""Least step by which a neighbouring object's pixel is nearer and occludes this one [m]."""
+OCCLUDER_STEP_M = 0.01  # least step by which a neighbouring object's pixel is nearer and occludes this one [m]
 SPILL_HEIGHT_M = 0.01
 SPILL_AWAY_M = 0.006
-TALL_M = 0.04
-"""Least height of an object beside which pixels at its support's height are mask bleed, not a flat part [m]."""
+TALL_M = 0.04  # least height of an object beside which pixels at its support's height are mask bleed, no flat part [m]
+SAMPLES = 400
+NEAR = 12.0  # distance in CIELAB within which colours are alike
+RARITY = 4.0  # ratio of frequencies from which a colour is the background's; so is one that the object lacks
+INSET_PX = 2
 
 
 def find_denoised_pixels(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
@@ -67,7 +68,8 @@ def find_free_pixels(
         return np.zeros(own.shape, dtype=bool), raw
     nearest = ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     own_depth = raw[nearest[0], nearest[1]]
-    end = _compute_ray_ends(raw, ids, window, camera_to_table)
+    plane = _intersect_table(window, camera_to_table)
+    end = np.where((ids == TABLE_ID) & (raw <= 0.0) & np.isfinite(plane), plane, raw)
     hides = (ids > 0) & (end < own_depth - OCCLUDER_STEP_M)
     # An unlabelled pixel above the table, about as far as the nearest own one: the mask may have lost it.
     up = rotation_matrix(camera_to_table.quaternion_wxyz)[2]
@@ -76,14 +78,7 @@ def find_free_pixels(
     past: Mask = ~own & (end > 0.0) & ~hides & ~lost
     doubtful = ~own & (lost | ((end <= 0.0) & (ids <= 0)))
     foreign = find_foreign_colors(color, own, past, doubtful)
-    return past | foreign, np.where(foreign, np.minimum(_intersect_table(window, camera_to_table), FAR_M), end)
-
-
-def _compute_ray_ends(raw: DepthImage, ids: IdImage, window: Camera, camera_to_table: Pose) -> DepthImage:
-    """Compute the ends of rays: the reading, or the table's plane for table pixels without one."""
-    hole = (ids == TABLE_ID) & (raw <= 0.0)
-    plane = _intersect_table(window, camera_to_table)
-    return np.where(hole & np.isfinite(plane), plane, raw)
+    return past | foreign, np.where(foreign, np.minimum(plane, FAR_M), end)
 
 
 def _intersect_table(window: Camera, camera_to_table: Pose) -> DepthImage:
@@ -91,6 +86,32 @@ def _intersect_table(window: Camera, camera_to_table: Pose) -> DepthImage:
     rays = backproject(np.ones((window.height, window.width)), window)
     down = rays @ rotation_matrix(camera_to_table.quaternion_wxyz)[2]
     return np.where(down < -1e-6, -camera_to_table.position[2] / np.minimum(down, -1e-6), np.inf)
+
+
+def find_foreign_colors(color: Picture, own: Mask, past: Mask, asked: Mask) -> Mask:
+    """Find the `asked` pixels whose colour the object lacks, or is far more frequent in the background.
+
+    Sensors lose black and shiny surfaces and steep steps, on the object and beside it; the colour still tells.
+    """
+    answer = np.zeros(own.shape, dtype=bool)
+    core = ndimage.binary_erosion(own, iterations=INSET_PX)
+    if not asked.any() or not core.any():
+        return answer
+    shown = rgb2lab(color)
+    on, off = compute_color_share(shown[asked], shown[core]), compute_color_share(shown[asked], shown[past])
+    answer[asked] = (on == 0.0) | (RARITY * on < off)
+    return answer
+
+
+def compute_color_share(
+    colors: Float64[np.ndarray, "n 3"], known: Float64[np.ndarray, "m 3"]
+) -> Float64[np.ndarray, " n"]:
+    """Compute the share of the known colours that are like each of `colors`."""
+    sample = known[:: max(1, -(-len(known) // SAMPLES))]
+    if len(sample) == 0:
+        return np.zeros(len(colors))
+    counts: Float64[np.ndarray, " n"] = cKDTree(sample).query_ball_point(colors, NEAR, return_length=True)
+    return counts / len(sample)
 
 
 def compute_outline_distance(past: Mask) -> DepthImage:
@@ -120,18 +141,12 @@ def compute_pixel_normals(
 
 def _compute_slope(points: Float64[np.ndarray, "h w 3"], axis: int) -> Float64[np.ndarray, "h w 3"]:
     """Compute central differences over two pixels to each side, one-sided where only one side is known."""
-    step = 2
-    ahead = np.full_like(points, np.nan)
-    back = np.full_like(points, np.nan)
-    front: list[slice] = [slice(None)] * 3
-    rear: list[slice] = [slice(None)] * 3
-    front[axis], rear[axis] = slice(step, None), slice(None, -step)
-    ahead[tuple(rear)] = points[tuple(front)]
-    back[tuple(front)] = points[tuple(rear)]
-    forward, backward = ahead - points, points - back
-    jump = np.linalg.norm(forward, axis=-1, keepdims=True) > 3 * np.linalg.norm(backward, axis=-1, keepdims=True)
-    jump_back = np.linalg.norm(backward, axis=-1, keepdims=True) > 3 * np.linalg.norm(forward, axis=-1, keepdims=True)
-    both = np.where(jump, backward, np.where(jump_back, forward, (forward + backward) / 2))
+    padding = [(2, 2) if k == axis else (0, 0) for k in range(3)]
+    padded, count = np.pad(points, padding, constant_values=np.nan), points.shape[axis]
+    forward = padded.take(range(4, count + 4), axis) - points
+    backward = points - padded.take(range(count), axis)
+    ahead, back = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (forward, backward))
+    both = np.where(ahead > 3 * back, backward, np.where(back > 3 * ahead, forward, (forward + backward) / 2))
     return np.where(np.isfinite(both), both, np.where(np.isfinite(forward), forward, backward))
 
 

@@ -37,15 +37,12 @@ class ObjectView(Frozen):
         instance_id: Value of the object's pixels in `PerceivedObjects.instance_ids`.
         points: Denoised points, table frame [m]. Shape (n, 3).
         normals: Unit normals of `points`, towards the camera, table frame. Shape (n, 3).
-        colors: sRGB of `points`.
         camera: Intrinsics of the window: pixel (0, 0) is the window's corner.
-        camera_to_table: Pose of the camera in the table frame.
-        own: Pixels of the object in the window.
-        depth: Smoothed depth of the window [m]; 0 where unknown.
+        own: Pixels of the object.
+        depth: Smoothed depth [m]; 0 where unknown.
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
         outline_px: Distance of each pixel to the silhouette, the border of `past` [px]; negative within `past`.
-        support: Support of the object, and what it supports.
     """
 
     instance_id: int
@@ -73,13 +70,11 @@ class ObjectView(Frozen):
 
 
 def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSupport) -> ObjectView:
-    """Crop the picture around one object and classify its pixels.
-
-    Raises:
-        GeometryError: if no pixel of the picture is the object's.
-    """
+    """Crop the picture around one object and classify its pixels."""
     rows, columns = _find_window(scene.instance_ids == item.instance_id)
-    window, pose = _crop_camera(scene.observation.camera, rows, columns), scene.camera_to_table
+    whole, pose = scene.observation.camera, scene.camera_to_table
+    size = columns.stop - columns.start, rows.stop - rows.start
+    window = Camera(whole.fx, whole.fy, whole.cx - columns.start, whole.cy - rows.start, *size)
     ids = scene.instance_ids[rows, columns]
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
     color = scene.observation.color[rows, columns]
@@ -114,16 +109,11 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
 
 
 def measure_free_space(view: ObjectView, points: Points, frame: Pose | None = None) -> Distances:
-    """Measure the distance of points from free space [m], negative inside it. Shape (n,).
+    """Measure the distance of points in a frame, else in the table frame, from free space [m], negative inside it.
 
     All in front of the end of a ray is empty; behind the end nothing is known, unless the ray passes the object:
     then it is empty as well. Near the silhouette the distance to it counts, so that the field is continuous across it.
     Rays without depth tell nothing.
-
-    Args:
-        view: The object's view.
-        points: Points in `frame` [m].
-        frame: Frame of the points in the table frame; None for the table frame itself.
     """
     return measure_clearances(view, points, frame)[0]
 
@@ -142,9 +132,7 @@ def measure_clearances(
     u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
     outline = ndimage.map_coordinates(view.outline_px, [v, u], order=1) * z / view.camera.fx
     pixel = np.rint(v).astype(np.intp) * width + np.rint(u).astype(np.intp)
-    end = view.depth.ravel()[pixel]
-    own = view.own.ravel()[pixel]
-    past = view.past.ravel()[pixel]
+    end, own, past = (values.ravel()[pixel] for values in (view.depth, view.own, view.past))
     # Just behind what a ray ends on beside the object there is no object either: without this slack the noise of
     # the table would grow a skirt around every foot.
     depth_gap = np.where(end > 0.0, z - end - np.where(past, PAST_SLACK_M, 0.0), np.inf)
@@ -152,11 +140,6 @@ def measure_clearances(
     clearance = np.where(past, beside, np.minimum(depth_gap, np.abs(outline)))
     hidden = ~inside | ~(own | past)
     return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
-
-
-def _crop_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
-    size = columns.stop - columns.start, rows.stop - rows.start
-    return Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
 
 
 def _remove_bleed(

@@ -10,41 +10,28 @@ from schemas.geometry import Frozen, Points
 from schemas.objects import PerceivedObjects
 from tableverse_factory.geometry.math.transforms import transform_points
 
-ABOVE_M = 0.03
-"""Most height of an object's lowest visible points above its support [m]: its foot can be hidden."""
-BELOW_M = 0.012
-"""Most depth of them below it [m], for noise and flying pixels."""
-TABLE_M = 0.012
-"""Least height of a top above the table's noise [m]."""
+ABOVE_M = 0.03  # most height of an object's lowest visible points above its support [m]: its foot can be hidden
+BELOW_M = 0.012  # most depth of them below it [m], for noise and flying pixels
+TABLE_M = 0.012  # least height of a top above the table's noise [m]
 NEAR_M = 0.01
 MIN_POINTS = 20
 MIN_OVERLAP = 0.1
-CONTAINER_FLOOR_M = 0.005
-"""Height of the hidden floor of a container above the table [m]."""
-LONG_RATIO, STEEP_RATIO = 2.5, 1.9
-"""Least length over breadth of contents that lean on the rim and reach the floor; less for steep ones, which are more
-hidden."""
-STEEP = 0.9
-"""Least sine of the elevation of a steep object's longest axis."""
-CORE = 0.5
-"""Share of a supported object's footprint, about its middle, that has to be supported."""
+CONTAINER_FLOOR_M = 0.005  # height of the hidden floor of a container above the table [m]
+LONG_RATIO = 2.5  # least length over breadth of contents that lean on the rim and reach the floor
+STEEP_RATIO = 1.9  # the same of steep ones, which are more hidden
+STEEP = 0.9  # least sine of the elevation of a steep object's longest axis
+CORE = 0.5  # share of a supported object's footprint, about its middle, that has to be supported
 
 Points2 = Float64[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthSupport(Frozen):
-    """Support of one object, and what it supports.
+    """Support of one object, and what it supports, in the table frame."""
 
-    Attributes:
-        height: Height of the support [m], table frame; 0 is the table.
-        carried: Corners of the middle part of the footprints of all that stands on the object, table frame [m].
-        leaning: Whether it is a long object in a container.
-    """
-
-    height: float
-    carried: Points2
-    leaning: bool = False
+    height: float  # of the support [m]; 0 is the table
+    carried: Points2  # corners of the middle part of the footprints of all that stands on the object [m]
+    leaning: bool = False  # a long object in a container
 
 
 def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:

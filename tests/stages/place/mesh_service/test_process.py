@@ -281,7 +281,7 @@ def test_a_chatty_process_fills_neither_the_disk_nor_the_memory_and_never_waits(
     process = daemon._process
     assert process is not None
     assert str(Path(f"/proc/{process._process.pid}/fd/2").readlink()).startswith("pipe:")
-    assert process.read_last_line() == "step 1/25"
+    assert process.output.read_last_line() == "step 1/25"
 
 
 def test_a_process_knows_where_things_are_and_nothing_else_of_ours(tmp_path, monkeypatch: pytest.MonkeyPatch):

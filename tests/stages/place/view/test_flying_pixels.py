@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
-from tableverse_factory.stages.place.view.color_model import find_foreign_colors
 from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
+from tableverse_factory.stages.place.view.object_pixels import find_foreign_colors
 
 RED, WOOD, BLACK = (190, 40, 45), (150, 115, 80), (12, 12, 14)
 CAMERA = Camera(300.0, 300.0, 40.0, 30.0, 80, 60)
