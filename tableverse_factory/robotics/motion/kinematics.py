@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float64, Int64
 from schemas.geometry import Frozen, Matrix4, Pose, Vector3
 from schemas.trajectories import JointVector
 from tableverse_factory.geometry.math.transforms import matrix_from_pose
+from tableverse_factory.robotics.robots.arm import list_bodies_between
 
 Configurations = Float64[np.ndarray, "b j"]
 Rotations = Float64[np.ndarray, "b 3 3"]
@@ -121,7 +122,7 @@ def build_chain(
     """
     wanted = [model.joint(name).id for name in joint_names]
     offsets, found, pending = [], [], np.eye(4)
-    for body in _find_bodies_between(model, base_body, int(model.site_bodyid[tcp_site])):
+    for body in list_bodies_between(model, base_body, int(model.site_bodyid[tcp_site])):
         pending = pending @ _build_matrix(model.body_pos[body], model.body_quat[body])
         first = model.body_jntadr[body]
         for joint in range(first, first + model.body_jntnum[body]):
@@ -239,14 +240,6 @@ def _compute_rotation_vectors(rotations: Rotations) -> Positions:
     angle = np.arctan2(sine, (m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2] - 1) / 2)
     vectors: Positions = twice / 2 * (angle / np.maximum(sine, 1e-12))[:, None]
     return np.where(sine[:, None] < 1e-9, twice / 2, vectors)
-
-
-def _find_bodies_between(model: mujoco.MjModel, base: int, last: int) -> list[int]:
-    row: list[int] = []
-    while last not in (base, 0):
-        row.append(last)
-        last = int(model.body_parentid[last])
-    return row[::-1]
 
 
 def _build_matrix(position: Vector3, quaternion_wxyz: np.ndarray) -> Matrix4:

@@ -1,12 +1,11 @@
 """Clearance between placed objects (paper, section 3.4).
 
-The paper joins its conditions |Δx| ≥ b_x + b'_x + ε and |Δy| ≥ b_y + b'_y + ε by *and*. Boxes are apart as soon as one
-of them holds; taken literally, the rule would forbid everything straight to the left of a reference, where Δy is 0. One
-of the two is required here. Heights do not count on the table, where hands come from above; an object that is put on or
-into another may reach over a lower one by ε.
+The paper joins its conditions |Δx| ≥ b_x + b'_x + ε and |Δy| ≥ b_y + b'_y + ε by *and*, which would forbid everything
+straight to the left of a reference, where Δy is 0; one of the two is required here. Heights do not count on the table,
+where hands come from above; an object that is put on or into another may reach over a lower one by ε.
 
-Boxes overestimate objects that stand at an angle and may leave no room on a crowded table. There, convex outlines seen
-from above have to be ε apart instead; such placements come last and are marked (`Placement.clear_by`).
+Where boxes leave no room, convex outlines seen from above have to be ε apart instead; such placements come last and are
+marked (`Placement.clear_by`).
 """
 
 from collections.abc import Sequence
@@ -40,8 +39,7 @@ def compute_least_gaps(
     low: Corners, high: Corners, others: Sequence[BodyFeatures], over_lower: bool = False
 ) -> Float64[np.ndarray, " n"]:
     """Compute the least gap of each box to any body [m], infinite without bodies; see `compute_box_gaps`."""
-    gaps = compute_box_gaps(low, high, others, over_lower)
-    return gaps.min(axis=1, initial=np.inf)
+    return compute_box_gaps(low, high, others, over_lower).min(axis=1, initial=np.inf)
 
 
 def are_outlines_clear(

@@ -1,11 +1,10 @@
 """Placement domains Ω of relations, as rectangles from the reference's box (paper, appendix D).
 
-The paper names six predicates; the ten relations of a task are mapped to them and to two more, `next to` and `outside`.
-Directions are those of `geometry.relations`: left is -x, right +x, in front -y, behind +y.
+The paper's six predicates cover eight of the ten relations of a task; `next to` and `outside` are added. Directions are
+those of `geometry.relations`: left is -x, right +x, in front -y, behind +y.
 """
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -21,39 +20,15 @@ DOMAIN_DEPTH_M = 0.25
 NEXT_TO_MARGIN_M = 0.01  # `next to` placements stay closer than the relation's limit by this
 
 
-class Predicate(StrEnum):
-    """Domain shape."""
-
-    TOP = "top"
-    IN = "in"
-    LEFT = "left"
-    RIGHT = "right"
-    FRONT = "front"
-    BACK = "back"
-    NEXT_TO = "next to"
-    OUTSIDE = "outside"
-
-
-PREDICATES = {
-    Relation.ON: Predicate.TOP,
-    Relation.IN: Predicate.IN,
-    Relation.INTO: Predicate.IN,
-    Relation.INSIDE: Predicate.IN,
-    Relation.LEFT: Predicate.LEFT,
-    Relation.RIGHT: Predicate.RIGHT,
-    Relation.IN_FRONT: Predicate.FRONT,
-    Relation.BEHIND: Predicate.BACK,
-    Relation.NEXT_TO: Predicate.NEXT_TO,
-    Relation.OUTSIDE: Predicate.OUTSIDE,
-}
-
-_SIDES = {
-    Predicate.LEFT: ((0, -1.0),),
-    Predicate.RIGHT: ((0, 1.0),),
-    Predicate.FRONT: ((1, -1.0),),
-    Predicate.BACK: ((1, 1.0),),
-    Predicate.NEXT_TO: ((0, 1.0), (0, -1.0), (1, -1.0), (1, 1.0)),
-    Predicate.OUTSIDE: ((0, 1.0), (0, -1.0), (1, -1.0), (1, 1.0)),
+_ALL_SIDES = ((0, 1.0), (0, -1.0), (1, -1.0), (1, 1.0))
+# Sides of the reference, as axis and sign, on which the object may stand; all other relations put it on or in
+SIDES: dict[Relation, tuple[tuple[int, float], ...]] = {
+    Relation.LEFT: ((0, -1.0),),
+    Relation.RIGHT: ((0, 1.0),),
+    Relation.IN_FRONT: ((1, -1.0),),
+    Relation.BEHIND: ((1, 1.0),),
+    Relation.NEXT_TO: _ALL_SIDES,
+    Relation.OUTSIDE: _ALL_SIDES,
 }
 
 
@@ -79,31 +54,27 @@ class PlacementRegion(Frozen):
 
 
 def build_domain(
-    predicate: Predicate, half_xy: Vector2, y: BodyFeatures, delta_margin_m: float
+    relation: Relation, half_xy: Vector2, y: BodyFeatures, delta_margin_m: float
 ) -> tuple[PlacementRegion, ...]:
-    """Build Ω of a predicate, as rectangles for the middle of the placed object's box.
+    """Build Ω of a relation, as rectangles for the middle of the placed object's box.
 
-    `top` and `in` give the face of the reference's box; the level follows from lowering the object. A side is as wide
+    `on` and `in` give the face of the reference's box; the level follows from lowering the object. A side is as wide
     as the reference and begins where the two boxes are `delta_margin_m` apart, so the whole object is beyond the
     margin; it ends `DOMAIN_DEPTH_M` further. `next to` has all four sides up to the relation's gap, and begins no later
-    than halfway to it. `outside` has all four. `half_xy` are half extents of the object's box as it will stand [m].
+    than halfway to it. `half_xy` are half extents of the object's box as it will stand [m].
     """
-    if predicate in (Predicate.TOP, Predicate.IN):
+    if relation not in SIDES:
         return (PlacementRegion(y.low[:2], y.high[:2]),)
     nearest, furthest = delta_margin_m, delta_margin_m + DOMAIN_DEPTH_M
-    if predicate is Predicate.NEXT_TO:
+    if relation is Relation.NEXT_TO:
         nearest, furthest = min(nearest, NEXT_TO_GAP_M / 2), NEXT_TO_GAP_M - NEXT_TO_MARGIN_M
-    return tuple(_build_side_region(axis, sign, half_xy, y, nearest, furthest) for axis, sign in _SIDES[predicate])
-
-
-def _build_side_region(
-    axis: int, sign: float, half_xy: Vector2, y: BodyFeatures, nearest: float, furthest: float
-) -> PlacementRegion:
-    low, high = y.low[:2].copy(), y.high[:2].copy()
-    face = y.high[axis] if sign > 0 else y.low[axis]
-    ends = sorted(face + sign * (half_xy[axis] + gap) for gap in (nearest, furthest))
-    low[axis], high[axis] = ends
-    return PlacementRegion(low, high)
+    regions = []
+    for axis, sign in SIDES[relation]:
+        low, high = y.low[:2].copy(), y.high[:2].copy()
+        face = y.high[axis] if sign > 0 else y.low[axis]
+        low[axis], high[axis] = sorted(face + sign * (half_xy[axis] + gap) for gap in (nearest, furthest))
+        regions.append(PlacementRegion(low, high))
+    return tuple(regions)
 
 
 def sample_regions(regions: tuple[PlacementRegion, ...], count: int, rng: np.random.Generator) -> Points2:

@@ -9,24 +9,20 @@ from tableverse_factory.geometry.relations.relations import relation_holds
 from tableverse_factory.geometry.relations.stable_placement import CONTACT_M, is_stable
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.robotics.placements.clearance import are_outlines_clear, compute_least_gaps
-from tableverse_factory.robotics.placements.domains import Points2, Predicate
+from tableverse_factory.robotics.placements.domains import SIDES, Points2
 from tableverse_factory.robotics.placements.orientations import Orientation
 from tableverse_factory.robotics.placements.request import (
-    CHECKS_PER_PLACEMENT,
-    ENOUGH_CLEAR,
     RELEASE_HEIGHT_M,
     SAMPLES_PER_PLACEMENT,
     CandidatePlacement,
     NoPlacement,
     PlacementRequest,
     PlacementSamples,
-    concatenate_samples,
 )
 
 EDGE_CLEARANCE_M = 0.01  # minimum distance from the object's box to the table's edge
 _FULL_CLEARANCE_M = 0.06  # clearance beyond which a placement is no better
 _UNAMBIGUOUS_M = 0.03  # excess of one axis over the other that makes the side of the reference unambiguous
-_AXES = {Predicate.LEFT: 0, Predicate.RIGHT: 0, Predicate.FRONT: 1, Predicate.BACK: 1}
 Metres = Float64[np.ndarray, " n"]
 Corners = Float64[np.ndarray, "n 3"]
 
@@ -35,22 +31,15 @@ def find_places_beside(
     request: PlacementRequest, turns: tuple[Orientation, ...], rng: np.random.Generator
 ) -> tuple[CandidatePlacement, ...] | NoPlacement:
     """Find up to `request.wanted` placements in the relation's domain on the table, best first."""
-    upright = [turn for turn in turns if _stands_on_table(turn)]
+    upright = [turn for turn in turns if is_stable(turn.body, turn.body.heights.bottom <= turn.body.low[2] + CONTACT_M)]
     if not upright:
         return NoPlacement("does_not_stand", f"{request.x.object_id} as it lies now would not stand on the table")
     lost: Counter[str] = Counter()
     count = -(-SAMPLES_PER_PLACEMENT * request.wanted // len(upright))
-    samples = concatenate_samples(
-        [_sample_heading(request, turn, index, count, lost, rng) for index, turn in enumerate(upright)]
+    parts = [_sample_heading(request, turn, index, count, lost, rng) for index, turn in enumerate(upright)]
+    found = request.judge_samples(
+        parts, lambda heading, cells, clear: _judge_place(request, upright[heading], cells, clear, lost)
     )
-    found: list[CandidatePlacement] = []
-    for index in samples.rank(request.find_avoided_xy())[: CHECKS_PER_PLACEMENT * request.wanted]:
-        if len(found) == request.wanted or (len(found) >= ENOUGH_CLEAR and not samples.clear[index]):
-            break
-        place = _judge_place(
-            request, upright[samples.heading[index]], samples.cells[index], bool(samples.clear[index]), lost
-        )
-        found += [] if place is None else [place]
     told = ", ".join(f"{many} {why}" for why, many in lost.items() if many) or "none on the table"
     return tuple(found) or NoPlacement("no_room", f"of {count * len(upright)} samples {told}")
 
@@ -68,11 +57,6 @@ def _judge_place(
     else:
         return CandidatePlacement(turn, offset, (RELEASE_HEIGHT_M,), "boxes" if clear else "outlines")
     return None
-
-
-def _stands_on_table(turn: Orientation) -> bool:
-    body = turn.body
-    return is_stable(body, body.heights.bottom <= body.low[2] + CONTACT_M)
 
 
 def _sample_heading(
@@ -106,13 +90,9 @@ def _compute_costs(request: PlacementRequest, turn: Orientation, middles: Points
     half = np.maximum((y.high - y.low)[:2] / 2, 1e-3)
     far = np.linalg.norm(np.maximum(apart - half, 0.0), axis=1)
     costs: Metres = 1.0 - np.minimum(room, _FULL_CLEARANCE_M) / _FULL_CLEARANCE_M + far / 0.1 + 0.5 * turn.angle / np.pi
-    if request.predicate in _AXES:
-        axis = _AXES[request.predicate]
+    if len(sides := SIDES[request.relation]) == 1:
+        axis = sides[0][0]
         longer = apart[:, axis] - apart[:, 1 - axis]
-        costs = (
-            costs
-            + 1.0
-            - np.clip(longer, 0.0, _UNAMBIGUOUS_M) / _UNAMBIGUOUS_M
-            + 0.5 * apart[:, 1 - axis] / half[1 - axis]
-        )
+        costs = costs + 1.0 - np.clip(longer, 0.0, _UNAMBIGUOUS_M) / _UNAMBIGUOUS_M
+        costs = costs + 0.5 * apart[:, 1 - axis] / half[1 - axis]
     return costs

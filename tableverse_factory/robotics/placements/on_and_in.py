@@ -6,27 +6,24 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from schemas.curation import Relation
 from schemas.geometry import Vector3
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, MovingSolid
 from tableverse_factory.geometry.collision.solids import Solids
 from tableverse_factory.geometry.math.transforms import rotation_matrix, transform_points
-from tableverse_factory.geometry.mesh.height_maps import CellMask, Heights
+from tableverse_factory.geometry.mesh.height_maps import Heights
 from tableverse_factory.geometry.relations.relations import BodyFeatures, is_inside, relation_holds
 from tableverse_factory.geometry.relations.stable_placement import CONTACT_M, drop_body, is_stable, make_support_surface
 from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.robotics.placements.clearance import are_outlines_clear, compute_least_gaps
-from tableverse_factory.robotics.placements.domains import Predicate
 from tableverse_factory.robotics.placements.orientations import Orientation
 from tableverse_factory.robotics.placements.request import (
-    CHECKS_PER_PLACEMENT,
-    ENOUGH_CLEAR,
     RELEASE_HEIGHT_M,
     SAMPLES_PER_PLACEMENT,
     CandidatePlacement,
     NoPlacement,
     PlacementRequest,
     PlacementSamples,
-    concatenate_samples,
 )
 
 FINGER_REACH_M = 0.02  # minimum reach of fingers beside a held object, from its top
@@ -71,24 +68,22 @@ def find_places_on_or_in(
     With `on_end` the object is stood on its end and must not topple out again.
     """
     y = request.y.body
-    if request.predicate is Predicate.TOP:
-        if not y.flat.any():
-            return NoPlacement("no_stable_top", f"{request.y.object_id} has no level patch that carries anything")
-        return _ReferenceSurface(request, turns, y.flat, on_end=False).find_places(rng)
-    if y.cavity is None:
+    if request.relation is Relation.ON and not y.flat.any():
+        return NoPlacement("no_stable_top", f"{request.y.object_id} has no level patch that carries anything")
+    if request.relation is not Relation.ON and y.cavity is None:
         return NoPlacement("no_container", f"{request.y.object_id} has no room that opens upwards")
-    return _ReferenceSurface(request, turns, y.cavity.cells, on_end=on_end).find_places(rng)
+    return _ReferenceSurface(request, turns, on_end=on_end).find_places(rng)
 
 
 class _ReferenceSurface:
     """The reference with nearby objects."""
 
-    def __init__(
-        self, request: PlacementRequest, turns: tuple[Orientation, ...], room: CellMask, *, on_end: bool
-    ) -> None:
-        self._on_end = on_end
-        self._request, self._turns, self._y = request, turns, request.y.body
-        self._into = request.predicate is Predicate.IN
+    def __init__(self, request: PlacementRequest, turns: tuple[Orientation, ...], *, on_end: bool) -> None:
+        self._request, self._turns, self._y, self._on_end = request, turns, request.y.body, on_end
+        self._into = request.relation is not Relation.ON
+        cavity = self._y.cavity if self._into else None
+        self._rim_z = -np.inf if cavity is None else cavity.rim_z
+        self._room = self._y.flat if cavity is None else cavity.cells
         size = max(float(np.linalg.norm((turn.body.high - turn.body.low)[:2])) for turn in turns)
         things = [o for o in request.others if _compute_box_gap(o.body, self._y) < size]
         near = tuple(o.body for o in things)
@@ -98,26 +93,21 @@ class _ReferenceSurface:
         self._scene = make_support_surface((self._y, *near), request.table, request.cell, size + 2 * request.cell)
         self._heights = self._scene.without(None)
         self._ground = self._heights[self._scene.window_of(self._y.heights)]
-        free = room if self._into else room & (self._ground <= self._y.heights.top + CONTACT_M)
+        free = self._room if self._into else self._room & (self._ground <= self._y.heights.top + CONTACT_M)
         self._depth: Heights = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * request.cell
 
     def find_places(self, rng: np.random.Generator) -> tuple[CandidatePlacement, ...] | NoPlacement:
         """Find where the object stands, or lies within the rim, clear of neighbors, and the relation holds."""
-        wanted = self._request.wanted
-        count = -(-SAMPLES_PER_PLACEMENT * wanted // len(self._turns))
-        samples = concatenate_samples(
-            [self._sample_heading(turn, index, count, rng) for index, turn in enumerate(self._turns)]
-        )
-        found: list[tuple[bool, CandidatePlacement]] = []
+        count = -(-SAMPLES_PER_PLACEMENT * self._request.wanted // len(self._turns))
+        parts = [self._sample_heading(turn, index, count, rng) for index, turn in enumerate(self._turns)]
         lost: Counter[str] = Counter()
-        for index in samples.rank(self._request.find_avoided_xy())[: CHECKS_PER_PLACEMENT * wanted]:
-            if len(found) == wanted or (len(found) >= ENOUGH_CLEAR and not samples.clear[index]):
-                break
-            place = self._lower_object(self._turns[samples.heading[index]], samples.cells[index], lost)
-            found += [] if place is None else [place]
+        found = self._request.judge_samples(
+            parts, lambda heading, cells, _: self._lower_object(self._turns[heading], cells, lost)
+        )
         told = ", ".join(f"{many} {why}" for why, many in lost.items()) or "none over it"
         easy_first = sorted(found, key=lambda entry: entry[0])
-        return tuple(place for _, place in easy_first) or NoPlacement("no_room", f"of {len(samples.costs)} {told}")
+        total = sum(len(part.costs) for part in parts)
+        return tuple(place for _, place in easy_first) or NoPlacement("no_room", f"of {total} {told}")
 
     def _sample_heading(
         self, turn: Orientation, heading: int, count: int, rng: np.random.Generator
@@ -172,9 +162,8 @@ class _ReferenceSurface:
         if self._on_end and not self._is_stable(landed):
             lost["where it would topple out"] += 1
             return None
-        clear = bool(
-            compute_least_gaps(landed.low[None], landed.high[None], self._beside, True)[0] >= request.epsilon_m
-        )
+        gap = compute_least_gaps(landed.low[None], landed.high[None], self._beside, over_lower=True)[0]
+        clear = bool(gap >= request.epsilon_m)
         if not clear and not are_outlines_clear(landed, self._beside, request.epsilon_m, over_lower=True):
             lost[f"within {1e3 * request.epsilon_m:g} mm of something"] += 1
             return None
@@ -186,9 +175,8 @@ class _ReferenceSurface:
             return None
         clear_by = "boxes" if clear else "outlines"
         if self._into:
-            return self._compute_wall_gap(landed) < WALL_GAP_M, CandidatePlacement(
-                turn, offset, self._list_drop_heights(landed, rise), clear_by
-            )
+            place = CandidatePlacement(turn, offset, self._list_drop_heights(landed, rise), clear_by)
+            return self._compute_wall_gap(landed) < WALL_GAP_M, place
         # It will stand on pieces, which may lie higher than the mesh: in a plate, on a lid with a groove.
         higher = max(rise - clearance, 0.0)
         if not relation_holds(request.relation, landed.moved((0, 0), higher), self._y):
@@ -198,23 +186,17 @@ class _ReferenceSurface:
 
     def _is_stable(self, landed: BodyFeatures) -> bool:
         """Test whether an object on its end has its center below the rim, or stands on the floor by itself."""
-        cavity = self._y.cavity
         ground = self._heights[self._scene.window_of(landed.heights)]
-        below = cavity is not None and float(landed.center[2]) < cavity.rim_z
-        return below or is_stable(landed, landed.heights.bottom <= ground + CONTACT_M)
+        return float(landed.center[2]) < self._rim_z or is_stable(landed, landed.heights.bottom <= ground + CONTACT_M)
 
     def _compute_wall_gap(self, landed: BodyFeatures) -> float:
         """Compute the least distance from the object below the rim to the wall, in whole cells [m]."""
-        cavity = self._y.cavity
-        if cavity is None:
-            return 0.0
-        below = landed.heights.bottom < cavity.rim_z - RELEASE_HEIGHT_M
+        below = landed.heights.bottom < self._rim_z - RELEASE_HEIGHT_M
         return float(landed.heights.window(self._y.heights, self._depth, 0.0)[below].min(initial=np.inf))
 
     def _list_drop_heights(self, landed: BodyFeatures, least: float) -> tuple[float, ...]:
         """List release heights: low in the vessel, or with fingers above the rim, in the order that suits its width."""
-        cavity = self._y.cavity
-        above = cavity.rim_z + FINGER_REACH_M - float(landed.high[2]) if cavity is not None else 0.0
+        above = self._rim_z + FINGER_REACH_M - float(landed.high[2])
         if above <= least:
             return (least,)
         width = 2 * float(self._depth.max())
@@ -224,8 +206,7 @@ class _ReferenceSurface:
     def _is_content(self, other: BodyFeatures) -> bool:
         """Test whether a body lies in the vessel, or leans in it with its middle over the room."""
         index = np.floor(other.center[:2] / self._request.cell).astype(np.int64) - np.array(self._y.heights.corner)
-        room = self._y.cavity.cells if self._y.cavity is not None else np.zeros((0, 0), dtype=bool)
-        over = bool(((index >= 0) & (index < room.shape)).all()) and bool(room[tuple(index)])
+        over = bool(((index >= 0) & (index < self._room.shape)).all()) and bool(self._room[tuple(index)])
         return over or (_compute_box_gap(other, self._y) < 0.0 and is_inside(other, self._y))
 
 

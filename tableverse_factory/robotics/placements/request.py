@@ -1,7 +1,8 @@
 """Placement requests and their results."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -14,10 +15,7 @@ from tableverse_factory.geometry.relations.relations import BodyFeatures, relati
 from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.physics.mjcf.slab import Slab
 from tableverse_factory.robotics.placements.domains import (
-    PREDICATES,
-    PlacementRegion,
     Points2,
-    Predicate,
     Vector2,
     build_domain,
     sample_regions,
@@ -31,6 +29,7 @@ RELEASE_HEIGHT_M = 0.002  # release height above the support: a pressed-down obj
 SAMPLES_PER_PLACEMENT = 100  # samples per requested placement (`TrajectoriesConfig.placements`)
 CHECKS_PER_PLACEMENT = 6  # maximum number of samples per requested placement checked on true shapes, the expensive part
 ENOUGH_CLEAR = 6  # with this many placements clear by boxes, outlines are not tried
+Accepted = TypeVar("Accepted")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,12 +61,6 @@ class PlacementSamples(Frozen):
             near = (np.abs(self.middles[left] - self.middles[first]) < ALIKE_RADIUS_M).all(axis=1)
             left = left[~(near & (self.heading[left] == self.heading[first]))]
         return [*firsts, *map(int, order[~np.isin(order, firsts)])]
-
-
-def concatenate_samples(parts: Sequence[PlacementSamples]) -> PlacementSamples:
-    """Concatenate the samples of several headings."""
-    names = ("heading", "cells", "middles", "costs", "clear")
-    return PlacementSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +101,6 @@ class PlacementRequest:
     wanted: int  # number of placements
 
     @property
-    def predicate(self) -> Predicate:
-        """Domain shape of the relation."""
-        return PREDICATES[self.relation]
-
-    @property
     def cell(self) -> float:
         """Cell size of the height maps, by which objects are moved [m]."""
         return self.x.body.heights.cell
@@ -129,20 +117,10 @@ class PlacementRequest:
         pieces = min(float((hull.vertices @ low).min()) for hull in self.x.hulls) + float(self.x.pose.position[2])
         return min(pieces, float(self.x.body.low[2]))
 
-    def find_avoided_xy(self) -> Vector2 | None:
-        """Return the object's present middle if the relation holds there already, as the object has to move."""
-        body = self.x.body
-        middle: Vector2 = (body.low + body.high)[:2] / 2
-        return middle if relation_holds(self.relation, body, self.y.body) else None
-
-    def regions(self, turn: Orientation) -> tuple[PlacementRegion, ...]:
-        """Build the domain for the middle of the rotated object's box."""
-        half = (turn.body.high - turn.body.low)[:2] / 2
-        return build_domain(self.predicate, half, self.y.body, self.delta_margin_m)
-
     def sample_cells(self, turn: Orientation, count: int, rng: np.random.Generator) -> tuple[np.ndarray, Points2]:
         """Sample at most `count` distinct cell offsets in the domain above the table, and the boxes' middles."""
-        regions, middle = self.regions(turn), (turn.body.low + turn.body.high)[:2] / 2
+        half, middle = (turn.body.high - turn.body.low)[:2] / 2, (turn.body.low + turn.body.high)[:2] / 2
+        regions = build_domain(self.relation, half, self.y.body, self.delta_margin_m)
         reach = float(np.linalg.norm(self.table.half_size_xy))
         near = tuple(r.intersect(self.table.center_xy - reach, self.table.center_xy + reach) for r in regions)
         found = np.rint((sample_regions(near, count, rng) - middle) / self.cell).astype(np.int64)
@@ -152,3 +130,22 @@ class PlacementRequest:
         for region in regions:
             inside |= region.contains(middles)
         return cells[inside], middles[inside]
+
+    def judge_samples(
+        self, parts: Sequence[PlacementSamples], judge: Callable[[int, np.ndarray, bool], Accepted | None]
+    ) -> list[Accepted]:
+        """Judge the samples of all headings, best first, by heading, cells and clearness, until enough are accepted.
+
+        Where the relation holds already, places near the present one come last, as the object has to move.
+        """
+        columns = zip(*([getattr(part, field.name) for field in fields(part)] for part in parts), strict=True)
+        samples, body = PlacementSamples(*map(np.concatenate, columns)), self.x.body
+        avoided = (body.low + body.high)[:2] / 2 if relation_holds(self.relation, body, self.y.body) else None
+        found: list[Accepted] = []
+        for index in samples.rank(avoided)[: CHECKS_PER_PLACEMENT * self.wanted]:
+            clear = bool(samples.clear[index])
+            if len(found) == self.wanted or (len(found) >= ENOUGH_CLEAR and not clear):
+                break
+            if (place := judge(int(samples.heading[index]), samples.cells[index], clear)) is not None:
+                found.append(place)
+        return found

@@ -15,7 +15,7 @@ from schemas.curation import Relation
 from schemas.trajectories import Placement
 from tableverse_factory.physics.mjcf.scene_objects import SceneObject
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.robotics.placements.domains import Predicate
+from tableverse_factory.robotics.placements.domains import SIDES
 from tableverse_factory.robotics.placements.next_to import find_places_beside
 from tableverse_factory.robotics.placements.on_and_in import find_places_on_or_in
 from tableverse_factory.robotics.placements.orientations import list_orientations, list_upright_orientations
@@ -41,11 +41,10 @@ def sample_placements(
     request = PlacementRequest(
         relation, x, y, tuple(others), table, config.epsilon_m, config.delta_margin_m, config.placements
     )
-    lets_down = request.predicate in (Predicate.TOP, Predicate.IN)
-    found = (find_places_on_or_in if lets_down else find_places_beside)(
-        request, list_orientations(x.standing, x.body), rng
-    )
-    if isinstance(found, NoPlacement) and request.predicate is Predicate.IN and y.body.cavity is not None:
+    beside, turns = relation in SIDES, list_orientations(x.standing, x.body)
+    found = (find_places_beside if beside else find_places_on_or_in)(request, turns, rng)
+    into = not beside and relation is not Relation.ON
+    if isinstance(found, NoPlacement) and into and y.body.cavity is not None:
         on_end = list_upright_orientations(x.standing, x.body.heights.cell)
         found = find_places_on_or_in(request, on_end, rng, on_end=True) if on_end else found
     if isinstance(found, NoPlacement):

@@ -31,6 +31,15 @@ class GripperShape(Frozen):
         return centers, np.concatenate([self.hand_half_sizes, self.finger_half_sizes, self.finger_half_sizes])
 
 
+def list_bodies_between(model: mujoco.MjModel, base: int, last: int) -> list[int]:
+    """List bodies from the child of a base, or of the world, to a body."""
+    bodies: list[int] = []
+    while last not in (base, 0):
+        bodies.append(last)
+        last = int(model.body_parentid[last])
+    return bodies[::-1]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm(Frozen):
     """Arm on its own, not yet in a scene. Its root body stands upright at the origin."""

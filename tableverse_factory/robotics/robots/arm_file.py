@@ -17,29 +17,20 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.physics.mjcf.file_check import check_files
 from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
-from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.arm import Arm, list_bodies_between
 from tableverse_factory.robotics.robots.gripper import measure_gripper, robot_error
 
-TCP_SITE = "tcp"
-HOME_KEY = "home"
+TCP_SITE, HOME_KEY = "tcp", "home"
 # Gentle defaults for files without a `numeric` of that name [rad/s], [rad/s²], [m/s]
 MAX_VELOCITY, MAX_ACCELERATION, MAX_OPENING_SPEED = 1.5, 5.0, 0.1
-_MIN_BASE_RADIUS_M = 0.08
-_FOOT_HEIGHT_M = 0.15
+_MIN_BASE_RADIUS_M, _FOOT_HEIGHT_M = 0.08, 0.15
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 
 
 def load_arm_file(path: Path, name: str, tcp: tuple[str, Vector3] | None = None) -> Arm:
-    """Load an arm from an MJCF file.
+    """Load an arm, called `name` in rows and arrays, from an MJCF file.
 
-    Args:
-        path: The file; everything it references must lie in its folder.
-        name: Name of the arm in rows and arrays.
-        tcp: Body and position in its frame [m] at which to add a site `tcp`, for a known file that has none.
-
-    Raises:
-        InputError: `bad_mjcf` if MuJoCo does not load it or it references files elsewhere, `bad_robot` if it lacks a
-            required part of an arm.
+    `tcp` is a body and the position in its frame [m] at which to add a site `tcp`, for a known file that has none.
     """
     spec, model = _load_spec(path, tcp)
     try:
@@ -63,27 +54,27 @@ def _load_spec(path: Path, tcp: tuple[str, Vector3] | None) -> tuple[mujoco.MjSp
     except InputError as error:
         raise InputError(f"{path.name}: {error}", error.reason) from None
     except (ValueError, AttributeError) as error:
-        raise InputError(
-            f"{path.name}: MuJoCo does not load it: {sanitize_line(str(error), 400)}", "bad_mjcf"
-        ) from None
+        message = f"{path.name}: MuJoCo does not load it: {sanitize_line(str(error), 400)}"
+        raise InputError(message, "bad_mjcf") from None
 
 
 def _build_arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, TCP_SITE)
     if site < 0:
         raise robot_error(f"there is no site {TCP_SITE!r}: add one between the fingertips, z out of the hand, y across")
-    bodies = _find_bodies_to(model, int(model.site_bodyid[site]))
-    joints = [j for body in bodies for j in _list_joints(model, body)]
+    bodies = list_bodies_between(model, 0, int(model.site_bodyid[site]))
+    if not bodies:
+        raise robot_error(f"the site {TCP_SITE!r} stands in the world: put it into the hand")
+    first, count = model.body_jntadr, model.body_jntnum
+    joints = [j for body in bodies for j in range(first[body], first[body] + count[body])]
     _check_chain(model, bodies[0], joints)
     servos = [_find_servo(model, joint) for joint in joints]
     gripper_actuator = _find_gripper_actuator(model, servos)
     home = _read_home(model)
     lower, upper = _compute_limits(model, joints, servos)
-    addresses = model.jnt_qposadr[joints]
-    if ((home[addresses] < lower) | (home[addresses] > upper)).any():
-        raise robot_error(
-            f"the keyframe {HOME_KEY!r} is outside the joints' limits: {home[addresses].round(4).tolist()}"
-        )
+    at_home = home[model.jnt_qposadr[joints]]
+    if ((at_home < lower) | (at_home > upper)).any():
+        raise robot_error(f"the keyframe {HOME_KEY!r} is outside the joints' limits: {at_home.round(4).tolist()}")
     gripper = measure_gripper(model, site, joints, gripper_actuator, home)
     _prepare_for_attachment(spec, model, joints[0], home)
     return Arm(
@@ -94,7 +85,7 @@ def _build_arm(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> Arm:
         actuator_names=tuple(_require_name(model.actuator(servo), "actuator") for servo in servos),
         gripper_actuator=_require_name(model.actuator(gripper_actuator), "actuator of the gripper"),
         tcp_site=TCP_SITE,
-        home=np.array(home[addresses]),
+        home=at_home,
         lower=lower,
         upper=upper,
         max_velocity=_read_numeric(model, "max_velocity", len(joints), MAX_VELOCITY),
@@ -133,21 +124,6 @@ def _prepare_for_attachment(spec: mujoco.MjSpec, model: mujoco.MjModel, first_jo
         raise robot_error(
             f"at home {pairs[0][0]!r} touches {pairs[0][1]!r}: exclude the pair, or choose another {HOME_KEY!r}"
         )
-
-
-def _find_bodies_to(model: mujoco.MjModel, body: int) -> list[int]:
-    """List bodies from the child of the world to this body."""
-    bodies: list[int] = []
-    while body > 0:
-        bodies.insert(0, body)
-        body = int(model.body_parentid[body])
-    if not bodies:
-        raise robot_error(f"the site {TCP_SITE!r} stands in the world: put it into the hand")
-    return bodies
-
-
-def _list_joints(model: mujoco.MjModel, body: int) -> list[int]:
-    return list(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
 
 
 def _check_chain(model: mujoco.MjModel, base: int, joints: list[int]) -> None:

@@ -25,10 +25,6 @@ def find_bases(station: Station, targets: Points, most: int = 8) -> list[Pose]:
 
     Poses are ranked by the smallest margin to the border of the reach, capped at `MAX_MARGIN_M`; then by angle from the
     viewer's side, -y; then by distance to the targets, whose middle the base faces. The station's base stays unchanged.
-
-    Raises:
-        InputError: `bad_mjcf` if the scene has no table.
-        ValueError: if there are no targets.
     """
     if len(targets) == 0:
         raise ValueError("no targets: give at least one point")
@@ -57,7 +53,8 @@ def _select_bases(station: Station, feet: Points2, middle: np.ndarray, most: int
         toward = middle - foot
         pose = Pose(np.array([*foot, 0.0]), quaternion_about_z(float(np.arctan2(toward[1], toward[0]))))
         station.place_base(pose)
-        if not _arm_collides(station, data):
+        mujoco.mj_fwdPosition(station.model, data)
+        if not np.isin(station.model.geom_bodyid[data.contact.geom], station.arm_bodies).any():
             kept.append(pose)
     station.place_base(before)
     return kept
@@ -107,10 +104,3 @@ def _compute_outline_distance(outline: Points2, feet: Points2) -> np.ndarray:
     distance = np.linalg.norm(offset - share[..., None] * edge, axis=2).min(axis=1)
     cross = edge[None, :, 0] * offset[..., 1] - edge[None, :, 1] * offset[..., 0]
     return np.where((cross >= 0.0).all(axis=1), 0.0, distance)
-
-
-def _arm_collides(station: Station, data: mujoco.MjData) -> bool:
-    """Test whether any contact in the home configuration involves the arm."""
-    mujoco.mj_fwdPosition(station.model, data)
-    bodies = station.model.geom_bodyid[data.contact.geom]
-    return bool(np.isin(bodies, station.arm_bodies).any())

@@ -16,8 +16,7 @@ SETTLE_S = 3.0
 REST_SPEED_M_S = 1e-3  # fingers that are faster after `SETTLE_S` do not come to rest under their actuator
 MAX_CLOSED_GAP_M = 0.005  # maximum gap between closed fingertips, so that travel equals opening
 _STEP_S = 0.002
-_MAX_SKEW_M = 0.001
-_MIN_OPENING_M = 0.01
+_MAX_SKEW_M, _MIN_OPENING_M = 0.001, 0.01
 _DIGITS = 7  # decimals kept of simulated rest positions; the rest is within the simulation's tolerance
 
 
@@ -40,19 +39,14 @@ def measure_gripper(
     """Drive the gripper's actuator to both ends of its range, without gravity and contact, and measure the fingers.
 
     `site` is the TCP's id; `home` holds all positions to start from. Shape (nq,).
-
-    Raises:
-        InputError: `bad_robot` if there are not two fingers that slide along the TCP's y and meet.
     """
     joints = [joint for joint in range(model.njnt) if joint not in arm_joints]
     if len(joints) != 2 or (model.jnt_type[joints] != mujoco.mjtJoint.mjJNT_SLIDE).any():
         raise robot_error(f"the gripper has {len(joints)} joints: only two fingers that slide are known here")
-    bodies = [int(model.jnt_bodyid[joint]) for joint in joints]
-    ends = [
-        (float(end), _drive_fingers(model, joints, actuator, float(end), home))
-        for end in model.actuator_ctrlrange[actuator]
-    ]
-    (shut, closed), (wide, opened) = sorted(ends, key=lambda end: _compute_distance(end[1].xpos[bodies]))
+    bodies, reach = [int(model.jnt_bodyid[joint]) for joint in joints], model.actuator_ctrlrange[actuator]
+    ends = [(end, _drive_fingers(model, joints, actuator, end, home)) for end in map(float, reach)]
+    ends.sort(key=lambda end: float(np.linalg.norm(end[1].xpos[bodies[0]] - end[1].xpos[bodies[1]])))
+    (shut, closed), (wide, opened) = ends
     travel = _to_gripper_frame(opened, site, opened.xpos[bodies]) - _to_gripper_frame(closed, site, closed.xpos[bodies])
     _check_travel(travel)
     fingers = [_find_contact_geoms(model, body) for body in bodies]
@@ -139,10 +133,9 @@ def _measure_shape(
     if not around:
         raise robot_error("no geom of the fingers lies at the site 'tcp': put it between the fingertips")
     pad = min(around, key=lambda box: float(np.prod(box[1])))
-    none = np.zeros((0, 3))
     return GripperShape(
-        hand_centers=np.array([center for center, _ in hand_boxes]) if hand_boxes else none,
-        hand_half_sizes=np.array([half for _, half in hand_boxes]) if hand_boxes else none,
+        hand_centers=np.reshape([center for center, _ in hand_boxes], (-1, 3)),
+        hand_half_sizes=np.reshape([half for _, half in hand_boxes], (-1, 3)),
         finger_centers=np.array([center for center, _ in finger_boxes]),
         finger_half_sizes=np.array([half for _, half in finger_boxes]),
         pad_half_size_xz=np.maximum(pad[1] - np.abs(pad[0]), 1e-3)[[0, 2]],
@@ -164,10 +157,6 @@ def _measure_box(model: mujoco.MjModel, data: mujoco.MjData, site: int, geom: in
 def _to_gripper_frame(data: mujoco.MjData, site: int, points: Points) -> Points:
     """Transform world points into the gripper frame. Shape (n, 3) [m]."""
     return (points - data.site_xpos[site]) @ data.site_xmat[site].reshape(3, 3)
-
-
-def _compute_distance(places: Points) -> float:
-    return float(np.linalg.norm(places[0] - places[1]))
 
 
 def robot_error(message: str) -> InputError:

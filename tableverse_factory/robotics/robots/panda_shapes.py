@@ -4,6 +4,7 @@ Each is given in the frame of its link, whose z is the axis of the joint before 
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import mujoco
 
@@ -26,14 +27,8 @@ class LinkShape:
     rgba: Rgba = WHITE
 
 
-def capsule(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> LinkShape:
-    """Make a cylinder with half balls at its ends, which reach beyond `a` and `b`."""
-    return LinkShape(mujoco.mjtGeom.mjGEOM_CAPSULE, a, b, radius, rgba)
-
-
-def cylinder(a: Point, b: Point, radius: float, rgba: Rgba = WHITE) -> LinkShape:
-    """Make a cylinder with flat ends at `a` and `b`."""
-    return LinkShape(mujoco.mjtGeom.mjGEOM_CYLINDER, a, b, radius, rgba)
+capsule = partial(LinkShape, mujoco.mjtGeom.mjGEOM_CAPSULE)  # its half balls reach beyond `a` and `b`
+cylinder = partial(LinkShape, mujoco.mjtGeom.mjGEOM_CYLINDER)
 
 
 def box(middle: Point, half_size: Point, rgba: Rgba = WHITE) -> LinkShape:
@@ -46,7 +41,7 @@ HAND = box((0.0, 0.0, 0.033), (0.0315, 0.102, 0.033))
 SHANK = box((0.0, 0.013, 0.018), (0.0105, 0.009, 0.018), GREY)
 # Pad of the left finger, in a frame whose y = 0 is the gripping face; its middle is at the height of the TCP
 PAD = box((0.0, 0.006, 0.045), (0.0105, 0.006, 0.0105), DARK)
-COLLISION_SHAPES: tuple[tuple[LinkShape, ...], ...] = (
+COLLISION_SHAPES: tuple[tuple[LinkShape, ...], ...] = (  # by link, 0 to 7
     (box((-0.0375, 0.0, 0.035), (0.1, 0.095, 0.035)), cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.14), 0.075)),
     (capsule((0.0, 0.0, -0.17), (0.0, 0.0, 0.0), 0.06), capsule((0.0, -0.05, 0.0), (0.0, 0.05, 0.0), 0.06)),
     (capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.06), 0.06), capsule((0.0, -0.13, 0.0), (0.0, 0.0, 0.0), 0.06)),
@@ -60,9 +55,7 @@ COLLISION_SHAPES: tuple[tuple[LinkShape, ...], ...] = (
     (capsule((0.0, 0.0, -0.06), (0.0, 0.0, 0.01), 0.048), capsule((0.05, 0.0, 0.0), (0.09, 0.0, 0.0), 0.05)),
     (cylinder((0.0, 0.0, 0.03), (0.0, 0.0, 0.107), 0.045),),
 )
-"""By link, 0 to 7."""
-
-VISUAL_SHAPES: tuple[tuple[LinkShape, ...], ...] = (
+VISUAL_SHAPES: tuple[tuple[LinkShape, ...], ...] = (  # by link, 0 to 7
     (
         box((-0.0375, 0.0, 0.004), (0.1, 0.095, 0.004), DARK),
         box((-0.045, 0.0, 0.037), (0.088, 0.082, 0.029)),
@@ -120,8 +113,6 @@ VISUAL_SHAPES: tuple[tuple[LinkShape, ...], ...] = (
         cylinder((0.045, 0.045, 0.088), (0.045, 0.045, 0.092), 0.009, BLUE),
     ),
 )
-"""By link, 0 to 7."""
-
 HAND_VISUAL = (
     cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.012), 0.041, GREY),
     box((0.0, 0.0, 0.034), (0.0285, 0.082, 0.024)),

@@ -19,14 +19,11 @@ from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 from tableverse_factory.robotics.robots.arm import Arm
 
 CELL_M = 0.05
-MAX_DISTANCE_M = 1.5
-MAX_HEIGHT_M = 0.8
+MAX_DISTANCE_M, MAX_HEIGHT_M = 1.5, 0.8
 LIMIT_MARGIN_RAD = 0.1  # distance kept from joint stops, so that a reached pose leaves room to move on
 _DOWNWARD = np.diag([1.0, -1.0, -1.0])
-_ITERATIONS = 30
-_RESTARTS = 16
-_TOLERANCE = 1e-3
-_DAMPING = 1e-3
+_ITERATIONS, _RESTARTS = 30, 16
+_TOLERANCE, _DAMPING = 1e-3, 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)

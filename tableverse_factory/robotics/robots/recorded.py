@@ -10,11 +10,7 @@ from tableverse_factory.core.errors import ConfigError, InputError
 
 
 def record_robot(config: Config, _before: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Hash the names and bytes of the files of a robot that is given as MJCF; None for a robot with a name.
-
-    Raises:
-        ConfigError: if there is no such file, or it names others outside its folder.
-    """
+    """Hash the names and bytes of the files of a robot that is given as MJCF; None for a robot with a name."""
     path = Path(config.trajectories.robot)
     if path.suffix != ".xml":
         return None

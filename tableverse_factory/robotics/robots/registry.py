@@ -22,12 +22,7 @@ MENAGERIE_TCPS: Mapping[str, tuple[str, Vector3]] = {"franka_emika_panda": ("han
 
 @lru_cache(maxsize=8)
 def load_arm(name: str) -> Arm:
-    """Load the arm `panda`, `menagerie:NAME`, or the file `….xml`; a file that changes later is not read again.
-
-    Raises:
-        ConfigError: if the name is unknown, or its package is missing.
-        InputError: if the file is not a usable arm (`arm_file`).
-    """
+    """Load the arm `panda`, `menagerie:NAME`, or the file `….xml`; a file that changes later is not read again."""
     if name in ARMS:
         return ARMS[name]()
     if name.startswith(MENAGERIE_PREFIX):

@@ -30,52 +30,29 @@ Ids = Int64[np.ndarray, "n"]
 
 
 class Station:
-    """Scene and arm in one model.
+    """Scene and arm in one model, which only `place_base` changes.
 
-    Attributes:
-        arm: As attached.
-        model: Compiled; only `place_base` changes it.
-        base: Pose of the arm's base in the table frame.
-        base_body: Id of the body that carries the arm and its pedestal.
-        joint_qpos: Addresses of the arm's joints in qpos. Shape (j,).
-        joint_dof: Addresses of the arm's joints in qvel. Shape (j,).
-        joint_actuators: Ids of the joints' servos. Shape (j,).
-        gripper_actuator: Id of the gripper's actuator.
-        finger_qpos: Addresses of the fingers' joints in qpos. Shape (k,).
-        finger_dof: Addresses of the fingers' joints in qvel. Shape (k,).
-        finger_geoms: Ids of the geoms that may touch the gripped object.
-        arm_bodies: Ids of all bodies of the arm, its base included, ascending.
-        tcp_site: Id of the site between the fingertips.
-        object_ids: The scene's objects, in the order of the model.
-        object_bodies: Body id by object id.
-        object_qpos: Address in qpos of each object's position and quaternion.
-        object_dof: Address in qvel of each object's linear and angular velocity.
+    `…_qpos` and `…_dof` are addresses in qpos and qvel, of joints or of an object's pose and velocity; actuators,
+    bodies, geoms and sites are given by their MuJoCo ids, objects in the order of the model. `finger_geoms` may touch
+    the gripped object, `arm_bodies` include the base, and `base_body` carries the arm and its pedestal.
     """
 
     def __init__(
         self, files: Mapping[str, bytes], arm: Arm, base: Pose | None = None, *, visuals: bool = False
     ) -> None:
-        """Compile the scene's files with the arm.
+        """Compile exported files (`scene.xml`, `assets/…`, of any origin) with the arm below a body `robot/pedestal`.
 
-        Args:
-            files: `scene.xml` and files under `assets/`, as exported.
-            arm: Attached below a static body `robot/pedestal`.
-            base: Pose of the arm's base in the table frame; 0.55 m in front of the origin by default.
-            visuals: Keep visual geoms. Without them the model simulates the same and compiles faster.
-
-        Raises:
-            InputError: `bad_mjcf` if the files do not load, or the arm cannot be attached to them.
+        `base` is in the table frame, by default 0.55 m in front of the origin. Without `visuals` the model simulates
+        the same and compiles faster.
         """
         self.arm = arm
         self.model = _compile_station(files, arm, visuals)
         model = self.model
         joints = [model.joint(PREFIX + name).id for name in arm.joint_names]
         fingers = [model.joint(PREFIX + name).id for name in arm.finger_joints]
-        self.joint_qpos, self.joint_dof = model.jnt_qposadr[joints].astype(int), model.jnt_dofadr[joints].astype(int)
-        self.finger_qpos, self.finger_dof = (
-            model.jnt_qposadr[fingers].astype(int),
-            model.jnt_dofadr[fingers].astype(int),
-        )
+        qpos, dof = model.jnt_qposadr.astype(int), model.jnt_dofadr.astype(int)
+        self.joint_qpos, self.joint_dof = qpos[joints], dof[joints]
+        self.finger_qpos, self.finger_dof = qpos[fingers], dof[fingers]
         self.joint_actuators: Ids = np.array([model.actuator(PREFIX + name).id for name in arm.actuator_names])
         self.gripper_actuator = int(model.actuator(PREFIX + arm.gripper_actuator).id)
         self.finger_geoms: Ids = np.array([model.geom(PREFIX + name).id for name in arm.finger_geoms])
@@ -85,9 +62,7 @@ class Station:
         free = find_free_bodies(model)
         self.object_ids = tuple(model.body(body).name for body in free)
         self.object_bodies = dict(zip(self.object_ids, free, strict=True))
-        self.object_qpos = {
-            name: int(model.jnt_qposadr[model.body_jntadr[b]]) for name, b in self.object_bodies.items()
-        }
+        self.object_qpos = {name: int(qpos[model.body_jntadr[b]]) for name, b in self.object_bodies.items()}
         self.object_dof = {name: int(model.body_dofadr[b]) for name, b in self.object_bodies.items()}
         self.base = base or Pose(np.array([0.0, -0.55, 0.0]), np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
         self.place_base(self.base)
@@ -150,11 +125,7 @@ def _collect_vertices(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> 
 
 
 def build_station_spec(files: Mapping[str, bytes], arm: Arm, visuals: bool = False) -> mujoco.MjSpec:
-    """Build the uncompiled specification of scene and arm; the pedestal `robot/pedestal` is at the origin.
-
-    Raises:
-        InputError: `bad_mjcf` if the files do not load.
-    """
+    """Build the uncompiled specification of scene and arm; the pedestal `robot/pedestal` is at the origin."""
     if "scene.xml" not in files:
         raise InputError("there is no scene.xml", "bad_mjcf")
     check_references(files["scene.xml"], files.keys())
@@ -197,15 +168,12 @@ def _attach_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
 
 def copy_simulation_settings(child: mujoco.MjSpec, scene: mujoco.MjSpec) -> None:
     """Copy the scene's simulation settings to a specification: the scene's apply, and MuJoCo warns of others."""
-    for own, theirs in ((child.option, scene.option), *_parts(child.visual, scene.visual)):
+    parts = [(getattr(child.visual, name), getattr(scene.visual, name)) for name in _fields(child.visual)]
+    for own, theirs in ((child.option, scene.option), *parts):
         for name in _fields(own):
             setattr(own, name, getattr(theirs, name))
     for name in _SIZE_FIELDS:
         setattr(child, name, getattr(scene, name))
-
-
-def _parts(own: object, theirs: object) -> list[tuple[object, object]]:
-    return [(getattr(own, name), getattr(theirs, name)) for name in _fields(own)]
 
 
 def _fields(settings: object) -> list[str]:
