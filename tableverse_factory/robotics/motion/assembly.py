@@ -45,7 +45,7 @@ class MotionPaths(Frozen):
 
 def assemble_motion(task: PickPlace, paths: MotionPaths, config: TrajectoriesConfig) -> Motion | NoMotion:
     """Time three runs and concatenate them with the two pauses between them."""
-    arm, dynamics, take, give = task.world.station.arm, task.world.dynamics, paths.take, paths.give
+    world, take, give = task.world, paths.take, paths.give
     plans = (
         (
             PathSegment(Phase.PRE_GRASP, paths.reaching, task.reaching_space(take.opening_m, paths.margins[0] / 2)),
@@ -60,14 +60,12 @@ def assemble_motion(task: PickPlace, paths: MotionPaths, config: TrajectoriesCon
     )
     runs: list[tuple[TimedCurve, np.ndarray]] = []
     for index, sections in enumerate(plans):
-        dynamics.set_payload(task.world.station, task.carried if index == 1 else None)
-        run = time_segments(
-            sections, arm, dynamics, config.speed, config.step_s, touch_at_start=index > 0, touch_at_end=index < 2
-        )
+        world.dynamics.set_payload(world.station, task.carried if index == 1 else None)
+        run = time_segments(sections, config, touch_at_start=index > 0, touch_at_end=index < 2)
         if isinstance(run, NoMotion):
             return run
         runs.append(run)
-    return _concatenate_runs(runs, paths, task.width_m, arm, config.step_s)
+    return _concatenate_runs(runs, paths, task.width_m, world.station.arm, config.step_s)
 
 
 def _concatenate_runs(

@@ -7,13 +7,12 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from scipy.interpolate import BSpline
 
+from schemas.config import TrajectoriesConfig
 from schemas.geometry import Frozen
 from schemas.trajectories import JointPath, NoMotion, Phase
-from tableverse_factory.robotics.motion.dynamics import ArmDynamics
 from tableverse_factory.robotics.motion.retime import TimedCurve, retime_curve
 from tableverse_factory.robotics.motion.rrt import EDGE_STEP_RAD
 from tableverse_factory.robotics.motion.world import CollisionSpace
-from tableverse_factory.robotics.robots.arm import Arm
 
 CONTACT_SPACING_RAD = 0.01  # knot spacing at a contact, measured along the path
 SPACING_GROWTH = 0.25  # growth of the knot spacing with distance from the contact
@@ -62,27 +61,20 @@ class PathSegment(Frozen):
 
 
 def time_segments(
-    sections: Sequence[PathSegment],
-    arm: Arm,
-    dynamics: ArmDynamics,
-    speed: float,
-    step_s: float,
-    *,
-    touch_at_start: bool,
-    touch_at_end: bool,
+    sections: Sequence[PathSegment], config: TrajectoriesConfig, *, touch_at_start: bool, touch_at_end: bool
 ) -> tuple[TimedCurve, Int32[np.ndarray, " t"]] | NoMotion:
     """Compute the fastest run through all segments and the index into `Phase` of each sample, or why there is none.
 
     A failure is attributed to the run's last phase: `no_blend` where every blend collides, `too_fast` where no timing
     of the curve keeps velocity, acceleration and torque.
     """
+    world, phase, blocked = sections[0].space.world, sections[-1].phase, ""
     path, ends = _join_segments(sections)
-    phase, blocked = sections[-1].phase, ""
     for radius in BLEND_RADII_RAD:
         curve = blend_path(path, radius, touch_at_start=touch_at_start, touch_at_end=touch_at_end)
         blocked = _find_collision(curve, sections, ends)
         if not blocked:
-            timed = retime_curve(curve, arm, dynamics, speed, step_s)
+            timed = retime_curve(curve, world.station.arm, world.dynamics, config.speed, config.step_s)
             if timed is None:
                 detail = "no timing of the path from rest to rest keeps the limits of velocity, acceleration and torque"
                 return NoMotion(phase, "too_fast", detail)

@@ -1,7 +1,6 @@
 """Placements on or in the reference: lowered from above on height maps until the object touches."""
 
 from collections import Counter
-from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -34,23 +33,6 @@ WALL_GAP_M = 0.006  # gap to the wall that makes an insertion easy
 _CORE_SHARE = 0.6  # share of the object's width that is used to find the ground
 _LEVEL_SCALE_M = 0.03  # height in a vessel that costs as much as lying at its wall
 _MAX_DEPTH_M = 0.05  # distance from the edge beyond which a placement is no better
-
-
-class ConvexPieces:
-    """Pieces of an object and of the objects near its placement."""
-
-    def __init__(self, x: SceneObject, near: Sequence[SceneObject]) -> None:
-        self._standing = _build_solids(x)
-        self._near = [MovingSolid(_build_solids(scene_object), np.zeros(3)) for scene_object in near]
-        self._rotated: dict[bytes, Solids] = {}
-        self._up = LinearSweep(np.array([0.0, 0.0, 1.0]))
-
-    def find_clear_height(self, turn: Orientation, offset: Vector3, clearance_m: float) -> float:
-        """Find exactly how far above `offset` the rotated object first has `clearance_m` to all others [m]."""
-        key = turn.quaternion_wxyz.tobytes()
-        if key not in self._rotated:
-            self._rotated[key] = self._standing.turned(rotation_matrix(turn.quaternion_wxyz), np.zeros(3))
-        return self._up.find_first_clear([MovingSolid(self._rotated[key], offset)], self._near, clearance_m)
 
 
 def _build_solids(scene_object: SceneObject) -> Solids:
@@ -87,7 +69,10 @@ class _ReferenceSurface:
         size = max(float(np.linalg.norm((turn.body.high - turn.body.low)[:2])) for turn in turns)
         things = [o for o in request.others if _compute_box_gap(o.body, self._y) < size]
         near = tuple(o.body for o in things)
-        self._pieces = ConvexPieces(request.x, (request.y, *things))
+        self._solids = _build_solids(request.x)
+        self._near = [MovingSolid(_build_solids(o), np.zeros(3)) for o in (request.y, *things)]
+        self._rotated: dict[bytes, Solids] = {}
+        self._up = LinearSweep(np.array([0.0, 0.0, 1.0]))
         # Contents lie where the object is to go: it is let down onto them, by the map; boxes would keep it out.
         self._beside = tuple(o for o in near if not (self._into and self._is_content(o)))
         self._scene = make_support_surface((self._y, *near), request.table, request.cell, size + 2 * request.cell)
@@ -169,7 +154,7 @@ class _ReferenceSurface:
             return None
         offset = np.append(cells * request.cell, landed.low[2] - turn.body.low[2])
         clearance = WALL_CLEARANCE_M if self._into else RELEASE_HEIGHT_M
-        rise = self._pieces.find_clear_height(turn, offset, clearance)
+        rise = self._find_clear_height(turn, offset, clearance)
         if rise > MAX_RISE_M:
             lost["where its convex pieces do not fit"] += 1
             return None
@@ -183,6 +168,13 @@ class _ReferenceSurface:
             lost["where its convex pieces stand too high"] += 1
             return None
         return False, CandidatePlacement(turn, offset + np.array([0.0, 0.0, higher]), (clearance,), clear_by)
+
+    def _find_clear_height(self, turn: Orientation, offset: Vector3, clearance_m: float) -> float:
+        """Find exactly how far above `offset` the turned pieces first have `clearance_m` to all others [m]."""
+        key = turn.quaternion_wxyz.tobytes()
+        if key not in self._rotated:
+            self._rotated[key] = self._solids.turned(rotation_matrix(turn.quaternion_wxyz), np.zeros(3))
+        return self._up.find_first_clear([MovingSolid(self._rotated[key], offset)], self._near, clearance_m)
 
     def _is_stable(self, landed: BodyFeatures) -> bool:
         """Test whether an object on its end has its center below the rim, or stands on the floor by itself."""

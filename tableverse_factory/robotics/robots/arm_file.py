@@ -119,11 +119,9 @@ def _prepare_for_attachment(spec: mujoco.MjSpec, model: mujoco.MjModel, first_jo
     data = make_quiet_data(alone)
     data.qpos[:] = home
     mujoco.mj_fwdPosition(alone, data)
-    pairs = [[alone.body(int(body)).name for body in alone.geom_bodyid[contact.geom]] for contact in data.contact]
-    if pairs:
-        raise robot_error(
-            f"at home {pairs[0][0]!r} touches {pairs[0][1]!r}: exclude the pair, or choose another {HOME_KEY!r}"
-        )
+    if data.ncon:
+        a, b = (alone.body(int(body)).name for body in alone.geom_bodyid[data.contact.geom[0]])
+        raise robot_error(f"at home {a!r} touches {b!r}: exclude the pair, or choose another {HOME_KEY!r}")
 
 
 def _check_chain(model: mujoco.MjModel, base: int, joints: list[int]) -> None:

@@ -93,9 +93,8 @@ def _drive_fingers(
 def _check_travel(travel: Points) -> None:
     along, total = np.abs(travel[:, 1]), np.linalg.norm(travel, axis=1)
     if along.sum() < _MIN_OPENING_M:
-        raise robot_error(
-            f"the gripper's actuator moves the fingers by {along.round(4).tolist()} m along the TCP's y axis"
-        )
+        moved = along.round(4).tolist()
+        raise robot_error(f"the gripper's actuator moves the fingers by {moved} m along the TCP's y axis")
     if (total - along).max() > _MAX_SKEW_M or abs(travel[:, 1].sum()) > _MAX_SKEW_M:
         raise robot_error(
             f"the fingers move by {travel.round(4).tolist()} m in the TCP's frame: they must slide evenly along its y"
@@ -146,9 +145,8 @@ def _measure_box(model: mujoco.MjModel, data: mujoco.MjData, site: int, geom: in
     """Compute center and half size of the box around a geom, along the gripper frame's axes [m]."""
     shape = make_geom_mesh(model, geom)
     if shape is None:
-        raise robot_error(
-            f"the geom {model.geom(geom).name!r} of the gripper is of a kind that has no shape of its own"
-        )
+        name = model.geom(geom).name
+        raise robot_error(f"the geom {name!r} of the gripper is of a kind that has no shape of its own")
     points = _to_gripper_frame(data, site, shape.vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
     low, high = points.min(axis=0), points.max(axis=0)
     return (low + high) / 2, (high - low) / 2

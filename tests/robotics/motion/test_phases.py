@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from schemas.config import TrajectoriesConfig
 from schemas.geometry import Pose, TriangleMesh
 from schemas.trajectories import Motion, NoMotion, Phase
 from tableverse_factory.geometry.math.transforms import rotation_angle
@@ -217,8 +218,8 @@ def test_a_run_through_a_wall_is_no_matter_of_limits():
         solve_ik(world.chain, world.in_base(tcp), HOME, 1)[0] for tcp in (down(0.05, 0.0, 0.2), down(-0.2, 0.0, 0.2))
     ]
     sections = [PathSegment(Phase.PRE_GRASP, np.array(ends), CollisionSpace(world, 0.04))]
-    arm = world.station.arm
-    found = time_segments(sections, arm, world.dynamics, 0.5, 0.02, touch_at_start=False, touch_at_end=False)
+    config = TrajectoriesConfig(speed=0.5, step_s=0.02)
+    found = time_segments(sections, config, touch_at_start=False, touch_at_end=False)
     assert isinstance(found, NoMotion)
     assert (found.phase, found.reason) == (Phase.PRE_GRASP, "no_blend")
     assert "wall" in found.detail
