@@ -6,6 +6,7 @@ equal bytes.
 
 import json
 from dataclasses import fields, is_dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from schemas.manifest import ImageRow
 
 _MODULES = (geometry, objects, observation, outcome, scene, trajectories, work)
 
-RECORD_TYPES: dict[str, type[Any]] = {
+RECORD_TYPES: dict[str, type[Any]] = {  # the dataclasses that flow between stages and processes, and models in them
     kind.__name__: kind
     for kind in (
         *(kind for module in _MODULES for kind in vars(module).values() if isinstance(kind, type)),
@@ -27,21 +28,12 @@ RECORD_TYPES: dict[str, type[Any]] = {
     )
     if is_dataclass(kind) or issubclass(kind, BaseModel)
 }
-"""All dataclasses that flow between stages and processes, and the models that they hold, by name."""
 
 _ARRAY_KINDS = "biufc"
 
 _MALFORMED = (
-    AttributeError,
-    EOFError,
-    IndexError,
-    KeyError,
-    OSError,
-    OverflowError,
-    RecursionError,
-    StopIteration,
-    TypeError,
-    pa.ArrowException,
+    *(AttributeError, EOFError, IndexError, KeyError, OSError, OverflowError, RecursionError, StopIteration),
+    *(TypeError, pa.ArrowException),
 )
 
 _SCHEMA = pa.schema([("tree", pa.large_binary()), ("blobs", pa.list_(pa.large_binary()))])
@@ -83,18 +75,20 @@ def _make_list(blobs: list[bytes | memoryview]) -> pa.ListArray:
 
 
 def _to_tree(value: Any, blobs: list[bytes | memoryview]) -> Any:
-    if value is None or isinstance(value, bool | int | float | str):
-        return value if type(value) in (type(None), bool, int, float, str) else _to_scalar(value)
+    if type(value) in (type(None), bool, int, float, str):
+        return value
     if isinstance(value, bytes):
         blobs.append(value)
         return {"$bytes": len(blobs) - 1}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, StrEnum):
+        return value.value
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in _ARRAY_KINDS:
             raise TypeError(f"an array of {value.dtype} does not travel: give numbers")
         blobs.append(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
         return {"$array": len(blobs) - 1, "dtype": value.dtype.str, "shape": list(value.shape)}
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, tuple | list):
         return [_to_tree(item, blobs) for item in value]
     if isinstance(value, dict):
@@ -105,11 +99,6 @@ def _to_tree(value: Any, blobs: list[bytes | memoryview]) -> Any:
     if isinstance(value, BaseModel):
         return {"$model": name, "json": value.model_dump_json(by_alias=True)}
     return {"$record": name, "fields": [_to_tree(getattr(value, f.name), blobs) for f in fields(value)]}
-
-
-def _to_scalar(value: Any) -> Any:
-    """Convert a subclass of a scalar (an enum, a numpy float) to the scalar."""
-    return value.item() if isinstance(value, np.generic) else value.value
 
 
 def _from_tree(tree: Any, blobs: list[pa.Buffer]) -> Any:

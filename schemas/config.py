@@ -20,10 +20,8 @@ def _check_variable_name(name: str) -> str:
     return name
 
 
-MODEL_LOAD_S = 1200.0
-"""Wall time in which a model downloads and loads its weights, and its process starts [s]."""
-MAX_SLOW_MESHES = 30
-"""Objects of a scene that may each take the whole `place.mesh_timeout_s`; most take a fraction of it."""
+MODEL_LOAD_S = 1200.0  # wall time in which a model downloads and loads its weights, and its process starts [s]
+MAX_SLOW_MESHES = 30  # objects of a scene that may each take the whole `place.mesh_timeout_s`; most take much less
 
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_check_variable_name)]
 Weights = Annotated[str, Field(max_length=4096), AfterValidator(os.path.expanduser)]
@@ -44,7 +42,11 @@ class StageSection(Section):
 
     def resolve_deadline(self, run_deadline_s: float) -> float:
         """Resolve the wall time of the stage, given that of the run [s]."""
-        return run_deadline_s if self.deadline_s is None else self.deadline_s
+        return run_deadline_s + self._extra_s if self.deadline_s is None else self.deadline_s
+
+    @property
+    def _extra_s(self) -> float:  # beyond the deadline of the run, such as to load weights
+        return 0.0
 
 
 class RemoteModelSection(StageSection):
@@ -118,11 +120,9 @@ class ObserveConfig(StageSection):
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
     """Focal length of bare pictures, if neither the model nor their EXIF gives it [px]."""
 
-    def resolve_deadline(self, run_deadline_s: float) -> float:
-        """Add the time to load the weights of a depth model."""
-        if self.deadline_s is not None or self.depth in ("sensor", "recorded"):
-            return super().resolve_deadline(run_deadline_s)
-        return run_deadline_s + MODEL_LOAD_S
+    @property
+    def _extra_s(self) -> float:
+        return 0.0 if self.depth in ("sensor", "recorded") else MODEL_LOAD_S
 
 
 class PerceiveConfig(RemoteModelSection):
@@ -153,11 +153,9 @@ class PerceiveConfig(RemoteModelSection):
         """Protocol of the detector's server; empty if no model is asked."""
         return self.detector if self.detector in ("openai", "gemini") else ""
 
-    def resolve_deadline(self, run_deadline_s: float) -> float:
-        """Add the time to load the weights of a segmenter."""
-        if self.deadline_s is not None or self.segmenter == "geometric":
-            return super().resolve_deadline(run_deadline_s)
-        return run_deadline_s + MODEL_LOAD_S
+    @property
+    def _extra_s(self) -> float:
+        return 0.0 if self.segmenter == "geometric" else MODEL_LOAD_S
 
     @model_validator(mode="after")
     def _check_required_keys(self) -> "PerceiveConfig":
@@ -187,20 +185,17 @@ class PlaceConfig(StageSection):
     mesh_timeout_s: Positive = 120.0
     """Longest silence of that process during one object's mesh [s]."""
 
-    def resolve_deadline(self, run_deadline_s: float) -> float:
-        """Add the times of a mesh model to load its weights and to make each object's mesh."""
-        if self.deadline_s is not None or not self.in_process:
-            return super().resolve_deadline(run_deadline_s)
-        return run_deadline_s + MODEL_LOAD_S + MAX_SLOW_MESHES * self.mesh_timeout_s
+    @property
+    def _in_process(self) -> bool:
+        return self.mesh_model in ("sam3d", "triposr")
 
     @property
-    def in_process(self) -> bool:
-        """Whether meshes come from a model in its own process."""
-        return self.mesh_model in ("sam3d", "triposr")
+    def _extra_s(self) -> float:
+        return MODEL_LOAD_S + MAX_SLOW_MESHES * self.mesh_timeout_s if self._in_process else 0.0
 
     @model_validator(mode="after")
     def _check_required_keys(self) -> "PlaceConfig":
-        if self.in_process and not self.mesh_command:
+        if self._in_process and not self.mesh_command:
             raise ValueError(f"the mesh model {self.mesh_model!r} needs place.mesh_command (docs/mesh-process.md)")
         return self
 
@@ -317,9 +312,9 @@ class TrajectoriesConfig(StageSection):
     max_tasks: Annotated[int, Field(ge=0, le=100)] = 100
     """Accepted tasks of a scene that are tried, in their order."""
 
-    def resolve_deadline(self, run_deadline_s: float) -> float:
-        """Add the time of every task to the time for the rest of the stage [s]."""
-        return run_deadline_s + self.max_tasks * self.task_deadline_s if self.deadline_s is None else self.deadline_s
+    @property
+    def _extra_s(self) -> float:
+        return self.max_tasks * self.task_deadline_s
 
     @model_validator(mode="after")
     def _check_grasp_server(self) -> "TrajectoriesConfig":

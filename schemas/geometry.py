@@ -83,8 +83,7 @@ class TriangleMesh(Frozen):
     Attributes:
         vertices: Shape (n, 3) [m].
         faces: Shape (m, 3), indices into `vertices`.
-        vertex_colors: Shape (n, 3) sRGB, or None.
-        texture: Finer colours of the same surface, or None.
+        vertex_colors: Shape (n, 3) sRGB, or None; `texture` has finer colours of the same surface.
     """
 
     vertices: Points

@@ -9,11 +9,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from schemas.identity import RESERVED_IDS, SafeId, clean_label, find_name_clashes
 
 MAX_OBJECTS = 200
-FRAME = "table: z up, table plane z=0, metres"
-"""Frame of a layout; `table` alone means the same, and so does any part of it, with further notes."""
+FRAME = "table: z up, table plane z=0, metres"  # `table` alone means the same, and any part of it, with further notes
 
 Finite = Annotated[float, Field(allow_inf_nan=False, ge=-1e3, le=1e3)]
-
 
 _OTHER_FRAME = re.compile(
     r"""

@@ -21,15 +21,11 @@ class ImageRow(BaseModel):
 
     Attributes:
         scene_id: Derived from the content; safe as a file name.
-        kind: Which files to expect at `uri`.
         uri: Folder of a capture, file of a picture or layout; a local path or an fsspec URI.
         name: The entry's own name, for people; untrusted text.
         content_sha256: Hash of the bytes that the row was made from; empty if they could not be read.
         url: Address that the picture was fetched from, without user, query and fragment; empty for a local file.
-        source: Origin of the picture, if known.
-        licence: Its licence, if known.
         rejected: Empty, or the code of the reason why the entry cannot enter (`unreadable_color`, …).
-        rejected_detail: One line for people.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

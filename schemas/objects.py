@@ -37,8 +37,7 @@ class PerceivedObject(Frozen):
         instance_id: The value of its pixels in `PerceivedObjects.instance_ids`, > 0.
         label: Untrusted, cleaned text; `object` where the detector cannot name it.
         score: Confidence of the detection, 0 to 1.
-        points_camera: Denoised surface points, camera frame [m]. Shape (n, 3).
-        colors: sRGB of the points.
+        points_camera: Denoised surface points, camera frame [m]. Shape (n, 3); `colors` are their sRGB.
         contained_in: Id of the container that holds it, or None.
         count: Number of such objects (contents of a composite; one representative is segmented).
     """
@@ -132,7 +131,6 @@ class Evidence(Frozen):
         color_jpg: The picture as a JPEG file.
         masks_png: Instance ids as found in the picture, a 16-bit PNG file (0 background).
         object_pixels: Value in `masks_png` of each object, in the order of the objects.
-        camera: Intrinsics of the picture.
         camera_to_table: Pose of the camera in the table frame.
     """
 
@@ -149,9 +147,7 @@ class PlacedObjects(Frozen):
 
     Attributes:
         evidence: The picture it came from; None for a layout file.
-        perception: Name of the backend that found the objects; `layout` for a layout file.
         left_out: Ids of objects that were found but could not be used or placed, with the reason.
-        detection: Origin of the answer of a model that found the objects; None if none was asked.
     """
 
     scene_id: str

@@ -13,7 +13,6 @@ class Observation(Frozen):
     Attributes:
         color: Shape (h, w, 3) sRGB.
         depth: Shape (h, w) float32, distance along the optical axis [m]; 0 without a reading.
-        camera: Intrinsics of both images.
         recorded_detections: The capture's own `detections.json`, if it has one.
         recorded_ids: Shape (h, w), the capture's own `masks.png`: 0 background, else instance ids; or None.
         recorded_meshes: Instance id and mesh, of the capture's own `meshes/`; read if `place.mesh_model` is replay.

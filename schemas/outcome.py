@@ -1,6 +1,6 @@
 """Outcome of a stage: the next record, a reason to drop the scene, or an error; and the cost of its model requests."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Generic, TypeVar
 
 T = TypeVar("T", covariant=True)
@@ -19,9 +19,8 @@ class Done(Generic[T]):
 class Dropped:
     """Scene that is valid input but unfit for the dataset: a true reason, never an accident.
 
-    Attributes:
-        reason: Stable snake_case code to count by, e.g. `no_table_plane`.
-        detail: One line for people, with the values that decided it.
+    `reason` is a stable snake_case code to count by, such as `no_table_plane`; `detail` one line with the values that
+    decided it.
     """
 
     reason: str
@@ -53,13 +52,9 @@ Outcome = Done[T] | Dropped | Failed
 
 @dataclass(frozen=True, slots=True)
 class ModelCost:
-    """Cost of requests to model servers.
+    """Cost of requests to model servers, retries included.
 
-    Attributes:
-        calls: Requests, including retries.
-        input_tokens: As servers counted them; 0 if they did not.
-        output_tokens: Likewise.
-        usd: By the prices of the configuration [USD].
+    Tokens are as servers counted them, or 0; dollars by the prices of the configuration [USD].
     """
 
     calls: int = 0
@@ -68,12 +63,7 @@ class ModelCost:
     usd: float = 0.0
 
     def __add__(self, other: "ModelCost") -> "ModelCost":
-        return ModelCost(
-            self.calls + other.calls,
-            self.input_tokens + other.input_tokens,
-            self.output_tokens + other.output_tokens,
-            self.usd + other.usd,
-        )
+        return ModelCost(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
     def __bool__(self) -> bool:
         return self != NO_COST
@@ -84,16 +74,11 @@ NO_COST = ModelCost()
 
 @dataclass(frozen=True, slots=True)
 class Allowance:
-    """Budget that a chain of stages may still spend on model requests; None for no limit.
-
-    Attributes:
-        usd: A request may begin as long as less than this is spent [USD].
-        name: Under which costs are logged; empty if no model is asked.
-    """
+    """Budget that a chain of stages may still spend on model requests; None for no limit."""
 
     calls: int | None = None
-    usd: float | None = None
-    name: str = ""
+    usd: float | None = None  # a request may begin as long as less than this is spent [USD]
+    name: str = ""  # under which costs are logged; empty if no model is asked
 
     @property
     def is_limited(self) -> bool:

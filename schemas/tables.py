@@ -1,21 +1,13 @@
-"""Arrow schemas of the stored tables (docs/formats.md describes every column)."""
+"""Arrow schemas of the stored tables, and the normal form of their rows; docs/formats.md describes every column."""
+
+from collections.abc import Mapping
+from typing import Any
 
 import pyarrow as pa
 
-MANIFEST = pa.schema(  # schemas.manifest.ImageRow
-    [
-        ("scene_id", pa.string()),
-        ("kind", pa.string()),
-        ("uri", pa.string()),
-        ("name", pa.string()),
-        ("content_sha256", pa.string()),
-        ("url", pa.string()),
-        ("source", pa.string()),
-        ("licence", pa.string()),
-        ("rejected", pa.string()),
-        ("rejected_detail", pa.string()),
-    ]
-)
+from schemas.manifest import ImageRow
+
+MANIFEST = pa.schema([(name, pa.string()) for name in ImageRow.model_fields])
 
 SCENES = pa.schema(
     [
@@ -182,15 +174,24 @@ TRAJECTORIES = pa.schema(
 )
 
 TIMINGS = pa.schema(
-    [
-        ("scene_id", pa.string()),
-        ("stage", pa.string()),
-        ("cpu_s", pa.float64()),
-        ("wall_s", pa.float64()),
-    ]
+    [("scene_id", pa.string()), ("stage", pa.string()), ("cpu_s", pa.float64()), ("wall_s", pa.float64())]
 )
 
-TABLES = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}
-"""The tables that consumers query."""
-
+TABLES = {"scenes": SCENES, "objects": OBJECTS, "tasks": TASKS, "trajectories": TRAJECTORIES}  # consumers query these
 STORED_TABLES = {**TABLES, "timings": TIMINGS}
+
+
+def normalize_row(row: Mapping[str, Any], schema: pa.Schema) -> dict[str, Any]:
+    """Normalize a row: every column of its table in order, None for missing values, numbers of the column's type.
+
+    What is written and read back then equals what was given. Columns that the table does not have stay, behind the
+    others: the writer of the row refuses them.
+    """
+    known = {field.name: _convert(row.get(field.name), field.type) for field in schema}
+    return {**known, **{name: value for name, value in row.items() if name not in known}}
+
+
+def _convert(value: Any, kind: pa.DataType) -> Any:
+    if pa.types.is_floating(kind) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return list(value) if isinstance(value, tuple) else value

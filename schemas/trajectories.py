@@ -31,19 +31,12 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grasps(Frozen):
-    """Candidate grasps of one object as it stands.
+    """Candidate grasps of one object as it stands."""
 
-    Attributes:
-        rotations: Gripper frame in the table frame; the columns are its axes. Shape (n, 3, 3).
-        positions: TCP in the table frame. Shape (n, 3) [m].
-        widths: Distance between the contacts. Shape (n,) [m].
-        scores: Confidence, higher is better. Shape (n,).
-    """
-
-    rotations: Float64[np.ndarray, "n 3 3"]
-    positions: Points
-    widths: Numbers
-    scores: Numbers
+    rotations: Float64[np.ndarray, "n 3 3"]  # gripper frame in the table frame; the columns are its axes
+    positions: Points  # TCP in the table frame, shape (n, 3) [m]
+    widths: Numbers  # distance between the contacts, shape (n,) [m]
+    scores: Numbers  # confidence, higher is better, shape (n,)
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -55,39 +48,23 @@ class Grasps(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placement(Frozen):
-    """Pose at which an object is released.
+    """Pose at which an object is released."""
 
-    Attributes:
-        pose: The object's own frame in the table frame, before it is released.
-        drop_m: How far it then falls until it touches [m].
-        clear_by: How it keeps clear of other objects: `boxes`, or `outlines` seen from above if boxes leave
-            no room.
-    """
-
-    pose: Pose
-    drop_m: float
-    clear_by: str = "boxes"
+    pose: Pose  # the object's own frame in the table frame, before it is released
+    drop_m: float  # how far it then falls until it touches [m]
+    clear_by: str = "boxes"  # keeps clear of other objects by `boxes`, or `outlines` seen from above in narrow places
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion(Frozen):
-    """Timed joint motion through the six phases, sampled at a constant step.
+    """Timed joint motion through the six phases, sampled at a constant step."""
 
-    Attributes:
-        step_s: Time between samples [s].
-        positions: Of the arm's joints. Shape (t, j) [rad].
-        velocities: Shape (t, j) [rad/s].
-        openings: Commanded distance between the fingers. Shape (t,) [m].
-        phases: Index into `Phase` of each sample, ascending. Shape (t,).
-        fallbacks: Deviations from the usual plan, in words; usually empty.
-    """
-
-    step_s: float
-    positions: JointPath
-    velocities: JointPath
-    openings: Numbers
-    phases: Indices
-    fallbacks: tuple[str, ...] = ()
+    step_s: float  # time between samples [s]
+    positions: JointPath  # of the arm's joints, shape (t, j) [rad]
+    velocities: JointPath  # shape (t, j) [rad/s]
+    openings: Numbers  # commanded distance between the fingers, shape (t,) [m]
+    phases: Indices  # index into `Phase` of each sample, ascending, shape (t,)
+    fallbacks: tuple[str, ...] = ()  # deviations from the usual plan, in words; usually empty
 
     @property
     def duration_s(self) -> float:
@@ -97,35 +74,20 @@ class Motion(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class NoMotion:
-    """Reason why there is no motion for a grasp and a placement.
+    """Reason why there is no motion for a grasp and a placement."""
 
-    Attributes:
-        phase: The first that cannot be planned.
-        reason: Code: `out_of_reach`, `blocked`, `no_path`, `no_blend`, `too_fast`, `not_rechecked` or `no_shape`.
-        detail: One line for people, with the values that decided.
-    """
-
-    phase: Phase
-    reason: str
-    detail: str
+    phase: Phase  # the first that cannot be planned
+    reason: str  # `out_of_reach`, `blocked`, `no_path`, `no_blend`, `too_fast`, `not_rechecked` or `no_shape`
+    detail: str  # one line for people, with the values that decided
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Result of a motion's rollout in physics.
+    """Result of a motion's rollout in physics."""
 
-    Attributes:
-        success: Grasped, lifted, nothing else moved, the relation holds, the object at rest.
-        failed_phase: The phase in which it failed; empty if it succeeded.
-        reason: Code; empty if it succeeded.
-        detail: One line for people, with the values that decided.
-        lifted_m: How far the object rose above where it stood [m].
-        disturbed_m: Largest displacement of any other object [m].
-    """
-
-    success: bool
-    failed_phase: str
-    reason: str
-    detail: str
-    lifted_m: float = 0.0
-    disturbed_m: float = 0.0
+    success: bool  # grasped, lifted, nothing else moved, the relation holds, the object at rest
+    failed_phase: str  # the phase in which it failed; empty if it succeeded
+    reason: str  # code; empty if it succeeded
+    detail: str  # one line for people, with the values that decided
+    lifted_m: float = 0.0  # how far the object rose above where it stood [m]
+    disturbed_m: float = 0.0  # largest displacement of any other object [m]

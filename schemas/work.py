@@ -10,99 +10,59 @@ Status = Literal["done", "dropped", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class SandboxSetup:
-    """Configuration of a sandbox, sent before its first call.
+    """Configuration of a sandbox, sent before its first call."""
 
-    Attributes:
-        pipeline: Location of the pipelines, as `module:attribute`.
-        config_json: The whole configuration.
-        cache_dir: Content-addressed cache on the machine that runs the sandbox.
-        attempts: Attempts of a stage that crashes, hangs or runs out of memory on a scene.
-        memory_mb: Resident memory of the child [MB].
-        records_dir: Folder of the checkpoints.
-    """
-
-    pipeline: str
+    pipeline: str  # where the pipelines are defined, `module:attribute`
     config_json: str
-    cache_dir: str
-    attempts: int
-    memory_mb: int
-    records_dir: str
+    cache_dir: str  # content-addressed cache on the machine that runs the sandbox
+    attempts: int  # of a stage that crashes, hangs or runs out of memory on a scene
+    memory_mb: int  # resident memory of the child [MB]
+    records_dir: str  # folder of the checkpoints
 
 
 @dataclass(frozen=True, slots=True)
 class StageCall:
-    """Call of one stage on one scene; the input travels beside it as encoded bytes.
-
-    Attributes:
-        kind: Kind of the manifest row, which names the pipeline.
-        position: Index of the stage in that pipeline.
-        deadline_s: Wall time of one attempt [s].
-        tried: Failed attempts before, in chains that the budget interrupted.
-    """
+    """Call of one stage on one scene; the input travels beside it as encoded bytes."""
 
     scene_id: str
-    kind: str
-    position: int
-    deadline_s: float
-    tried: int = 0
+    kind: str  # of the manifest row; it names the pipeline
+    position: int  # index of the stage in that pipeline
+    deadline_s: float  # wall time of one attempt [s]
+    tried: int = 0  # failed attempts before, in chains that the budget interrupted
 
 
 @dataclass(frozen=True, slots=True)
 class StageChain:
-    """Consecutive stages of one pool on one scene; the input travels beside it, or is a checkpoint.
-
-    Attributes:
-        calls: The stages, in order.
-        input_record: Name or location of the checkpoint that is the input; empty if the input travels beside.
-        output_records: Name of the checkpoint of each stage's output; empty if it has none.
-        allowance: Budget of all of them together for model requests.
-        losses: How often a child was killed from outside before, in chains that the budget interrupted.
-    """
+    """Consecutive stages of one pool on one scene; the input travels beside it, or is a checkpoint."""
 
     calls: tuple[StageCall, ...]
-    input_record: str
-    output_records: tuple[str, ...]
-    allowance: Allowance = UNLIMITED
-    losses: int = 0
+    input_record: str  # name or location of the checkpoint that is the input; empty if the input travels beside
+    output_records: tuple[str, ...]  # name of the checkpoint of each stage's output; empty if it has none
+    allowance: Allowance = UNLIMITED  # of all of them together
+    losses: int = 0  # how often a child was killed from outside before, in chains that the budget interrupted
 
 
 @dataclass(frozen=True, slots=True)
 class StageReport:
-    """Report of a call; the next record travels beside it as encoded bytes.
+    """Report of a call; the next record travels beside it as encoded bytes."""
 
-    Attributes:
-        outcome: None if the stage is done.
-        attempts: The item's own attempts, 1 or more; losses of the infrastructure do not count.
-        cpu_s: CPU time of the last attempt [s].
-        wall_s: Wall time of the last attempt [s].
-        trace: Traceback of an error, for the log only: never part of the dataset.
-        cost: Cost of the models' answers when they were first given, by any build: a figure of the scene.
-        paid: Cost of this call: less, if answers were in the cache.
-    """
-
-    outcome: Dropped | Failed | None
-    attempts: int
-    cpu_s: float
-    wall_s: float
-    trace: str = ""
-    cost: ModelCost = NO_COST
-    paid: ModelCost = NO_COST
+    outcome: Dropped | Failed | None  # None if the stage is done
+    attempts: int  # the item's own, 1 or more; losses of the infrastructure do not count
+    cpu_s: float  # of the last attempt [s]
+    wall_s: float  # of the last attempt [s]
+    trace: str = ""  # traceback of an error, for the log only: never part of the dataset
+    cost: ModelCost = NO_COST  # of the answers when they were first given, by any build: a figure of the scene
+    paid: ModelCost = NO_COST  # of this call: less, if answers were in the cache
 
 
 @dataclass(frozen=True, slots=True)
 class StageChainReport:
-    """Report of a chain: a report of each stage that ran; only the last may be other than done.
-
-    Attributes:
-        input_lost: Whether nothing ran, because the checkpoint of the input is gone or damaged.
-        losses: How often a child was killed from outside, those of the chain before included.
-        counted: Whether the reports hold all costs: those of a process that died are only in its cost log.
-    """
+    """Report of a chain: a report of each stage that ran; only the last may be other than done."""
 
     stages: tuple[StageReport, ...]
-    input_lost: bool = False
-    losses: int = 0
-    counted: bool = True
+    input_lost: bool = False  # nothing ran, because the checkpoint of the input is gone or damaged
+    losses: int = 0  # how often a child was killed from outside, those of the chain before included
+    counted: bool = True  # the reports hold all costs: those of a process that died are only in its cost log
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,25 +76,15 @@ class StageTiming:
 
 @dataclass(frozen=True, slots=True)
 class SceneResult:
-    """Result of a scene, as the journal keeps it until its shard is committed.
-
-    Attributes:
-        stage: The last stage that ran; `manifest` if the row was rejected.
-        reason: Code of a drop, else empty.
-        error_kind: Kind of a failure, else empty.
-        detail: One line for people, of a drop or a failure.
-        attempts: The most attempts of any stage; 0 if none ran.
-        exported: An encoded `ExportedScene`; None unless done.
-        costs: Costs of the models' answers, by stage that asked one.
-    """
+    """Result of a scene, as the journal keeps it until its shard is committed."""
 
     scene_id: str
     status: Status
-    stage: str
-    reason: str
-    error_kind: str
-    detail: str
-    attempts: int
+    stage: str  # the last that ran; `manifest` if the row was rejected
+    reason: str  # code of a drop, else empty
+    error_kind: str  # of a failure, else empty
+    detail: str  # one line for people, of a drop or a failure
+    attempts: int  # the most of any stage; 0 if none ran
     timings: tuple[StageTiming, ...]
-    exported: bytes | None
-    costs: tuple[tuple[str, ModelCost], ...] = ()
+    exported: bytes | None  # an encoded `ExportedScene`; None unless done
+    costs: tuple[tuple[str, ModelCost], ...] = ()  # of the answers, by stage that asked one
