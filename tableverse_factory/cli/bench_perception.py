@@ -152,7 +152,7 @@ def _show_way(title: str, entries: list["PlacementError"]) -> None:
 
 
 def _placement_figures(entries: list["PlacementError"]) -> list[str]:
-    """Format medians and 90th percentiles of the errors, and of the errors over their stated deviations."""
+    """Format medians and 90th percentiles of the errors, also over their stated deviations."""
     import numpy as np
 
     def spread(values: list[float], *quantiles: int) -> str:
@@ -172,15 +172,10 @@ def _placement_figures(entries: list["PlacementError"]) -> list[str]:
 
 
 def _derive_scores(row: "MaskScore") -> dict[str, object]:
-    """Compute the scores that follow from the counts of a row."""
     pairs = row.containment
-    shares = {"precision": pairs.precision, "recall": pairs.recall} if pairs else {}
-    return {
-        "mean_iou": row.mean_iou,
-        "recall": row.recall,
-        "overlap_f": row.overlap_f,
-        "containment": asdict(pairs) | shares if pairs else None,
-    }
+    containment = asdict(pairs) | {"precision": pairs.precision, "recall": pairs.recall} if pairs else None
+    scores = {name: getattr(row, name) for name in ("mean_iou", "recall", "overlap_f")}
+    return {**scores, "containment": containment}
 
 
 def _show_masks(rows: list["MaskScore"], detector: str) -> None:

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from workers.progress.tally import DisplayGroup
     from workers.run import BuildSummary
 
-SOME_FAILED = 3
-OVER_BUDGET = 4
+SOME_FAILED, OVER_BUDGET = 3, 4  # exit codes
 
 
 def build(

@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,16 +22,13 @@ from tableverse_factory.stages.observe.depth.from_git import PACKAGES
 SCRIPT_TIMEOUT_S = 120.0
 MIN_FREE_BYTES = 2 * 1024**3
 MIN_MEMORY_BYTES = 2 * 1024**3
-
-SYSTEM_LIBRARIES = {
+SYSTEM_LIBRARIES = {  # that Open3D loads, with their Debian packages
     "libusb-1.0.so.0": "libusb-1.0-0",
     "libGL.so.1": "libgl1",
     "libgomp.so.1": "libgomp1",
     "libX11.so.6": "libx11-6",
 }
-"""Libraries that Open3D loads, with their Debian packages."""
-
-EXTRAS = {
+EXTRAS = {  # of pyproject.toml, without `dev` and `docs`: packages and purpose
     "cluster": (("aiohttp",), "builds as jobs of a Ray cluster, Ray's dashboard"),
     "s3": (("s3fs",), "datasets in object stores"),
     "vlm": (("google-genai", "openai"), "detectors and judges that are models behind an address"),
@@ -46,8 +44,6 @@ EXTRAS = {
     ),
     "bench": (("pandas",), "the comparison of tableverse bench with Ray Data"),
 }
-"""Packages and purpose of each extra in pyproject.toml, without `dev` and `docs`."""
-
 _SIMULATOR = """
 import mujoco
 model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
@@ -79,6 +75,7 @@ ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level
 assert ray.get(ray.remote(lambda: 41).remote(), timeout=60) == 41
 print(ray.__version__, "starts and answers")
 """
+_run = partial(subprocess.run, capture_output=True, text=True, errors="replace", check=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,15 +128,7 @@ def _check_script(
 ) -> Check:
     """Run a script in a process of its own; the last line of its output is what was found."""
     try:
-        ended = subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            timeout=SCRIPT_TIMEOUT_S,
-            text=True,
-            errors="replace",
-            check=False,
-            env={**os.environ, **(environment or {})},
-        )
+        ended = _run([sys.executable, "-c", code], timeout=SCRIPT_TIMEOUT_S, env={**os.environ, **(environment or {})})
     except subprocess.TimeoutExpired:
         return Check(name, required, False, f"no answer within {SCRIPT_TIMEOUT_S:g} s", advice)
     ok = ended.returncode == 0
@@ -153,7 +142,7 @@ def _check_gpu() -> Check:
         return Check("GPU", False, False, "no nvidia-smi", advice)
     query = ["nvidia-smi", "--query-gpu=name,memory.total", "--format=csv,noheader"]
     try:
-        ended = subprocess.run(query, capture_output=True, timeout=20, text=True, errors="replace", check=False)
+        ended = _run(query, timeout=20)
     except (subprocess.TimeoutExpired, OSError) as error:
         return Check("GPU", False, False, str(error)[:200], advice)
     names = [line.strip() for line in ended.stdout.splitlines() if line.strip()]

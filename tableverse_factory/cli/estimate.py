@@ -1,5 +1,6 @@
 """`tableverse estimate`: cost of a larger build, from the timings of this one."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
@@ -107,29 +108,23 @@ def _print_estimate(found: "CostEstimate", cluster: "ClusterSize | None") -> Non
         console.print(f"note: {sanitize_line(note, 200)}", highlight=False)
 
 
-def _make_rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tuple[str, tuple[str, str, str]]]:
-    """Make the lines of the table, without unused resources."""
+def _make_rows(found: "CostEstimate", cluster: "ClusterSize | None") -> list[tuple[str, tuple[str, ...]]]:
     from workers.progress.table import format_bytes, format_duration
 
     rows = [("CPU-hours used", _format_range(found.cpu_hours)), ("CPU-hours held", _format_range(found.cpu_hours_held))]
     if found.gpu_hours.value:
         rows.append(("GPU-hours held", _format_range(found.gpu_hours)))
     for name, size in found.storage.items():
-        rows.append((name, (format_bytes(size.value), format_bytes(size.low), format_bytes(size.high))))
+        rows.append((name, _format_range(size, format_bytes)))
     for name, tokens in (("tokens read", found.input_tokens), ("tokens written", found.output_tokens)):
         if tokens.value:
             rows.append((name, _format_range(tokens)))
     where = "" if cluster is None else f"{cluster.cpus:g} CPUs" + (f", {cluster.gpus:g} GPUs" if cluster.gpus else "")
     for name, hours in ((f"wall time on {where}", found.wall_hours), ("  without waiting", found.least_wall_hours)):
         if hours is not None:
-            low, high = format_duration(hours.low * 3600), format_duration(hours.high * 3600)
-            rows.append((name, (format_duration(hours.value * 3600), low, high)))
+            rows.append((name, _format_range(hours, lambda value: format_duration(value * 3600))))
     rows += [(f"cost of {name}", _format_range(cost)) for name, cost in found.costs.items()]
     return rows
-
-
-def _format_range(figure: "IntervalEstimate") -> tuple[str, str, str]:
-    return _format_number(figure.value), _format_number(figure.low), _format_number(figure.high)
 
 
 def _format_number(value: float) -> str:
@@ -137,3 +132,7 @@ def _format_number(value: float) -> str:
     if value >= 100.0 or value == 0.0:
         return f"{value:,.0f}"
     return f"{value:.1f}" if value >= 10.0 else f"{value:.2f}" if value >= 1.0 else f"{value:.3g}"
+
+
+def _format_range(figure: "IntervalEstimate", as_text: Callable[[float], str] = _format_number) -> tuple[str, ...]:
+    return as_text(figure.value), as_text(figure.low), as_text(figure.high)

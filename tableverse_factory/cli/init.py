@@ -7,7 +7,6 @@ import typer
 
 from tableverse_factory.cli.options import require_local_path
 
-CONFIG, CAPTURES, CAPTURES_README = "config.yaml", "captures", "CAPTURES.md"
 _CAPTURES_TEXT = """\
 # Your captures
 
@@ -56,11 +55,11 @@ def init(
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.core.storage.files import write_atomic
 
-    files = {folder / CONFIG: format_commented_yaml(), folder / CAPTURES_README: _CAPTURES_TEXT}
+    files = {folder / "config.yaml": format_commented_yaml(), folder / "CAPTURES.md": _CAPTURES_TEXT}
     for path in files:
         if path.exists():
             raise InputError(f"{path} is there already and stays as it is: give another FOLDER, or move it away")
-    (folder / CAPTURES).mkdir(parents=True, exist_ok=True)
+    (folder / "captures").mkdir(parents=True, exist_ok=True)
     for path, text in files.items():
         write_atomic(path, text.encode())
     print(_NEXT_STEPS.format(folder=folder), end="")

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from tableverse_factory.cli import completions
+from tableverse_factory.cli.completions import complete_columns
 from tableverse_factory.cli.options import ReadableOut
-from tableverse_factory.cli.tables import to_strict_json
+from tableverse_factory.cli.tables import make_table, to_strict_json
 from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
@@ -37,9 +37,7 @@ def query(
     where: Annotated[str, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = "",
     columns: Annotated[
         str,
-        typer.Option(
-            "--columns", "-c", metavar="A,B", autocompletion=completions.complete_columns, help="Names; `all` for all."
-        ),
+        typer.Option("--columns", "-c", metavar="A,B", autocompletion=complete_columns, help="Names; `all` for all."),
     ] = "",
     limit: Annotated[int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="Most rows to print.")] = None,
     output: Annotated[
@@ -86,11 +84,10 @@ def _iter_rows(scanner: "pa.dataset.Scanner", limit: int | None) -> Iterator[dic
 
 def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounded: bool) -> None:
     from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
     shown = rows[:SHOWN_ROWS] if bounded else rows
-    grid = Table(box=None, pad_edge=False)
+    grid = make_table()
     for name in names:
         # A figure that is cut is a wrong figure, and an id that is cut cannot be copied.
         whole = name.endswith("_id") or not any(isinstance(row[name], str | list) for row in shown)

@@ -1,5 +1,6 @@
 """`tableverse status`: progress of a build, and the costs of its stages."""
 
+import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,6 +8,7 @@ import typer
 
 from tableverse_factory.cli.options import AsJson, BuiltOut
 from tableverse_factory.cli.tables import make_table
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
@@ -17,8 +19,6 @@ if TYPE_CHECKING:
     from tableverse_factory.dataset.judge_summary import JudgeSummary
     from tableverse_factory.dataset.trajectory_summary import TrajectorySummary
     from workers.progress.build_state import BuildState
-
-TRAJECTORIES = "trajectories"
 
 
 def status(
@@ -88,10 +88,6 @@ def _follow(out: "StoragePath", every_s: float) -> None:
 
 def _dump_json(figures: dict[str, Any]) -> str:
     """Encode the figures as strict JSON, which has no infinity."""
-    import json
-
-    from tableverse_factory.core.errors import InputError
-
     try:
         return json.dumps(figures, indent=2, allow_nan=False)
     except ValueError as error:
@@ -157,19 +153,18 @@ def _print_state(state: "BuildState", out: "StoragePath") -> None:
             table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
     writer = describe_writer(out / WORK / LOCK)
-    if writer is not None or state.remaining:
-        print(writer or f"to go on: {_suggest_command(state, out)}")
-    if state.remaining and read_rerun_stage(out) == TRAJECTORIES:
+    if writer is not None:
+        print(writer)
+    if not state.remaining:
+        return
+    again = read_rerun_stage(out) == "trajectories"
+    command = f"build MANIFEST {out} with what it was begun with"
+    if again and len(state.published) == state.shards:  # it lacks only trajectories, which need no manifest
+        command = f"trajectories {out} with its --set, if any"
+    if writer is None:
+        print(f"to go on: tableverse {command}")
+    if again:
         print("rows of trajectories appear when their shard is complete")
-
-
-def _suggest_command(state: "BuildState", out: "StoragePath") -> str:
-    """Suggest the command to resume; a dataset that only lacks trajectories needs no manifest."""
-    from workers.plan.rerun import read_rerun_stage
-
-    if read_rerun_stage(out) == TRAJECTORIES and len(state.published) == state.shards:
-        return f"tableverse trajectories {out} with its --set, if any"
-    return f"tableverse build MANIFEST {out} with what it was begun with"
 
 
 def _print_judgements(verdicts: "JudgeSummary") -> None:

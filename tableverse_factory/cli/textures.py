@@ -2,18 +2,15 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from tableverse_factory.cli import completions
+from tableverse_factory.cli.completions import complete_textures
 from tableverse_factory.cli.options import AsJson, require_local_path
 from tableverse_factory.cli.tables import print_json
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 textures = typer.Typer(no_args_is_help=True, help="Make table textures, or index a repository of PBR maps.")
 
@@ -45,16 +42,21 @@ def index(
     if not table.num_rows:
         raise InputError(f"{sanitize_line(str(folder))}: no map found; they are named as Wood001_1K-JPG_Color.jpg")
     write_index(out, table)
-    counts = _counts(table)
+    usable = table["rejected"].null_count
+    kinds = Counter(
+        f"rejected: {row['rejected']}" if row["rejected"] else f"licence {row['licence'] or 'not stated'}"
+        for row in table.select(["rejected", "licence"]).to_pylist()
+    )
+    counts = dict(sorted(kinds.items(), key=lambda item: (-item[1], item[0])))
     if as_json:
-        print_json({"usable": table["rejected"].null_count, "counts": counts}, indent=None)
+        print_json({"usable": usable, "counts": counts}, indent=None)
         return
     for what, count in counts.items():
         print(f"{count:6d}  {what}")
     rejected = [row for row in table.select(["name", "rejected_detail"]).to_pylist() if row["rejected_detail"]]
     for row in rejected[:_SHOWN_REJECTIONS]:
         print(f"{sanitize_line(row['name'])}: {row['rejected_detail']}")
-    print(f"{table.num_rows} sets, {table['rejected'].null_count} usable, in {out}")
+    print(f"{table.num_rows} sets, {usable} usable, in {out}")
 
 
 @textures.command("make")
@@ -62,9 +64,7 @@ def make(
     name: Annotated[
         str,
         typer.Argument(
-            metavar="NAME",
-            autocompletion=completions.complete_textures,
-            help="A seed, or family and number as marble-12.",
+            metavar="NAME", autocompletion=complete_textures, help="A seed, or family and number as marble-12."
         ),
     ],
     out: Annotated[
@@ -83,12 +83,3 @@ def make(
     seed = parse_texture_seed(name)
     write_atomic(out, encode_png(make_texture(seed, size)))
     print(f"{name_texture(seed)}, {size} x {size} px, in {out}")
-
-
-def _counts(table: "pa.Table") -> dict[str, int]:
-    """Count usable sets by licence, the others by reason; largest first."""
-    counts = Counter(
-        f"rejected: {row['rejected']}" if row["rejected"] else f"licence {row['licence'] or 'not stated'}"
-        for row in table.select(["rejected", "licence"]).to_pylist()
-    )
-    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
