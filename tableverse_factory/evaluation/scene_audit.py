@@ -27,16 +27,11 @@ ANGLE_TOLERANCE_RAD = 2e-3
 
 @dataclass(frozen=True, slots=True)
 class SceneAudit:
-    """Audit of one scene.
-
-    Attributes:
-        measured: Measured figures by the names of `Certificate`.
-        problems: Problems, one line each.
-    """
+    """Audit of one scene."""
 
     scene_id: str
-    measured: Mapping[str, Any]
-    problems: tuple[str, ...]
+    measured: Mapping[str, Any]  # figures by the names of `Certificate`
+    problems: tuple[str, ...]  # one line each
 
     @property
     def ok(self) -> bool:
@@ -88,11 +83,7 @@ def audit_model(name: str, model: mujoco.MjModel, epsilon_m: float) -> SceneAudi
 
 
 def read_scene_folder(folder: Path, without: Collection[str] = ()) -> dict[str, bytes]:
-    """Read the files of a scene folder by relative path, within limits; links out of it are not followed.
-
-    Args:
-        folder: Folder, as `tableverse extract` writes it.
-        without: Paths to skip.
+    """Read the files of a scene folder by relative path, except those of `without`; links out of it are not followed.
 
     Raises:
         InputError: `too_many_files` or `file_too_large` if it exceeds the limits.

@@ -26,17 +26,11 @@ SCENES_PER_PROCESS = 4  # least scenes per process: the start of a process takes
 
 @dataclass(frozen=True, slots=True)
 class ReplayContext:
-    """Context for replaying the trajectories of a dataset.
+    """Context for replaying the trajectories of a dataset."""
 
-    Attributes:
-        arm: Arm of trajectories whose robot came from a file.
-        config: Configuration of the trajectories from run.json.
-        tasks: Rows of tasks/ by scene.
-    """
-
-    arm: Arm | None
-    config: TrajectoriesConfig
-    tasks: Mapping[str, Sequence[Row]]
+    arm: Arm | None  # of trajectories whose robot came from a file
+    config: TrajectoriesConfig  # from run.json
+    tasks: Mapping[str, Sequence[Row]]  # rows of tasks/ by scene
 
     def replay(self, audit: SceneAudit, files: Mapping[str, bytes], rows: Sequence[Row]) -> SceneAudit:
         """Add the audit of the trajectories to that of their scene."""
@@ -51,17 +45,9 @@ class ReplayContext:
 
 
 def verify_scenes(path: str, jobs: int, trajectories: bool = False, robot: str | None = None) -> Iterator[SceneAudit]:
-    """Audit every finished scene of a dataset in the order of its rows.
+    """Audit every finished scene of a dataset in the order of its rows, and replay its trajectories if asked to.
 
-    Args:
-        path: Dataset, as `open_dataset` takes it.
-        jobs: Most processes.
-        trajectories: Whether to replay trajectories.
-        robot: Arm of trajectories whose robot came from a file.
-
-    Raises:
-        InputError: if there is no dataset, a table is missing, or there is nothing to verify.
-        ConfigError: if the trajectories have unknown configuration keys, or there is no such robot.
+    `robot` is the arm of trajectories whose robot came from a file. A missing table, or nothing to verify, is an error.
     """
     dataset = open_dataset(path)
     for table in TABLES:  # a missing table damages the shard even if its scenes are whole

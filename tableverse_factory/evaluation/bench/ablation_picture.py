@@ -41,27 +41,14 @@ GUTTER = 6  # white between two panels [px]
 
 
 def write_ablation(file: Path, layout: Path, methods: Sequence[str], config: Config, cache_dir: Path) -> None:
-    """Run methods on one layout and draw the results as a PNG file.
-
-    Args:
-        file: Path of the PNG file.
-        layout: Path of the layout file.
-        methods: Keys of `RECTIFICATION_METHODS`.
-        config: Configuration of the run.
-        cache_dir: Cache of convex pieces.
-    """
+    """Run methods (keys of `RECTIFICATION_METHODS`) on one layout and draw the results as a PNG file."""
     case = read_case(layout, None, config, cache_dir)
     scenes = {name: RECTIFICATION_METHODS[name](case, config).scene for name in methods}
     Image.fromarray(np.array(draw_ablation(scenes, config.settle.timestep_s))).save(file, format="PNG", optimize=True)
 
 
 def draw_ablation(scenes: Mapping[str, ReleasedScene], timestep_s: float) -> Picture:
-    """Draw a column for each method with one camera: its result, and below `LET_GO_S` of free simulation later.
-
-    Args:
-        scenes: Results of the methods on one layout, by name.
-        timestep_s: Time step of the simulation [s].
-    """
+    """Draw a column for each method with one camera: its result, and below `LET_GO_S` of free simulation later."""
     ids = sorted({body.object_id for scene in scenes.values() for body in scene.bodies})
     colors = {object_id: PALETTE[index % len(PALETTE)] for index, object_id in enumerate(ids)}
     at_first = {name: _build_scenery(scene, colors) for name, scene in scenes.items()}
@@ -82,7 +69,6 @@ def stack_panels(panels: Sequence[Picture], axis: int) -> Picture:
 
 
 def _frame_scenes(sceneries: Sequence[Scenery]) -> PosedCamera:
-    """Return a camera that sees every object of all scenes."""
     names = tuple(name for scenery in sceneries for name in scenery.names)
     parts = tuple(part for scenery in sceneries for part in scenery.parts[:-1])
     return make_front_camera(Scenery(names, parts, tuple(None for _ in parts)), WIDTH, HEIGHT, _AZIMUTH)

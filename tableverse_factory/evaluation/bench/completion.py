@@ -44,49 +44,29 @@ TABLE_HALF_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class CompletionScore:
-    """Score of one method on one view of a mesh.
-
-    Attributes:
-        view: Index into `VIEWS`.
-        method: `hull`, `height field`, or the `completion` that the place stage recorded.
-        iou: Volume of the intersection over the union; 0 where nothing was placed.
-        chamfer_m: Mean of the two mean distances between the surfaces [m].
-        size_error: Mean over the axes of the relative error of the extents.
-        hollow: Whether the true mesh has a cavity that opens upward.
-        cavity_kept: Part of that cavity that the completed mesh leaves open; NaN where there is none.
-        cpu_s: CPU time of the place stage; 0 for the other methods [s].
-    """
+    """Score of one method on one view of a mesh."""
 
     mesh: str
-    view: int
-    method: str
-    iou: float
-    chamfer_m: float
-    size_error: float
-    hollow: bool = False
-    cavity_kept: float = float("nan")
-    cpu_s: float = 0.0
+    view: int  # index into `VIEWS`
+    method: str  # `hull`, `height field`, or the `completion` that the place stage recorded
+    iou: float  # volume of the intersection over the union; 0 where nothing was placed
+    chamfer_m: float  # mean of the two mean distances between the surfaces [m]
+    size_error: float  # mean over the axes of the relative error of the extents
+    hollow: bool = False  # whether the true mesh has a cavity that opens upward
+    cavity_kept: float = float("nan")  # part of it that stays open; NaN where there is none
+    cpu_s: float = 0.0  # CPU time of the place stage; 0 for the other methods [s]
 
 
 @dataclass(frozen=True, slots=True)
 class CavityScore:
-    """The cavity of a mesh that is open from above.
+    """The cavity of a mesh that is open from above."""
 
-    Attributes:
-        share: Its volume over that of the hull.
-        points: Samples of the cavity. Shape (n, 3) [m].
-    """
-
-    share: float
-    points: Points
+    share: float  # its volume over that of the hull
+    points: Points  # samples of the cavity, shape (n, 3) [m]
 
 
 def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
-    """Complete every mesh in `folder` from two views by convex hull, height field and the place stage.
-
-    Raises:
-        InputError: If the folder holds no mesh.
-    """
+    """Complete every mesh in `folder` from two views by convex hull, height field and the place stage."""
     paths = sorted(folder.glob("*.obj"))
     if not paths:
         raise InputError(f"{sanitize_line(str(folder))} holds no meshes: give a folder with *.obj in it")

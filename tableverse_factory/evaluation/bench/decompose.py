@@ -23,27 +23,17 @@ from tableverse_factory.geometry.mesh.repair import make_closed_solid
 
 @dataclass(frozen=True, slots=True)
 class PieceScore:
-    """Score of one method on one mesh, or on several: the sums of time and pieces, the means of the rest.
-
-    Attributes:
-        method: Key of `DECOMPOSITIONS`.
-        cpu_s: CPU time of repair, simplification and decomposition [s].
-        faster: CPU time of the first method over that of this one.
-        volume_ratio: Volume of the union of the pieces over that of the mesh.
-        volume_error: Absolute difference of `volume_ratio` from 1.
-        hausdorff: Hausdorff distance between mesh and pieces over the longest side of the mesh.
-        cavity_kept: Share of the space between the mesh and its hull that stays open.
-    """
+    """Score of one method on one mesh, or on several: the sums of time and pieces, the means of the rest."""
 
     mesh: str
-    method: str
-    cpu_s: float
-    faster: float
+    method: str  # key of `DECOMPOSITIONS`
+    cpu_s: float  # CPU time of repair, simplification and decomposition [s]
+    faster: float  # CPU time of the first method over that of this one
     pieces: int
-    volume_ratio: float
-    volume_error: float
-    hausdorff: float
-    cavity_kept: float
+    volume_ratio: float  # volume of the union of the pieces over that of the mesh
+    volume_error: float  # absolute difference of `volume_ratio` from 1
+    hausdorff: float  # Hausdorff distance between mesh and pieces over the longest side of the mesh
+    cavity_kept: float  # share of the space between the mesh and its hull that stays open
 
 
 def _coacd_defaults(shape: TriangleMesh) -> list[Points]:
@@ -67,15 +57,9 @@ DECOMPOSITIONS: dict[str, Callable[[TriangleMesh], list[Points]]] = {
 def bench_decompose(
     files: Sequence[Path], methods: Sequence[str], on_mesh: Callable[[], None] | None = None
 ) -> list[PieceScore]:
-    """Run every method on every mesh and compare the pieces with the repaired solid.
-
-    Args:
-        files: Mesh files.
-        methods: Keys of `DECOMPOSITIONS`.
-        on_mesh: Called after each mesh.
+    """Run methods (keys of `DECOMPOSITIONS`) on every mesh and compare the pieces with the repaired solid.
 
     Raises:
-        InputError: if there is no mesh, or a method is unknown.
         GeometryError: if a mesh cannot be made a solid.
     """
     if unknown := [name for name in methods if name not in DECOMPOSITIONS]:

@@ -26,27 +26,17 @@ _KINDS = {"workers.sandbox.child": "sandboxes", "ray::": "actors"}
 
 @dataclass(frozen=True, slots=True)
 class FactoryRun:
-    """Measurement of one build.
+    """Measurement of one build."""
 
-    Attributes:
-        what: `local`, `ray`, `burning` or `ray data`.
-        working_s: Wall time from the start of the driver's work until the last commit, start of workers included [s].
-        steady_s: Wall time from the first finished scenes until the last commit [s].
-        steady_scenes: Scenes finished in that time.
-        cpu_ms: CPU time per scene by kind of process, imports and the start of Ray included [ms].
-        peak_mb: Peak resident memory of the driver [MB].
-        growth_mb: Growth of the driver's memory per 10,000 scenes over the second half of the build [MB].
-    """
-
-    what: str
+    what: str  # `local`, `ray`, `burning` or `ray data`
     workers: int
     scenes: int
-    working_s: float
-    steady_s: float
-    steady_scenes: int
-    cpu_ms: Mapping[str, float]
-    peak_mb: float
-    growth_mb: float
+    working_s: float  # from the start of the driver's work to the last commit, start of workers included [s]
+    steady_s: float  # from the first finished scenes to the last commit [s]
+    steady_scenes: int  # scenes finished in that time
+    cpu_ms: Mapping[str, float]  # CPU time per scene by kind of process, imports and the start of Ray included
+    peak_mb: float  # peak resident memory of the driver
+    growth_mb: float  # growth of the driver's memory per 10,000 scenes over the second half of the build
 
     @property
     def rate(self) -> float:
@@ -66,26 +56,18 @@ class FactoryRun:
 
 @dataclass(frozen=True, slots=True)
 class FactoryComparison:
-    """Ratios between runs; nan where a run is missing.
+    """Ratios between runs; nan where a run is missing. Marginal cost is that of one more scene."""
 
-    Attributes:
-        linear: Marginal CPU time per scene from the second largest to the largest build, over that from the smallest to
-            the second largest: 1 for linear cost.
-        ray_ms: Marginal CPU time per scene that Ray with one worker adds to one process [ms].
-        speed_up: Steady rate with all workers over that with one, for stages that burn CPU.
-        to_ray_data: Marginal rate of the factory over that of Ray Data.
-    """
-
-    linear: float
-    ray_ms: float
-    speed_up: float
-    to_ray_data: float
+    linear: float  # marginal CPU time of the two largest builds over that of the two smallest: 1 for linear cost
+    ray_ms: float  # marginal CPU time that Ray with one worker adds to one process [ms]
+    speed_up: float  # steady rate with all workers over that with one, for stages that burn CPU
+    to_ray_data: float  # marginal rate of the factory over that of Ray Data
 
 
 def bench_factory(
     sizes: Sequence[int], workers: int, burning: int, show: Callable[[str], None] = lambda _: None
 ) -> Iterator[FactoryRun]:
-    """Measure one build after the other.
+    """Measure one build after the other; `show` gets a description before each.
 
     Args:
         sizes: Scenes of the builds on Ray and on Ray Data, ascending; the two smallest also run with one worker.

@@ -27,11 +27,7 @@ BURST_SPEED = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReleasedScene(Frozen):
-    """Bodies on their table, ready to be simulated.
-
-    Attributes:
-        bodies: In the order of the layout's objects.
-    """
+    """Bodies on their table, in the order of the layout's objects, ready to be simulated."""
 
     bodies: tuple[SceneBody, ...]
     slab: Slab

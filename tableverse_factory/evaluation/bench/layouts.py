@@ -43,25 +43,15 @@ _REST_POSES = TypeAdapter(dict[str, _RestPose])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayoutCase:
-    """A layout and the references of its results.
+    """A layout and the references of its results."""
 
-    Attributes:
-        name: File name without its suffix.
-        item: The layout as observed.
-        pieces: Convex pieces of each object.
-        truth: True rest poses, of the objects for which they are known.
-        relations: True relations; None unless the rest of every object is known.
-        groups: LCCR's groups in the observed layout, the root first.
-        azimuths: Directions of the groups about the root [rad].
-    """
-
-    name: str
-    item: PlacedObjects
-    pieces: tuple[ConvexPieces, ...]
-    truth: RestPoses
-    relations: Relations | None
-    groups: tuple[Group, ...]
-    azimuths: Float64[np.ndarray, " n"]
+    name: str  # file name without its suffix
+    item: PlacedObjects  # as observed
+    pieces: tuple[ConvexPieces, ...]  # of each object
+    truth: RestPoses  # of the objects for which it is known
+    relations: Relations | None  # true ones; None unless the rest of every object is known
+    groups: tuple[Group, ...]  # LCCR's groups in the observed layout, the root first
+    azimuths: Float64[np.ndarray, " n"]  # directions of the groups about the root [rad]
 
     def azimuth_changes(self, poses: Mapping[str, Pose]) -> Float64[np.ndarray, " k"]:
         """Compute the turn of each group about the root [rad], for objects at poses by id; NaN at the centre."""
@@ -82,11 +72,7 @@ def make_parts(
 
 
 def find_layouts(path: Path, most: int | None) -> list[Path]:
-    """Find the layouts of a folder in the order of their names, at most `most`, spread evenly; or return the one file.
-
-    Raises:
-        InputError: If the folder holds none.
-    """
+    """Find the layouts of a folder by name, at most `most`, spread evenly; or return the one file."""
     found = [path] if path.is_file() else sorted(path.glob("*.json"))
     if not found:
         raise InputError(f"{path} holds no layout: give a folder of *.json files", "no_layouts")
@@ -94,18 +80,7 @@ def find_layouts(path: Path, most: int | None) -> list[Path]:
 
 
 def read_case(path: Path, truth: Path | None, config: Config, cache_dir: Path) -> LayoutCase:
-    """Read a layout and its truth, and decompose its meshes.
-
-    Args:
-        path: The layout file.
-        truth: Folder with a file of the same name: object id to position, quaternion_wxyz, scale.
-        config: Configuration of the run.
-        cache_dir: Cache of convex pieces.
-
-    Raises:
-        InputError: If the layout or its truth cannot be read.
-        GeometryError: If a mesh cannot be decomposed.
-    """
+    """Read a layout and decompose its meshes; the folder `truth` has a file of the same name with the rest poses."""
     item = _read_layout(path, config)
     pieces = tuple(decompose(placed.mesh, config.rectify, cache_dir) for placed in item.objects)
     rests = _read_rest_poses(truth / path.name) if truth else {}

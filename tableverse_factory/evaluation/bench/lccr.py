@@ -25,41 +25,23 @@ from tableverse_factory.geometry.relations.preserved import PreservedRelations, 
 
 @dataclass(slots=True)
 class LayoutScore:
-    """Scores of one method over all layouts; lists are by scene or by object.
+    """Scores of one method over all layouts; lists are by scene or by object."""
 
-    Attributes:
-        piece_depths_m: Deepest overlap of two objects' convex pieces in each scene [m].
-        mesh_depths_m: The same on the meshes [m].
-        resting: Whether each scene is stable.
-        from_observed_m: Displacement of the box centre of each observed object from the layout [m].
-        from_truth_m: The same from the true pose, where it is known [m].
-        kept: True relations that still hold.
-        by_force: Number of true supports by force, where a method has simulated.
-        by_force_kept: Number of them that still hold.
-        by_force_left_out: Number of further pairs of which one moved too far until the truth rested.
-        by_force_unknown: Scenes whose true support by force is not known.
-        azimuth_changes_rad: Change of the azimuth of each group about the root [rad].
-        burst_speeds: Largest speed in each scene just after its release [m/s].
-        fallen: Number of objects that are no longer on the table.
-        left_out: Number of objects, copies included, that did not fit into their container.
-        seconds: CPU time of each scene, without decomposition [s].
-    """
-
-    piece_depths_m: list[float] = field(default_factory=list)
-    mesh_depths_m: list[float] = field(default_factory=list)
-    resting: list[bool] = field(default_factory=list)
-    from_observed_m: list[float] = field(default_factory=list)
-    from_truth_m: list[float] = field(default_factory=list)
-    kept: PreservedRelations = field(default_factory=PreservedRelations)
-    by_force: int = 0
-    by_force_kept: int = 0
-    by_force_left_out: int = 0
-    by_force_unknown: int = 0
-    azimuth_changes_rad: list[float] = field(default_factory=list)
-    burst_speeds: list[float] = field(default_factory=list)
-    fallen: int = 0
-    left_out: int = 0
-    seconds: list[float] = field(default_factory=list)
+    piece_depths_m: list[float] = field(default_factory=list)  # deepest overlap of pieces in each scene [m]
+    mesh_depths_m: list[float] = field(default_factory=list)  # the same on the meshes [m]
+    resting: list[bool] = field(default_factory=list)  # whether each scene is stable
+    from_observed_m: list[float] = field(default_factory=list)  # shift of the box centre from the layout [m]
+    from_truth_m: list[float] = field(default_factory=list)  # the same from the true pose, where known [m]
+    kept: PreservedRelations = field(default_factory=PreservedRelations)  # true relations that still hold
+    by_force: int = 0  # true supports by force, where a method has simulated
+    by_force_kept: int = 0  # of them, those that still hold
+    by_force_left_out: int = 0  # further pairs of which one moved too far until the truth rested
+    by_force_unknown: int = 0  # scenes whose true support by force is not known
+    azimuth_changes_rad: list[float] = field(default_factory=list)  # of each group about the root [rad]
+    burst_speeds: list[float] = field(default_factory=list)  # largest in each scene just after its release [m/s]
+    fallen: int = 0  # objects that are no longer on the table
+    left_out: int = 0  # objects, copies included, that did not fit into their container
+    seconds: list[float] = field(default_factory=list)  # CPU time of each scene, without decomposition [s]
 
 
 def bench_lccr(
@@ -70,19 +52,7 @@ def bench_lccr(
     methods: Sequence[str] = DEFAULT_METHODS,
     on_layout: Callable[[LayoutCase, Mapping[str, MethodResult]], None] | None = None,
 ) -> dict[str, LayoutScore]:
-    """Score methods on layouts, one layout after the other.
-
-    Args:
-        paths: Layout files.
-        truth: Folder with files of the same names: object id to position, quaternion_wxyz, scale.
-        config: Configuration of the run.
-        cache_dir: Cache of convex pieces.
-        methods: Keys of `RECTIFICATION_METHODS`.
-        on_layout: Called after each layout with its results.
-
-    Raises:
-        InputError: If a method is unknown, or a layout or its truth cannot be read.
-    """
+    """Score methods (keys of `RECTIFICATION_METHODS`) on layouts, one after the other, against `read_case`'s truth."""
     if unknown := [name for name in methods if name not in RECTIFICATION_METHODS]:
         raise InputError(f"unknown method {unknown[0]!r}: choose from {', '.join(RECTIFICATION_METHODS)}")
     scores = {name: LayoutScore() for name in methods}
@@ -103,9 +73,7 @@ def bench_lccr(
 def summarize_scores(score: LayoutScore, epsilons_m: Sequence[float]) -> dict[str, float | None]:
     """Summarize the scores of one method by row of the table; None where nothing was measured.
 
-    Args:
-        score: Scores of the method.
-        epsilons_m: Depths beyond which two objects collide, each with rows of its own [m].
+    Each of `epsilons_m`, depths beyond which two objects collide, has rows of its own [m].
     """
     azimuths_known = np.abs([angle for angle in score.azimuth_changes_rad if np.isfinite(angle)])
     return {

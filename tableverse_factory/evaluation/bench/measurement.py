@@ -11,11 +11,7 @@ Item = TypeVar("Item")
 
 
 class Stopwatch:
-    """CPU time of this process by part.
-
-    Attributes:
-        cpu_s: Seconds by the name of the part, in the order of first use [s].
-    """
+    """CPU time of this process by part, in the order of first use [s]."""
 
     def __init__(self) -> None:
         self.cpu_s: dict[str, float] = {}

@@ -32,16 +32,11 @@ TABLE_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Containment:
-    """Counts of containment pairs, an object and its container.
+    """Counts of containment pairs, an object and its container."""
 
-    Attributes:
-        true: True pairs with both objects visible in the true masks.
-        correct: Found pairs whose objects match those of a true pair, one to one by their masks.
-    """
-
-    true: int
+    true: int  # true pairs with both objects visible in the true masks
     found: int
-    correct: int
+    correct: int  # found pairs whose objects match those of a true pair, one to one by their masks
 
     @property
     def precision(self) -> float:
@@ -56,31 +51,18 @@ class Containment:
 
 @dataclass(frozen=True, slots=True)
 class MaskScore:
-    """Score of one capture, or of several.
+    """Score of one capture, or of several."""
 
-    Attributes:
-        name: Name of the capture's folder.
-        truth: Number of true objects.
-        found: Number of objects found, those without a true object included.
-        ious: Best IoU of each true object with an object found.
-        overlap: Pixels that found and true objects share in the best one-to-one assignment.
-        found_pixels: Pixels of all objects found that overlap a true object.
-        true_pixels: Pixels of all true objects.
-        cpu_s: CPU time of `perceive` [s].
-        reason: Reason why the scene was dropped, or empty.
-        containment: Counts of containment; None without `truth.json`.
-    """
-
-    name: str
-    truth: int
-    found: int
-    ious: tuple[float, ...]
-    overlap: int
-    found_pixels: int
-    true_pixels: int
-    cpu_s: float
-    reason: str = ""
-    containment: Containment | None = None
+    name: str  # of the capture's folder
+    truth: int  # true objects
+    found: int  # objects found, those without a true object included
+    ious: tuple[float, ...]  # best IoU of each true object with an object found
+    overlap: int  # pixels that found and true objects share in the best one-to-one assignment
+    found_pixels: int  # of all objects found that overlap a true object
+    true_pixels: int  # of all true objects
+    cpu_s: float  # CPU time of `perceive` [s]
+    reason: str = ""  # why the scene was dropped, or empty
+    containment: Containment | None = None  # None without `truth.json`
 
     @property
     def mean_iou(self) -> float:
@@ -104,9 +86,6 @@ def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
 
     The truth is `seg.png` or `masks.png`, and `truth.json` for containment. The largest id of a `seg.png` may be the
     table: it is left out if most of it lies on the plane that was found.
-
-    Raises:
-        InputError: if the folder holds no such capture.
     """
     names = sorted(p.name for p in folder.iterdir() if _find_truth(p) is not None and _has_image(p))
     if not names:
@@ -116,11 +95,7 @@ def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
 
 
 def score_capture(capture: Path, config: Config) -> MaskScore:
-    """Run `observe` and `perceive` on one capture and compare the masks with the truth.
-
-    Raises:
-        InputError: if the capture cannot be read.
-    """
+    """Run `observe` and `perceive` on one capture and compare the masks with the truth."""
     scene_id = check_id(capture.name)
     services = Services(Path())
     seen = observe(
@@ -154,14 +129,7 @@ def find_pairs(found: PerceivedObjects) -> dict[int, int]:
 
 
 def read_true_pairs(capture: Path) -> dict[int, int] | None:
-    """Read the true containment of a capture: instance id of each contained object to its container's.
-
-    Returns:
-        None if the capture has no `truth.json`.
-
-    Raises:
-        InputError: if the file is not as `tableverse synth` writes it.
-    """
+    """Read the true containment, from instance id to the container's; None without `truth.json`."""
     path = capture / GROUND_TRUTH_NAME
     if not path.is_file():
         return None

@@ -38,34 +38,19 @@ UNIT = 1.0  # longest side of a true mesh as `replay` receives it: a MeshModel d
 
 @dataclass(frozen=True, slots=True)
 class PlacementError:
-    """Errors of one true object of one capture; NaN if it was not placed.
+    """Errors of one true object of one capture; NaN if it was not placed."""
 
-    Attributes:
-        scene: Name of the capture's folder.
-        completion: Kind of completion; empty if the object was not placed.
-        visible_fraction: Visible part of the object in the image.
-        symmetry: Number of headings at which the true mesh looks alike: 1 for none but its own, 0 for all (round).
-        position_error_m: Distance between the centres of the axis-aligned boxes in the true table frame [m].
-        height_error_m: Signed error along z [m].
-        heading_error_rad: Smallest turn about the vertical onto the true mesh; NaN for a round one [rad].
-        size_error: Mean over the axes of the relative error of the sides of the boxes.
-        residual_m: Median distance from the observed points to the placed mesh [m].
-        position_std_m: Standard deviation of the position that `place` states; NaN without one [m].
-        heading_std_rad: Standard deviation of the heading that `place` states; NaN without one [rad].
-        ambiguity: Ambiguity that `place` states; NaN without one.
-    """
-
-    scene: str
+    scene: str  # name of the capture's folder
     label: str
-    completion: str
-    visible_fraction: float
-    symmetry: int
-    position_error_m: float = np.nan
-    height_error_m: float = np.nan
-    heading_error_rad: float = np.nan
-    size_error: float = np.nan
-    residual_m: float = np.nan
-    position_std_m: float = np.nan
+    completion: str  # empty if the object was not placed
+    visible_fraction: float  # of the object in the image
+    symmetry: int  # headings at which the true mesh looks alike: 1 for none but its own, 0 for all (round)
+    position_error_m: float = np.nan  # between the centres of the axis-aligned boxes in the true table frame
+    height_error_m: float = np.nan  # signed, along z
+    heading_error_rad: float = np.nan  # smallest turn about z onto the true mesh; NaN for a round one
+    size_error: float = np.nan  # mean over the axes of the relative error of the sides of the boxes
+    residual_m: float = np.nan  # median distance from the observed points to the placed mesh
+    position_std_m: float = np.nan  # as `place` states it, like the next two; NaN without one
     heading_std_rad: float = np.nan
     ambiguity: float = np.nan
 
@@ -95,14 +80,8 @@ def bench_placement(
 ) -> Iterator[dict[tuple[str, str], list[PlacementError]]]:
     """Run every capture with a `truth.json` in `folder` up to `place`, once for each pair of backends.
 
-    Args:
-        folder: Folder of captures, as `tableverse synth` writes them.
-        config: Configuration; its detector and mesh model are replaced.
-        ways: Pairs of `perceive.detector` and `place.mesh_model`. For the mesh model `replay`, the true meshes are
-            recorded at longest side 1 and at random headings, as an ideal MeshModel would return them.
-
-    Raises:
-        InputError: if no capture in the folder has a truth.
+    A way is a pair of `perceive.detector` and `place.mesh_model`. For the mesh model `replay`, the true meshes are
+    recorded at longest side 1 and at random headings, as an ideal MeshModel would return them.
     """
     captures = [path.parent for path in sorted(folder.glob("*/truth.json"))]
     if not captures:

@@ -20,17 +20,11 @@ _LAST_CHARS = 2000
 
 @dataclass(frozen=True, slots=True)
 class CommandMeasurement:
-    """Measurement of one command.
+    """Measurement of one command."""
 
-    Attributes:
-        lines: Lines of stdout: pairs (monotonic time [s], count).
-        memory: Resident memory of the main process: pairs (monotonic time [s], memory [MB]).
-        cpu_s: CPU time by kind of process [s].
-    """
-
-    lines: tuple[tuple[float, int], ...]
-    memory: tuple[tuple[float, float], ...]
-    cpu_s: Mapping[str, float]
+    lines: tuple[tuple[float, int], ...]  # of stdout: monotonic time [s], count
+    memory: tuple[tuple[float, float], ...]  # resident memory of the main process: monotonic time [s], memory [MB]
+    cpu_s: Mapping[str, float]  # CPU time by kind of process [s]
 
 
 def measure_command(

@@ -27,37 +27,23 @@ _FIGURES = [name for name in OBJECTS.names if name.endswith(("_m", "_kg", "_m3")
 
 @dataclass(frozen=True, slots=True)
 class QueryTimes:
-    """Medians of `REPEATS` repetitions after a warm-up [ms].
-
-    Attributes:
-        found: Number of objects that pass the filter.
-        filter_ms: Filter of objects by label and confidence, in the columns that `query` shows.
-        count_ms: Count of usable scenes from a score on.
-        anew_ms: The filter with the dataset opened for it.
-        scene_ms: A scene by its id, compiled by MuJoCo; another scene each time.
-        first_ms: The same with the dataset opened for it.
-        cpu_ms: CPU time of the filter, all threads.
-    """
+    """Medians of `REPEATS` repetitions after a warm-up [ms]."""
 
     what: str
     shards: int
     scenes: int
     objects: int
-    found: int
-    filter_ms: float
-    count_ms: float
-    anew_ms: float
-    scene_ms: float
-    first_ms: float
-    cpu_ms: float
+    found: int  # objects that pass the filter
+    filter_ms: float  # filter of objects by label and confidence, in the columns that `query` shows
+    count_ms: float  # count of usable scenes from a score on
+    anew_ms: float  # the filter with the dataset opened for it
+    scene_ms: float  # a scene by its id, compiled by MuJoCo; another scene each time
+    first_ms: float  # the same with the dataset opened for it
+    cpu_ms: float  # CPU time of the filter, all threads
 
 
 def bench_query(out: Path, what: str) -> QueryTimes:
-    """Measure query times of a dataset.
-
-    Raises:
-        InputError: if it has no objects, or no scene with files.
-    """
+    """Measure query times of a dataset that has objects and scenes with files."""
     dataset = open_dataset(out)
     done = dataset.scenes.to_table(columns=["scene_id"], filter=parse_filter("tar_offset is not null", SCENES))
     label = dataset.objects.head(1, columns=["label"])["label"].to_pylist()

@@ -24,21 +24,13 @@ STEP_M = 0.001
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MethodResult(Frozen):
-    """Result of a method on a layout.
+    """Result of a method on a layout."""
 
-    Attributes:
-        layout: The layout that it started from: containers filled, contents that do not fit left out.
-        scene: The same objects in the same order at their resulting poses.
-        seconds: CPU time, without decomposition [s].
-        restless: Whether an object still moved when the time limit of the simulation was reached.
-        simulated: Whether the method simulates.
-    """
-
-    layout: AssembledLayout
-    scene: ReleasedScene
-    seconds: float
-    restless: bool = False
-    simulated: bool = False
+    layout: AssembledLayout  # as it started: containers filled, contents that do not fit left out
+    scene: ReleasedScene  # the same objects in the same order at their resulting poses
+    seconds: float  # CPU time, without decomposition [s]
+    restless: bool = False  # whether an object still moved at the time limit of the simulation
+    simulated: bool = False  # whether the method simulates
 
 
 Method = Callable[[LayoutCase, Config], MethodResult]
@@ -46,10 +38,7 @@ Rectifier = Callable[[Sequence[RigidPart], RectifyConfig], RectificationResult]
 
 
 def rectify_in_steps(parts: Sequence[RigidPart], config: RectifyConfig) -> RectificationResult:
-    """Run LCCR with equation (2) searched in steps of `STEP_M` instead of solved exactly.
-
-    The second spread, of the final shapes, is exact.
-    """
+    """Run LCCR with equation (2) searched in steps of `STEP_M`; the second spread, of the final shapes, is exact."""
     return rectify_lccr(parts, config, _spread_in_steps)
 
 

@@ -34,20 +34,13 @@ CacheState = Literal["cold", "warm"]
 
 @dataclass(frozen=True, slots=True)
 class SceneCost:
-    """CPU time of one scene.
-
-    Attributes:
-        cache: Whether the cache of convex pieces was empty, or held every mesh.
-        ended: `done`, or the reason why it was dropped.
-        objects: Number of exported objects.
-        cpu_s: Of each stage in order, then of `RECORDS` and `COMMIT` [s].
-    """
+    """CPU time of one scene."""
 
     scene_id: str
-    cache: CacheState
-    ended: str
-    objects: int
-    cpu_s: dict[str, float]
+    cache: CacheState  # whether the cache of convex pieces was empty, or held every mesh
+    ended: str  # `done`, or the reason why it was dropped
+    objects: int  # number of exported objects
+    cpu_s: dict[str, float]  # of each stage in order, then of `RECORDS` and `COMMIT` [s]
 
     @property
     def total_s(self) -> float:
@@ -60,12 +53,7 @@ def bench_stages(
 ) -> list[SceneCost]:
     """Run every scene with an empty cache of its own, then every scene again with the cache that this left.
 
-    The in-memory caches of this process and of MuJoCo are cleared before each scene.
-
-    Args:
-        rows: Rows of a manifest.
-        config: Configuration of the run.
-        on_scene: Called after each scene, twice per row.
+    The in-memory caches of this process and of MuJoCo are cleared before each scene; `on_scene` is called after each.
     """
     costs = []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):

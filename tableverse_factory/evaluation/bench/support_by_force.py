@@ -22,15 +22,10 @@ TRUE_REST_M = 0.005
 
 @dataclass(frozen=True, slots=True)
 class TrueSupport:
-    """Support by force among the objects of a layout at their true rest poses.
+    """Support by force among the objects of a layout at their true rest poses."""
 
-    Attributes:
-        pairs: Pairs (carried, carrier), indices of objects.
-        left_out: Number of further pairs of which either moved by more than `TRUE_REST_M` until it rested.
-    """
-
-    pairs: Pairs
-    left_out: int
+    pairs: Pairs  # (carried, carrier), indices of objects
+    left_out: int  # further pairs of which either moved by more than `TRUE_REST_M` until it rested
 
 
 def find_support_by_force(scene: ReleasedScene, timestep_s: float) -> Pairs:

@@ -20,11 +20,7 @@ CONFIGURATIONS = {"Direct": "placed", "Direct + LCCR": "rectified", "Direct + LC
 
 
 def list_configurations(folder: Path) -> dict[str, str]:
-    """Return `CONFIGURATIONS` with the rectification method of this dataset instead of LCCR.
-
-    Raises:
-        InputError: if its run.json cannot be read.
-    """
+    """Return `CONFIGURATIONS` with the rectification method of this dataset's run.json instead of LCCR."""
     value: Any = parse_json(read_bytes(str(folder / "run.json"), MAX_JSON_BYTES, "bad_run"), "run.json", "bad_run")
     for key in ("config", "rectify", "method"):
         value = value.get(key) if isinstance(value, dict) else None
@@ -38,9 +34,6 @@ def find_ablation_scenes(folder: Path, poses: str) -> list[SceneSource]:
 
     Dropped scenes are missing, so the figures before settling are those of the survivors; `tableverse bench lccr`
     measures all layouts of a folder.
-
-    Raises:
-        InputError: if there is no dataset.
     """
     dataset = open_dataset(folder)
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"]).column(0).to_pylist()

@@ -28,22 +28,14 @@ _Z95 = 1.959964
 
 @dataclass(frozen=True, slots=True)
 class SceneCollisions:
-    """Collisions of one scene.
-
-    Attributes:
-        objects: Number of objects compared, without the table.
-        meshes: Pairs with overlapping meshes, deepest first.
-        pieces: Pairs with overlapping convex pieces, deepest first; None if they were not measured.
-        left_out: Names of static bodies and of the table.
-        error: Reason why the scene could not be measured, or empty.
-    """
+    """Collisions of one scene."""
 
     name: str
-    objects: int = 0
-    meshes: tuple[Pair, ...] = ()
-    pieces: tuple[Pair, ...] | None = None
-    left_out: tuple[str, ...] = ()
-    error: str = ""
+    objects: int = 0  # number of objects compared, without the table
+    meshes: tuple[Pair, ...] = ()  # pairs with overlapping meshes, deepest first
+    pieces: tuple[Pair, ...] | None = None  # the same for convex pieces; None if they were not measured
+    left_out: tuple[str, ...] = ()  # names of static bodies and of the table
+    error: str = ""  # why the scene could not be measured, or empty
 
     @property
     def depth_m(self) -> float:
@@ -75,18 +67,12 @@ class SceneCollisions:
 
 @dataclass(frozen=True, slots=True)
 class MethodCollisions:
-    """Collisions of one method over all its scenes.
-
-    Attributes:
-        epsilon_m: Depth beyond which objects collide [m].
-        scenes: Measured scenes, and those that could not be measured.
-        dropped: Number of scenes that the factory dropped, which are not among them; None if unknown.
-    """
+    """Collisions of one method over all its scenes."""
 
     method: str
-    epsilon_m: float
-    scenes: tuple[SceneCollisions, ...]
-    dropped: int | None = None
+    epsilon_m: float  # depth beyond which objects collide [m]
+    scenes: tuple[SceneCollisions, ...]  # measured scenes, and those that could not be measured
+    dropped: int | None = None  # scenes that the factory dropped, not among these; None if unknown
 
     @property
     def measured(self) -> tuple[SceneCollisions, ...]:
@@ -138,11 +124,7 @@ def measure_scenes(sources: Iterable[SceneSource], cache_dir: Path | None) -> It
 
 
 def measure_scene(name: str, scene: MethodScene, cache_dir: Path | None) -> SceneCollisions:
-    """Measure the depths of all pairs of one scene.
-
-    Raises:
-        GeometryError: if a mesh cannot be closed.
-    """
+    """Measure the depths of all pairs of one scene; raise a `GeometryError` if a mesh cannot be closed."""
     poses = [item.pose for item in scene.objects]
     scales = [item.scale for item in scene.objects]
     meshes = measure_mesh_penetrations([item.mesh for item in scene.objects], poses, scales)

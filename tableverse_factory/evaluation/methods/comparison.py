@@ -17,12 +17,7 @@ _CONTENT_HASH = re.compile(r"-[0-9a-f]{12}\Z")
 
 
 class Comparison:
-    """Methods with their scenes matched by name.
-
-    Attributes:
-        sources: Scenes of each method by shared name.
-        scenes: Names of the scenes that every method has.
-    """
+    """Methods with their scenes matched by name: `sources` by method, and `scenes`, the names that all methods have."""
 
     def __init__(
         self,
@@ -51,11 +46,7 @@ class Comparison:
         return {method: names for method, names in lacking.items() if names}
 
     def grid(self, question: Question) -> bytes:
-        """Draw the grid of one question as a PNG file; a scene is drawn once for all its rounds.
-
-        Raises:
-            InputError: if a scene or its picture cannot be read.
-        """
+        """Draw the grid of one question as a PNG file; a scene is drawn once for all its rounds."""
         scene = question.scene
         reference = read_reference(self.reference(scene), scene)
         if self._drawn[0] != scene:
@@ -66,11 +57,7 @@ class Comparison:
         return stitch_grid(reference, [self._drawn[1][method] for method in question.columns], self._side)
 
     def reference(self, scene: str) -> bytes:
-        """Read the picture of the real scene.
-
-        Raises:
-            InputError: `no_reference` if there is none.
-        """
+        """Read the picture of the real scene; raise `no_reference` if there is none."""
         found = self._find_in_datasets(scene) if self._references is None else _find_reference(self._references, scene)
         if found is None:
             where = self._references or "the datasets that are compared; give --reference"
@@ -94,20 +81,13 @@ def match_methods(methods: Mapping[str, Path], references: Path | None = None, s
         references: Folder of pictures of the real scenes, `<scene>.png` or `<scene>/color.png`; None for those in a
             dataset among the methods.
         side: Side of a cell of the grid [px].
-
-    Raises:
-        InputError: if a method has no scenes.
     """
     sources = {method: index_by_shared_name(find_scenes(path)) for method, path in methods.items()}
     return Comparison(sources, dict(methods), references, side)
 
 
 def check_shared_scenes(comparison: Comparison) -> None:
-    """Check that every method has at least one scene in common.
-
-    Raises:
-        InputError: `no_shared_scenes`.
-    """
+    """Raise `no_shared_scenes` unless the methods have a scene in common."""
     if not comparison.scenes:
         first = ", ".join(f"{min(its)} of {method}" for method, its in comparison.sources.items())
         raise InputError(

@@ -18,13 +18,10 @@ GREY: Rgb = (178, 178, 184)
 
 
 def read_glb_scene(path: Path) -> MethodScene:
-    """Read the objects of a GLB file, z up, sorted by name.
+    """Read the objects of a GLB file, z up, sorted by name; raise `bad_glb` if it holds no finite triangles.
 
     An object is a node with its descendants: the roots of the file, or, below a single root without a mesh of its own,
     the children of that root, and so on. Nodes named like a table (`TABLE_NAMES`) are left out.
-
-    Raises:
-        InputError: `bad_glb` if it cannot be decoded, or holds no finite triangles.
     """
     if path.stat().st_size > MAX_FILE_BYTES:
         raise InputError(f"{path.name}: {path.stat().st_size} bytes; at most {MAX_FILE_BYTES} are read", "bad_glb")
@@ -48,7 +45,6 @@ def _check_size(scene: trimesh.Scene) -> None:
 
 
 def _find_object_nodes(scene: trimesh.Scene) -> list[str]:
-    """Find the nodes that represent objects."""
     children, geometry = scene.graph.transforms.children, scene.graph.transforms.node_data
     node, seen = scene.graph.base_frame, set[str]()
     while len(children.get(node, ())) == 1 and "geometry" not in geometry[node] and node not in seen:

@@ -73,11 +73,7 @@ def stitch_grid(reference: Image.Image, views: Sequence[tuple[Picture, Picture]]
 
 
 def read_reference(data: bytes, name: str) -> Image.Image:
-    """Decode a real picture, upright and in RGB.
-
-    Raises:
-        InputError: `bad_reference` if it cannot be decoded or is too large.
-    """
+    """Decode a real picture, upright and in RGB; raise `bad_reference` if it cannot be decoded or is too large."""
     try:
         picture = Image.open(io.BytesIO(data))
         if picture.width * picture.height > MAX_REFERENCE_PIXELS:

@@ -31,11 +31,7 @@ class GridJudge(Protocol):
     """Interface of a judge that compares methods."""
 
     def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:
-        """Mark every method.
-
-        Args:
-            question: The scene and the order of its columns.
-            grid: Draws the picture as a PNG file; called only if the judge needs it.
+        """Mark every method; `grid` draws the picture as a PNG file if the judge needs it.
 
         Raises:
             ModelError: if there is no valid answer.
@@ -116,11 +112,7 @@ def _read_record(path: Path) -> dict[str, Any]:
 
 
 def make_grid_judge(config: CurateConfig, services: Services) -> GridJudge:
-    """Make the judge that the section `curate` of a configuration names.
-
-    Raises:
-        ConfigError: for the rules, which cannot look at pictures; for a folder of answers that holds none.
-    """
+    """Make the judge that the section `curate` names; raise a `ConfigError` for one that cannot look at pictures."""
     if config.judge == "replay":
         folder = Path(config.replay_dir)
         if not summarize_recorded(folder, MAX_METHODS)[1]:

@@ -36,17 +36,10 @@ class _Cloud(Frozen):
 
 
 def compute_heading_error(mesh: TriangleMesh, truth: TriangleMesh) -> float | None:
-    """Compute the smallest rotation about the vertical that aligns a mesh with the true one [rad].
+    """Compute the smallest rotation about the vertical that aligns a mesh with the true one [rad]; None if round.
 
-    Both are centred on their surfaces first. Of the rotations that fit equally well (a box turned by half a turn, a
-    square one by a quarter), the smallest counts.
-
-    Args:
-        mesh: Mesh in the scene frame, z up [m].
-        truth: True mesh in the same frame.
-
-    Returns:
-        None for a round shape.
+    Both are in the scene frame, z up [m], and are centred on their surfaces first. Of the rotations that fit equally
+    well (a box turned by half a turn, a square one by a quarter), the smallest counts.
     """
     turns = _find_fitting_turns(mesh, truth)
     return None if turns is None else min(map(_wrap_angle, turns))
@@ -55,12 +48,7 @@ def compute_heading_error(mesh: TriangleMesh, truth: TriangleMesh) -> float | No
 def compute_heading_error_of_same(truth: TriangleMesh, turned: float) -> float | None:
     """Compute the heading error of the true mesh turned by a known angle, exact but for symmetries [rad].
 
-    Args:
-        truth: Mesh in the scene frame, z up [m].
-        turned: Rotation from the truth about the vertical [rad].
-
-    Returns:
-        None for a round shape.
+    The mesh is in the scene frame, z up [m]; None for a round shape.
     """
     symmetries = _find_fitting_turns(truth, truth)
     return None if symmetries is None else min(_wrap_angle(turned - turn) for turn in (0.0, *symmetries))

@@ -39,38 +39,26 @@ SAME_PLACE = 0.6  # without names, objects match within this share of the diagon
 class ObjectMatch:
     """A true object and its match in the result.
 
-    Attributes:
-        name: Name of the true object.
-        found: Name of the match; empty without one, and then there are no errors.
-        position_error_m: Distance between the centres of the boxes [m]: of the mesh's own box if both sides have the
-            same mesh, as in the certificate and in `bench lccr`; else of the boxes along the axes of the table.
-        size_error: Relative error of the size: the cube root of the ratio of the convex hulls' volumes, less 1.
-        heading_error_rad: Error about the vertical up to symmetries; None for a round shape [rad].
+    The boxes are the mesh's own if both sides have the same mesh, as in the certificate and in `bench lccr`; else those
+    along the axes of the table.
     """
 
-    name: str
-    found: str = ""
-    position_error_m: float = float("nan")
-    size_error: float = float("nan")
-    heading_error_rad: float | None = None
+    name: str  # of the true object
+    found: str = ""  # name of the match; empty without one, and then there are no errors
+    position_error_m: float = float("nan")  # between the centres of the boxes [m]
+    size_error: float = float("nan")  # cube root of the ratio of the convex hulls' volumes, less 1
+    heading_error_rad: float | None = None  # about the vertical up to symmetries; None for a round shape [rad]
 
 
 @dataclass(frozen=True, slots=True)
 class SceneLayout:
-    """Comparison of one scene.
-
-    Attributes:
-        matches: One per true object.
-        extra: Names of objects of the result without a true object.
-        kept: True relations of support and containment, and those that hold in the result.
-        error: Reason why the scene could not be compared, or empty.
-    """
+    """Comparison of one scene."""
 
     name: str
-    matches: tuple[ObjectMatch, ...] = ()
-    extra: tuple[str, ...] = ()
-    kept: PreservedRelations = field(default_factory=PreservedRelations)
-    error: str = ""
+    matches: tuple[ObjectMatch, ...] = ()  # one per true object
+    extra: tuple[str, ...] = ()  # names of objects of the result without a true object
+    kept: PreservedRelations = field(default_factory=PreservedRelations)  # true relations, and those that hold
+    error: str = ""  # why the scene could not be compared, or empty
 
 
 def compare_layouts(
@@ -101,11 +89,7 @@ def _make_missing(name: str, read_truth: ReadTruth, error: str) -> SceneLayout:
 
 
 def compare_scene(name: str, result: MethodScene, truth: SceneTruth, cache_dir: Path) -> SceneLayout:
-    """Compare one scene with its truth.
-
-    Raises:
-        GeometryError: if a mesh cannot be cut into convex pieces.
-    """
+    """Compare one scene with its truth; raise a `GeometryError` if a mesh cannot be cut into convex pieces."""
     pairs = _match_by_name(result, truth) if truth.named else _match_by_position(result, truth)
     used = {item.name for item in pairs if item is not None}
     matches = [

@@ -9,11 +9,7 @@ MAX_METHODS = 12
 
 
 def parse_methods(paths: Sequence[Path], named: Sequence[str]) -> dict[str, Path]:
-    """Parse methods by name: paths first, named after their last part, then `NAME=PATH`.
-
-    Raises:
-        InputError: `bad_method` if there is none or too many, two have one name, or an entry lacks its name.
-    """
+    """Parse methods by name: paths first, named after their last part, then `NAME=PATH`; raise `bad_method`."""
     methods: dict[str, Path] = {}
     entries = [(path.resolve().stem, path) for path in paths]
     for text in named:

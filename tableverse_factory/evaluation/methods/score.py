@@ -59,15 +59,8 @@ def ask_all(
 ) -> VoteResults:
     """Ask the judge about every scene that all methods have, `rounds` times each.
 
-    With a folder `out`, each grid is written to `out/grids` and each vote to `out/answers` at once.
-
-    Args:
-        comparison: The methods.
-        judge: The judge.
-        rounds: Questions per scene.
-        seed: Seed of the order of columns.
-        out: Folder to write to, or None.
-        watch: Passes the questions on and shows progress.
+    With a folder `out`, each grid is written to `out/grids` and each vote to `out/answers` at once. `watch` passes the
+    questions on and shows progress.
 
     Raises:
         ModelAccessError: if further questions are pointless: no key, no credit.
@@ -88,11 +81,7 @@ def ask_all(
 
 
 def write_grids(comparison: Comparison, rounds: int, seed: int, out: Path) -> int:
-    """Write every grid without asking a judge; return their number.
-
-    Raises:
-        InputError: if a scene or its picture cannot be read.
-    """
+    """Write every grid without asking a judge; return their number."""
     asked = _list_questions(comparison, rounds, seed)
     for question in asked:
         _draw_grid(comparison, question, out)

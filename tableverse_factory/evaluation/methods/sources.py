@@ -30,14 +30,11 @@ WORLD = "world"  # name of the world body in MuJoCo
 
 
 def find_scenes(path: Path) -> list[SceneSource]:
-    """Find the scenes at a path, sorted by name.
+    """Find the scenes at a path, sorted by name; raise `no_scenes` if there is none.
 
     A file is a layout (.json), a GLB or an MJCF scene (.xml). A folder is one of our datasets; or a scene as released
     by the authors of TableVerse (XML, assets and scene.glb, of which the XML is read); or a folder of such files or
     folders. Layouts have priority: other files beside them are taken for their meshes.
-
-    Raises:
-        InputError: `no_scenes` if there is none.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder", "no_scenes")
@@ -119,11 +116,7 @@ def _read_scale(entry: Mapping[str, Any], where: str) -> float:
 
 
 def read_pose(value: Mapping[str, Any]) -> Pose:
-    """Read a pose of our JSON files.
-
-    Raises:
-        InputError: `bad_pose` for an invalid pose.
-    """
+    """Read a pose of our JSON files; raise `bad_pose` for an invalid one."""
     try:
         given = LayoutPose.model_validate({key: value[key] for key in ("position", "quaternion_wxyz")})
     except (KeyError, TypeError, ValueError) as error:
@@ -132,11 +125,7 @@ def read_pose(value: Mapping[str, Any]) -> Pose:
 
 
 def read_mjcf(path: Path, root: Path | None = None) -> MethodScene:
-    """Read the objects of an MJCF file with their collision shapes; it may name only files below `root`.
-
-    Raises:
-        InputError: `bad_mjcf` if it names other or too many files, or MuJoCo cannot load it.
-    """
+    """Read the objects of an MJCF file with their collision shapes; it may name only files below `root`."""
     return read_model_scene(load_mjcf(path, root))
 
 
@@ -158,11 +147,7 @@ def _build_object(content: ModelObject) -> MethodObject:
 
 
 def read_layout_scene(path: Path) -> MethodScene:
-    """Read the objects of a layout file (`schemas.layout`).
-
-    Raises:
-        InputError: as `read_layout_file` and `read_layout_meshes`.
-    """
+    """Read the objects of a layout file (`schemas.layout`)."""
     layout = read_layout_file(str(path.resolve()))
     meshes = read_layout_meshes(str(path.resolve()), layout, ObserveConfig())
     items = []

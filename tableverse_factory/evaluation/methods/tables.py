@@ -34,19 +34,12 @@ ABSENT = "–"
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """Content of the two tables.
+    """Content of the two tables."""
 
-    Attributes:
-        collisions: Collisions of each method over all its own scenes.
-        shared: The same over the scenes that could be measured for every method (table 1).
-        votes: The judge's marks; None without recorded answers.
-        ablation: Configurations of each method that is one of our datasets (table 2).
-    """
-
-    collisions: tuple[MethodCollisions, ...]
-    shared: tuple[MethodCollisions, ...]
-    votes: VoteResults | None
-    ablation: Mapping[str, tuple[MethodCollisions, ...]]
+    collisions: tuple[MethodCollisions, ...]  # of each method over all its own scenes
+    shared: tuple[MethodCollisions, ...]  # over the scenes that could be measured for every method (table 1)
+    votes: VoteResults | None  # the judge's marks; None without recorded answers
+    ablation: Mapping[str, tuple[MethodCollisions, ...]]  # of each method that is one of our datasets (table 2)
     seed: int
 
     @property
@@ -66,9 +59,6 @@ def make_tables(folder: Path, epsilon_m: float, seed: int, answers: Path | None,
         seed: Seed of the bootstrap.
         answers: Folder of recorded answers, if elsewhere.
         cache_dir: Cache of convex pieces; None measures only the meshes, as the paper does.
-
-    Raises:
-        InputError: if there is no method, or one has no scenes.
     """
     methods = {entry.name: entry for entry in sorted(folder.iterdir()) if _is_method_folder(entry)}
     if not methods:

@@ -26,19 +26,12 @@ CAPTURE_TRUTH = "truth.json"
 
 @dataclass(frozen=True, slots=True)
 class SceneTruth:
-    """Ground truth of a scene in the frame of the compared result.
+    """Ground truth of a scene in the frame of the compared result."""
 
-    Attributes:
-        objects: Objects with true meshes, poses and scales.
-        missing: Names of true objects that the result lacks and whose meshes are therefore unknown.
-        named: Whether objects match by name; else by position.
-        same_meshes: Whether the result has these meshes, at other poses and scales.
-    """
-
-    objects: tuple[MethodObject, ...]
-    missing: tuple[str, ...]
-    named: bool
-    same_meshes: bool
+    objects: tuple[MethodObject, ...]  # with true meshes, poses and scales
+    missing: tuple[str, ...]  # true objects that the result lacks and whose meshes are therefore unknown
+    named: bool  # whether objects match by name; else by position
+    same_meshes: bool  # whether the result has these meshes, at other poses and scales
 
 
 class TrueObject(BaseModel):
@@ -65,14 +58,11 @@ ReadTruth = Callable[[MethodScene], SceneTruth]
 
 
 def find_truths(folder: Path) -> dict[str, ReadTruth]:
-    """Find the truths in a folder by scene name.
+    """Find the truths in a folder by scene name; raise `no_truth` if there is none.
 
     - `<scene>.json`, object id to position, quaternion_wxyz and scale: true poses of the result's own meshes;
     - `<scene>/truth.json` of synthetic captures: true meshes; the common camera relates the frames;
     - any other scenes (`find_scenes`): true meshes with the same names in the same frame.
-
-    Raises:
-        InputError: `no_truth` if there is none.
     """
     captures = sorted(folder.glob(f"*/{CAPTURE_TRUTH}"))
     if captures:
@@ -101,7 +91,6 @@ def _read_poses(path: Path) -> dict[str, tuple[Pose, float]] | None:
 
 
 def _load_pose_truth(poses: Mapping[str, tuple[Pose, float]], result: MethodScene) -> SceneTruth:
-    """Apply true poses to the meshes of the result."""
     objects = tuple(
         replace(item, pose=poses[item.name][0], scale=poses[item.name][1] / item.baked_scale, baked_scale=1.0)
         for item in result.objects

@@ -53,16 +53,11 @@ class GridAnswer(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One grid: a scene, and which method stands in which column.
-
-    Attributes:
-        round: Number of earlier questions about the scene; the columns rotate by one each time.
-        columns: The methods from the left.
-    """
+    """One grid: a scene, and which method stands in which column."""
 
     scene: str
-    round: int
-    columns: tuple[str, ...]
+    round: int  # earlier questions about the scene; the columns rotate by one each time
+    columns: tuple[str, ...]  # the methods from the left
 
     @property
     def name(self) -> str:
@@ -72,11 +67,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Vote:
-    """An answer with the marks by method.
-
-    Attributes:
-        columns: The methods from the left, as they were shown.
-    """
+    """An answer with the marks by method; the columns are as they were shown."""
 
     scene: str
     round: int
@@ -85,13 +76,10 @@ class Vote:
 
 
 def make_questions(scene: str, methods: tuple[str, ...], rounds: int, seed: int) -> tuple[Question, ...]:
-    """The orders in which a scene's methods are shown.
+    """The orders in which a scene's methods are shown; raise `too_many_rounds` if grids would repeat.
 
     The first order is drawn from the seed and the scene's name; each further round moves every method one column on, so
     that after as many rounds as there are methods each stood everywhere once, and a judge's liking for a place cancels.
-
-    Raises:
-        InputError: `too_many_rounds` if there are more: the same grids would be asked about again.
     """
     if rounds > len(methods):
         raise InputError(
@@ -143,11 +131,7 @@ def parse_vote(text: str, count: int) -> GridAnswer:
 
 
 def validate_vote(value: Any, count: int) -> GridAnswer:
-    """Validate the JSON value of an answer.
-
-    Raises:
-        AnswerInvalidError: as `parse_vote`.
-    """
+    """Validate the JSON value of an answer, as `parse_vote`."""
     answer = validate_answer(value, GridAnswer)
     if len(answer.columns) != count:
         raise AnswerInvalidError(f"{len(answer.columns)} columns; there are {count}")

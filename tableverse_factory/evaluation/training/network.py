@@ -15,26 +15,17 @@ WIDTHS = (32, 64, 128, 224)  # channels at 1/2, 1/4, 1/8 and 1/16 of the height 
 
 @dataclass(frozen=True, slots=True)
 class ConvLayer:
-    """A convolution with batch norm and ReLU unless it is `plain`.
+    """A convolution with batch norm and ReLU unless it is `plain`."""
 
-    Attributes:
-        name: Name of its weights and its result.
-        kernel: Side of the kernel [px].
-        stride: Stride [px].
-        dilation: Spacing of the kernel's taps [px].
-        plain: Without batch norm and ReLU.
-        onto: A coarser result that is upsampled and added before the ReLU.
-    """
-
-    name: str
+    name: str  # of its weights and its result
     source: str
     inputs: int
     outputs: int
-    kernel: int = 3
-    stride: int = 1
-    dilation: int = 1
-    plain: bool = False
-    onto: str = ""
+    kernel: int = 3  # side [px]
+    stride: int = 1  # [px]
+    dilation: int = 1  # spacing of the kernel's taps [px]
+    plain: bool = False  # without batch norm and ReLU
+    onto: str = ""  # a coarser result that is upsampled and added before the ReLU
 
     @property
     def padding(self) -> int:

@@ -24,21 +24,13 @@ MAX_HOLES = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingBatch(Frozen):
-    """Samples of one step.
+    """Samples of one step."""
 
-    Attributes:
-        inputs: Features of `learned.features`.
-        is_object: Whether the output pixel belongs to an object.
-        offsets: From the point of the pixel to the mean of its object's visible points [OFFSET_UNIT_M]; 0 elsewhere.
-        counted: Weight of each output pixel in the objectness loss: 0 without a reading.
-        share: Weight of each output pixel in the offset loss; those of one object sum to 1.
-    """
-
-    inputs: Float32[np.ndarray, "b 7 h w"]
-    is_object: Float32[np.ndarray, "b h2 w2"]
-    offsets: Float32[np.ndarray, "b 3 h2 w2"]
-    counted: Float32[np.ndarray, "b h2 w2"]
-    share: Float32[np.ndarray, "b h2 w2"]
+    inputs: Float32[np.ndarray, "b 7 h w"]  # features of `learned.features`
+    is_object: Float32[np.ndarray, "b h2 w2"]  # whether the output pixel belongs to an object
+    offsets: Float32[np.ndarray, "b 3 h2 w2"]  # to the mean of its object's visible points [OFFSET_UNIT_M]; else 0
+    counted: Float32[np.ndarray, "b h2 w2"]  # weight in the objectness loss: 0 without a reading
+    share: Float32[np.ndarray, "b h2 w2"]  # weight in the offset loss; those of one object sum to 1
 
 
 def make_batch(views: list[TrainingView], rng: np.random.Generator) -> TrainingBatch:

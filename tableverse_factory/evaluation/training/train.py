@@ -30,35 +30,22 @@ AHEAD = 2  # batches that each process prepares ahead
 
 @dataclass(frozen=True, slots=True)
 class TrainSettings:
-    """Settings that determine the weights, besides the device.
-
-    Attributes:
-        steps: Number of steps, each on `batch` random views.
-        seed: Seed of scenes, first weights, order and augmentation.
-        batch: Views per step.
-        rate: Peak learning rate.
-    """
+    """Settings that determine the weights, besides the device."""
 
     scenes: int
-    steps: int
-    seed: int = 0
-    batch: int = 16
-    rate: float = 3e-3
+    steps: int  # each on `batch` random views
+    seed: int = 0  # of scenes, first weights, order and augmentation
+    batch: int = 16  # views per step
+    rate: float = 3e-3  # peak learning rate
 
 
 @dataclass(frozen=True, slots=True)
 class TrainProgress:
-    """Losses of one step.
+    """Losses of one step."""
 
-    Attributes:
-        step: Number of the step, from 1.
-        objects: Cross entropy of objectness.
-        offset_m: Mean error of the offsets, each object with the same weight [m].
-    """
-
-    step: int
-    objects: float
-    offset_m: float
+    step: int  # number of the step, from 1
+    objects: float  # cross entropy of objectness
+    offset_m: float  # mean error of the offsets, each object with the same weight [m]
 
 
 def train_network(
@@ -80,9 +67,6 @@ def train_network(
         on_step: Called after each step.
         checkpoint_every: Steps between two checkpoints; the last step writes one too.
         jobs: Processes that augment views; with 0 this process does.
-
-    Raises:
-        InputError: if the checkpoint is of another training or network, a view is damaged, or a process died.
     """
     torch = import_torch()
     network = make_network(settings.seed).to(device.torch_device).train()
@@ -178,7 +162,6 @@ def _load_batches(paths: Sequence[Path], settings: TrainSettings, done: int, job
 
 
 def _fingerprint_network() -> str:
-    """Compute a fingerprint of the layers."""
     return content_hash(repr(list_layers()).encode())
 
 

@@ -34,21 +34,13 @@ WALL_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingView(Frozen):
-    """A depth image with its truth.
+    """A depth image with its truth."""
 
-    Attributes:
-        depth: Depth in units of `depth_scale`; 0 without a reading.
-        ids: Object id at each pixel from 1; 0 elsewhere.
-        focal: fx, fy, cx, cy [px].
-        camera_to_table: Pose of the camera as a 4 × 4 matrix [m].
-        depth_scale: Metres per unit of depth.
-    """
-
-    depth: UInt16[np.ndarray, "h w"]
-    ids: UInt8[np.ndarray, "h w"]
-    focal: Float64[np.ndarray, "4"]
-    camera_to_table: Float64[np.ndarray, "4 4"]
-    depth_scale: float
+    depth: UInt16[np.ndarray, "h w"]  # in units of `depth_scale`; 0 without a reading
+    ids: UInt8[np.ndarray, "h w"]  # object id at each pixel from 1; 0 elsewhere
+    focal: Float64[np.ndarray, "4"]  # fx, fy, cx, cy [px]
+    camera_to_table: Float64[np.ndarray, "4 4"]  # pose of the camera as a 4 × 4 matrix [m]
+    depth_scale: float  # metres per unit of depth
 
     @property
     def camera(self) -> Camera:
@@ -72,11 +64,7 @@ class TrainingView(Frozen):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a view that `write` wrote.
-
-        Raises:
-            InputError: if the file is not a view.
-        """
+        """Read a view that `write` wrote; raise an `InputError` if the file is not a view."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 scale = float(file["depth_scale"])
@@ -90,19 +78,7 @@ class TrainingView(Frozen):
 def make_views(
     folder: Path, scenes: int, seed: int, on_scene: Callable[[], object] = lambda: None, jobs: int = 1
 ) -> list[Path]:
-    """Make the views of scenes and return their files in order; existing ones are kept.
-
-    Args:
-        folder: Folder of the views, created if it is absent.
-        scenes: Number of scenes, 1 to `MAX_SCENES`; scene k does not depend on it.
-        seed: Seed of everything random.
-        on_scene: Called after each scene.
-        jobs: Number of processes.
-
-    Raises:
-        GeometryError: if a scene cannot be arranged.
-        InputError: if a process died.
-    """
+    """Make the views of scenes and return their files; existing ones are kept. A scene depends on the seed."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     make = partial(_make_scene_files, folder, seed)

@@ -23,14 +23,10 @@ def find_local_folder(path: str) -> Path | None:
 
 
 def resolve_destination(dest: Path, dataset: Path | None) -> Path:
-    """Check a destination and resolve its links.
-
-    Args:
-        dest: New or empty folder, or an earlier gallery.
-        dataset: Folder of the dataset, if it is on the disk.
+    """Resolve the links of a destination that is new, empty or an earlier gallery, and apart from the dataset.
 
     Raises:
-        InputError: if it holds anything but an earlier gallery, lies within the dataset, or holds it.
+        InputError: if it holds anything else, lies within the dataset, or holds it.
     """
     try:
         folder = dest.resolve()
@@ -49,11 +45,7 @@ def resolve_destination(dest: Path, dataset: Path | None) -> Path:
 
 
 def check_replaceable(folder: Path, name: str) -> None:
-    """Check that a folder is absent, empty, or holds nothing but a gallery.
-
-    Raises:
-        InputError: if it is a file, or holds something that is not part of a gallery.
-    """
+    """Raise an `InputError` unless a folder is absent, empty, or holds nothing but a gallery."""
     if not folder.exists():
         return
     if not folder.is_dir():
@@ -112,14 +104,7 @@ def write_marker(folder: Path, made_by: str, scenes: int) -> None:
 def replace_folder(new: Path, folder: Path, aside: Path, name: str) -> None:
     """Rename the earlier gallery aside and the finished one to its folder; a kill between the two keeps both.
 
-    Args:
-        new: The finished gallery, on the same file system.
-        folder: The destination from `resolve_destination`.
-        aside: Absent path on the same file system.
-        name: Name of the folder in errors.
-
-    Raises:
-        InputError: if something was added to the folder meanwhile; the folder is restored.
+    All are on one file system. If something was added to the folder meanwhile, it is restored.
     """
     if not folder.exists():
         new.rename(folder)

@@ -74,20 +74,10 @@ def write_gallery(
 ) -> Path:
     """Write the gallery of a dataset and return the path of its index.html.
 
-    The dataset is only read. `dest` may be new, empty, or an earlier gallery with nothing else in it, which is replaced
-    once the new one is complete.
-
-    Args:
-        dataset: Dataset, finished or not; only committed shards are shown.
-        dest: Folder of the gallery.
-        jobs: Number of processes that draw.
-        progress: Called with the numbers of drawn scenes and of all scenes.
-        renders: Number of scenes drawn from every side (`choose_options`).
-        films: Most films per drawn scene (`choose_options`).
-        robot: The arm of recordings of other robots than ours: a file, or `menagerie:NAME`.
-
-    Raises:
-        InputError: if `dest` holds something else, lies within the dataset, or holds it.
+    The dataset is only read; only committed shards are shown. `dest` may be new, empty, or an earlier gallery with
+    nothing else in it, which is replaced once the new one is complete. The first `renders` scenes are drawn from every
+    side, with at most `films` films each (defaults: `choose_options`); `progress` gets the numbers of drawn and of all
+    scenes. `robot` is the arm of recordings of other robots than ours: a file, or `menagerie:NAME`.
     """
     root = find_local_folder(dataset.path)
     target = resolve_destination(dest, root)
@@ -117,7 +107,6 @@ def _write_scenes(
     progress: Callable[[int, int], None] | None,
     robot: str | None,
 ) -> list[SceneCard]:
-    """Write the page of every scene."""
     ids = ["", *(scene.scene_id for scene in done), ""]
     scene_jobs = [
         SceneJob(scene, position < options.renders, ids[position], ids[position + 2], position // PAGE_SIZE + 1)

@@ -27,18 +27,12 @@ _JPEG_QUALITY = 82
 
 @dataclass(frozen=True, slots=True)
 class MotionCard:
-    """A trajectory on the page of its scene.
-
-    Attributes:
-        film: Name of the film and of its still without suffix; empty without a film.
-        plot: Joints and gripper over time as markup; None without a plot.
-        problem: Reason why the recording could not be shown.
-    """
+    """A trajectory on the page of its scene."""
 
     row: Mapping[str, Any]
-    film: str = ""
-    plot: Markup | None = None
-    problem: str = ""
+    film: str = ""  # name of the film and of its still without suffix; empty without a film
+    plot: Markup | None = None  # joints and gripper over time; None without a plot
+    problem: str = ""  # why the recording could not be shown
 
     @property
     def id(self) -> str:
@@ -47,18 +41,7 @@ class MotionCard:
 
 
 def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = None) -> tuple[MotionCard, ...]:
-    """Write the films of a scene and return a card per trajectory, in the order of the tasks.
-
-    Args:
-        scene: The scene.
-        folder: Folder of the films.
-        films: Most films.
-        robot: The arm of recordings of other robots than ours: a file, or `menagerie:NAME`.
-
-    Raises:
-        InputError: if the table of trajectories cannot be read.
-        ValueError: if the id of a task is not safe as a file name.
-    """
+    """Write at most `films` films and return a card per trajectory, in the order of the tasks."""
     filmed = choose_filmed_tasks(scene.trajectory_rows(), films)
     return tuple(
         _write_motion(scene, each, folder, str(each.row["task_id"]) in filmed, robot) for each in scene.trajectories()

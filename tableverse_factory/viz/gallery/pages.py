@@ -17,21 +17,14 @@ _LONGEST = 500
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Data that all pages of a gallery share.
-
-    Attributes:
-        out: Absolute path or address of the dataset.
-        n_done: Number of scenes with a page.
-        n_lost: Number of scenes listed with their reason.
-        n_rendered: Number of scenes drawn from every side, the first ones.
-    """
+    """Data that all pages of a gallery share."""
 
     folder: Path
     dataset: str
-    out: str
-    n_done: int
-    n_lost: int
-    n_rendered: int
+    out: str  # absolute path or address of the dataset
+    n_done: int  # scenes with a page
+    n_lost: int  # scenes listed with their reason
+    n_rendered: int  # scenes drawn from every side, the first ones
 
     @property
     def renders_all(self) -> bool:

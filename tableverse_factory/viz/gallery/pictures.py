@@ -37,23 +37,15 @@ _AZIMUTH = float(np.deg2rad(28.0))
 
 @dataclass(frozen=True, slots=True)
 class PictureSet:
-    """File names of the pictures of a scene without suffix; empty for those that do not exist.
-
-    Attributes:
-        twin: The twin from the camera of the photograph.
-        before: View from above the front of the observed layout.
-        front: The same view of the exported scene.
-        sketch: A small and quick picture, without photograph and render.
-        photo_height: Height of photograph and twin, `WIDTH` wide [px].
-    """
+    """File names of the pictures of a scene without suffix; empty for those that do not exist."""
 
     photo: str = ""
-    twin: str = ""
-    before: str = ""
-    front: str = ""
+    twin: str = ""  # the twin from the camera of the photograph
+    before: str = ""  # view from above the front of the observed layout
+    front: str = ""  # the same view of the exported scene
     top: str = ""
-    sketch: str = ""
-    photo_height: int = HEIGHT
+    sketch: str = ""  # a small and quick picture, without photograph and render
+    photo_height: int = HEIGHT  # of photograph and twin, `WIDTH` wide [px]
 
     @property
     def width(self) -> int:
@@ -79,16 +71,7 @@ _CAPTIONS = {"photo": "photograph", "twin": "twin", "front": "front", "top": "to
 
 
 def write_pictures(scene: Scene, folder: Path, render: bool) -> PictureSet:
-    """Write the pictures of a scene as JPEG, large and small.
-
-    Args:
-        scene: The scene.
-        folder: Folder of the pictures.
-        render: Whether to draw the twin from every side; otherwise only the photograph or a sketch is written.
-
-    Raises:
-        InputError: if the files of the scene cannot be loaded.
-    """
+    """Write the pictures of a scene as JPEG, large and small; without `render` only the photograph or a sketch."""
     photo = _load_photograph(scene)
     drawn: dict[str, Picture] = {} if photo is None else {"photo": photo}
     if render:

@@ -140,25 +140,15 @@ class Records:
 
 @dataclass(frozen=True, slots=True)
 class SceneFacts:
-    """Facts of meta.json.
+    """Facts of meta.json."""
 
-    Attributes:
-        reason_codes: The judge's reasons why the scene is not usable.
-        criteria: The judge's points by criterion.
-        left_out: Objects that could not be placed, with the reason.
-    """
-
-    reason_codes: tuple[str, ...] = ()
-    criteria: tuple[tuple[str, str], ...] = ()
-    left_out: tuple[tuple[str, str], ...] = ()
+    reason_codes: tuple[str, ...] = ()  # the judge's reasons why the scene is not usable
+    criteria: tuple[tuple[str, str], ...] = ()  # the judge's points by criterion
+    left_out: tuple[tuple[str, str], ...] = ()  # objects that could not be placed, with the reason
 
 
 def read_scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
-    """Read the facts of meta.json as text.
-
-    Raises:
-        ValueError: if meta.json is not as export writes it.
-    """
+    """Read the facts of meta.json as text; raise a `ValueError` if it is not as export writes it."""
     try:
         assessment = meta["assessment"]
         return SceneFacts(
@@ -171,11 +161,7 @@ def read_scene_facts(meta: Mapping[str, Any]) -> SceneFacts:
 
 
 def read_records(dataset: Dataset) -> Records:
-    """Read all rows of a dataset.
-
-    Raises:
-        InputError: if the id of a done scene is not safe as a file name.
-    """
+    """Read all rows of a dataset; raise an `InputError` if the id of a done scene is not safe as a file name."""
     objects, tasks, tried = (_group_by_scene(table) for table in (dataset.objects, dataset.tasks, dataset.trajectories))
     records = Records()
     for row in dataset.scenes.to_table().to_pylist():

@@ -13,35 +13,23 @@ from tableverse_factory.viz.gallery.records import SceneFacts, SceneRecord, read
 
 @dataclass(frozen=True, slots=True)
 class SceneJob:
-    """A scene to write.
-
-    Attributes:
-        render: Whether to draw its twin, plots and films.
-        before: Id of the previous scene; empty for the first.
-        after: Id of the next scene; empty for the last.
-    """
+    """A scene to write."""
 
     scene: SceneRecord
-    render: bool
-    before: str
-    after: str
+    render: bool  # whether to draw its twin, plots and films
+    before: str  # id of the previous scene; empty for the first
+    after: str  # id of the next scene; empty for the last
     page: int
 
 
 @dataclass(frozen=True, slots=True)
 class SceneCard:
-    """Data of a scene for its card and the filters.
-
-    Attributes:
-        pictures: Its pictures; None if they could not be made.
-        problem: Reason why there are no pictures.
-        reason_codes: The judge's reasons why the scene is not usable.
-    """
+    """Data of a scene for its card and the filters."""
 
     scene_id: str
-    pictures: PictureSet | None
-    problem: str = ""
-    reason_codes: tuple[str, ...] = ()
+    pictures: PictureSet | None  # None if they could not be made
+    problem: str = ""  # why there are no pictures
+    reason_codes: tuple[str, ...] = ()  # the judge's reasons why the scene is not usable
 
 
 def write_scene(site: Site, films: int, robot: str | None, job: SceneJob) -> SceneCard:

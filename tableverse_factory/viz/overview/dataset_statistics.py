@@ -27,26 +27,18 @@ _MERGE_ROWS = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Frequencies of names.
-
-    Attributes:
-        top: The most frequent names with their counts; equal counts in alphabetical order.
-    """
+    """Frequencies of names."""
 
     total: int
     names: int
-    top: tuple[tuple[str, int], ...]
+    top: tuple[tuple[str, int], ...]  # most frequent names with counts; equal counts by alphabet
 
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """Counts between edges; values beyond them and missing values are counted apart.
+    """Counts between edges; values beyond them and missing values are counted apart."""
 
-    Attributes:
-        edges: Edges of the bins; a value on an edge belongs to the bin above it.
-    """
-
-    edges: tuple[float, ...]
+    edges: tuple[float, ...]  # a value on an edge belongs to the bin above it
     counts: tuple[int, ...]
     below: int
     above: int
@@ -64,41 +56,23 @@ class MotionLoss:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Figures of the overview.
+    """Figures of the overview."""
 
-    Attributes:
-        scenes: Counts: `entered`, `done`, `dropped`, `failed`, `usable`.
-        objects: Counts: `total`, `contained`, `hinged`, `graspable`.
-        kinds: Done scenes by kind of input.
-        sources: Done scenes by source.
-        labels: Objects by name, lower case.
-        long_tail: Rank and count of names by falling count, at most 200 of them, evenly spread on a logarithmic scale.
-        objects_per_scene: Of done scenes.
-        quality_scores: Of done scenes.
-        masses_kg: Of objects.
-        sizes_m: Longest side of objects.
-        relations: Accepted tasks by relation.
-        tasks: Counts: `accepted`, `refused`.
-        trajectories: Counts: `tried`, `succeeded`; both 0 without trajectories.
-        trajectory_losses: Failed trajectories by phase (empty before any motion) and reason, largest first.
-        losses: Lost scenes by stage, status and reason, largest first.
-    """
-
-    scenes: Mapping[str, int]
-    objects: Mapping[str, int]
-    kinds: Ranking
-    sources: Ranking
-    labels: Ranking
-    long_tail: tuple[tuple[int, int], ...]
-    objects_per_scene: Histogram
-    quality_scores: Histogram
+    scenes: Mapping[str, int]  # `entered`, `done`, `dropped`, `failed`, `usable`
+    objects: Mapping[str, int]  # `total`, `contained`, `hinged`, `graspable`
+    kinds: Ranking  # done scenes by kind of input
+    sources: Ranking  # done scenes by source
+    labels: Ranking  # objects by name, lower case
+    long_tail: tuple[tuple[int, int], ...]  # at most 200 ranks of names and their counts, evenly spread on a log scale
+    objects_per_scene: Histogram  # of done scenes
+    quality_scores: Histogram  # of done scenes
     masses_kg: Histogram
-    sizes_m: Histogram
-    relations: Ranking
-    tasks: Mapping[str, int]
-    trajectories: Mapping[str, int]
-    trajectory_losses: tuple[MotionLoss, ...]
-    losses: tuple[SceneLoss, ...]
+    sizes_m: Histogram  # longest side of objects
+    relations: Ranking  # accepted tasks by relation
+    tasks: Mapping[str, int]  # `accepted`, `refused`
+    trajectories: Mapping[str, int]  # `tried`, `succeeded`; both 0 without trajectories
+    trajectory_losses: tuple[MotionLoss, ...]  # by phase (empty before any motion) and reason, largest first
+    losses: tuple[SceneLoss, ...]  # lost scenes by stage, status and reason, largest first
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values for `json.dumps`."""
@@ -106,11 +80,7 @@ class Statistics:
 
 
 def compute_statistics(dataset: Dataset) -> Statistics:
-    """Compute the statistics of all committed rows.
-
-    Raises:
-        InputError: if a committed shard lacks a table.
-    """
+    """Compute the statistics of all committed rows; raise an `InputError` if a committed shard lacks a table."""
     outcomes = _count_outcomes(dataset.scenes)
     done = pc.field("status") == "done"
     labels = _count_values(_choose_labels(_scan(dataset.objects, ("relabel_name", "label"))))

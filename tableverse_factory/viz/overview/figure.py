@@ -225,7 +225,6 @@ def _draw_losses(axes: Axes, statistics: Statistics) -> None:
 
 
 def _add_note(axes: Axes, text: str) -> None:
-    """Add a note beside the title."""
     axes.set_title(text, loc="right", fontsize=8, fontweight="normal", color=FAINT)
 
 

@@ -15,11 +15,7 @@ from tableverse_factory.viz.overview.figure import draw_overview
 
 
 def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
-    """Write the statistics of a dataset and return the paths of the files; earlier files are replaced.
-
-    Args:
-        dataset: Dataset, finished or not; only committed shards count.
-        dest: Folder, created if it is absent.
+    """Write the statistics of the committed shards and return the paths of the files; earlier files are replaced.
 
     Raises:
         InputError: if `dest` is not a folder or lies within the dataset.

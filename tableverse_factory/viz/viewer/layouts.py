@@ -15,16 +15,10 @@ Poses = Mapping[str, Pose]
 
 
 def read_layouts(meta: Mapping[str, Any], settled: Poses) -> dict[str, Poses]:
-    """Read the layouts of a scene; the settled one always exists.
+    """Read the layouts of a scene; the settled one, of the exported model, always exists.
 
-    Copies that were added by `count` (`copy_of`) are in no observed layout.
-
-    Args:
-        meta: `meta.json`; scenes of other origin have no poses in it.
-        settled: Poses of the objects in the exported model.
-
-    Raises:
-        InputError: `bad_meta` for an invalid pose.
+    Copies that were added by `count` (`copy_of`) are in no observed layout; scenes of other origin have no poses in
+    `meta.json`. An invalid pose raises `bad_meta`.
     """
     found: dict[str, Poses] = {}
     for layout, key in _KEYS.items():

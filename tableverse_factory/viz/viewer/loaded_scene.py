@@ -35,35 +35,21 @@ _QUALITY = 85
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisualBody(Frozen):
-    """An object in its own frame.
-
-    Attributes:
-        look: GLB of the visual meshes; empty without any.
-        pieces: GLB of the convex pieces.
-        shape: Mesh of the whole object, for ghosts [m].
-        mass_kg: Mass in the simulation [kg].
-    """
+    """An object in its own frame."""
 
     name: str
-    look: bytes
-    pieces: bytes
+    look: bytes  # GLB of the visual meshes; empty without any
+    pieces: bytes  # GLB of the convex pieces
     n_pieces: int
-    shape: TriangleMesh
-    mass_kg: float
+    shape: TriangleMesh  # mesh of the whole object, for ghosts [m]
+    mass_kg: float  # in the simulation [kg]
 
 
 class LoadedScene:
     """An immutable scene, shared by all browsers that show it."""
 
     def __init__(self, scene: Scene) -> None:
-        """Compile the model and read the scene.
-
-        Args:
-            scene: A scene of a dataset, or of `load_scene_file`.
-
-        Raises:
-            InputError: if the model or meta.json cannot be loaded, or the model has other joints than free ones.
-        """
+        """Compile the model and read the scene; raise an `InputError` for joints other than free ones."""
         self.scene = scene
         self.meta: Mapping[str, Any] = scene.meta if "meta.json" in scene.files() else {}
         self.model = scene.model()
@@ -82,11 +68,7 @@ class LoadedScene:
 
     @cached_property
     def photograph(self) -> bytes | None:
-        """The photograph as JPEG, at most `PHOTOGRAPH_PX` wide; None without one.
-
-        Raises:
-            InputError: if it cannot be decoded.
-        """
+        """The photograph as JPEG, at most `PHOTOGRAPH_PX` wide; None without one."""
         data = self.scene.files().get(PHOTOGRAPH)
         if data is None:
             return None
@@ -113,20 +95,12 @@ class LoadedScene:
         return tuple(self.scene.task_rows())
 
     def motion(self, task_id: str, robot: str | None) -> MotionPlayback:
-        """Load the recorded motion of a task.
-
-        Raises:
-            InputError: if there is none, its file is damaged, or the arm must be given.
-        """
+        """Load the recorded motion of a task; raise an `InputError` if there is none, or the arm must be given."""
         trajectory = self.scene.trajectory(task_id)
         return MotionPlayback(trajectory.recording(), str(trajectory.row["x_id"]), robot)
 
     def retexture_table(self, texture: TableTexture | None) -> StaticVisuals:
-        """Encode the static bodies with another texture on the table.
-
-        Raises:
-            InputError: if there is no such texture, or no table.
-        """
+        """Encode the static bodies with another texture on the table; None for that of the export."""
         if texture is None:
             return self.static
         return _encode_static(read_model_contents(self.scene.model(texture=texture)))

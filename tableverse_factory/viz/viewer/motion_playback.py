@@ -25,17 +25,7 @@ class MotionPlayback:
     """A recording and the arm that executed it."""
 
     def __init__(self, recording: Recording, x_id: str, robot: str | None = None) -> None:
-        """Build the meshes of the arm.
-
-        Args:
-            recording: The recorded arrays.
-            x_id: Manipulated object.
-            robot: The arm, if it comes from a file; as `load_recorded_arm` takes it.
-
-        Raises:
-            InputError: if the arm must be given or is another one.
-            ConfigError: if there is no such arm.
-        """
+        """Build the meshes of the arm; `x_id` is the moved object, `robot` the arm as `load_recorded_arm` takes it."""
         self._recording, self._x_id = recording, x_id
         self._arm = ArmMeshes(load_recorded_arm(recording, robot))
 

@@ -58,11 +58,7 @@ class MotionPlayer:
         self._show_status()
 
     def select(self, loaded: LoadedScene) -> None:
-        """Show the motion of the chosen task, if it has one; the first one moves the camera to the arm.
-
-        Raises:
-            InputError: if it cannot be read, or the arm has to be given.
-        """
+        """Show the motion of the chosen task, if it has one; the first one moves the camera to the arm."""
         chosen = self._panel.task.value.partition(" ")[0]  # once: the next choice may come at any time
         first = self._motion is None
         self._remove()

@@ -17,19 +17,12 @@ _NEAREST_M, _FARTHEST_M, _AHEAD_M = 0.05, 20.0, 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrbitCamera(Frozen):
-    """An orbit camera with z up.
+    """An orbit camera in the table frame, z up."""
 
-    Attributes:
-        position: Position in the table frame [m].
-        target: Centre of the orbit in the table frame [m].
-        tan_up: Half the visible height at a distance of one metre [m].
-        tan_side: Half the visible width [m].
-    """
-
-    position: Vector3
-    target: Vector3
-    tan_up: float
-    tan_side: float
+    position: Vector3  # [m]
+    target: Vector3  # centre of the orbit [m]
+    tan_up: float  # half the visible height at a distance of one metre [m]
+    tan_side: float  # half the visible width there [m]
 
     def field_of_view(self, aspect: float) -> float:
         """Compute the vertical angle for a canvas of an aspect (width over height) to show the whole picture [rad]."""

@@ -21,15 +21,12 @@ class OriginPolicy:
     """Allows pages of this server, and the origins that the user names."""
 
     def __init__(self, bound: str, allowed: Sequence[str] = ()) -> None:
-        """Collect the names of this machine.
+        """Collect the names of this machine and the pages that the user allows.
 
         Args:
             bound: Address that this server listens on.
             allowed: Addresses of this server as browsers see it behind a proxy: `https://NAME.github.dev`, with a path
-                if the proxy adds one.
-
-        Raises:
-            InputError: `bad_origin` for an invalid address.
+                if the proxy adds one; an invalid one raises `bad_origin`.
         """
         self._names = {"localhost", bound.lower(), socket.gethostname().lower()}
         self._pages: dict[tuple[str, str, int], str] = {}
@@ -42,14 +39,10 @@ class OriginPolicy:
         self._refused: set[str] = set()
 
     def allows(self, origin: str | None, host: str | None) -> bool:
-        """Check that a browser that opens a socket shows a page of this server; log a refusal.
+        """Check by the headers of a browser that it shows a page of this server; log a refusal.
 
         A foreign name that points here (DNS rebinding) sends itself as both headers: only numeric addresses and names
-        of this machine count.
-
-        Args:
-            origin: Header `Origin`, the page that connects; programs other than browsers send none.
-            host: Header `Host`, the name under which it reached this server.
+        of this machine count. Programs other than browsers send no `Origin`.
         """
         if origin is None:
             return True
@@ -63,13 +56,7 @@ class OriginPolicy:
         return False
 
     def make_link(self, scene_id: str, origin: str | None, host: str) -> str:
-        """Make the address, relative to the page, that opens a scene; the address of the socket names the scene.
-
-        Args:
-            scene_id: The scene.
-            origin: Header `Origin` of an allowed browser.
-            host: Its header `Host`.
-        """
+        """Make the address, relative to the page, that opens a scene, from the headers of an allowed browser."""
         parts = _split_origin(origin) if origin is not None else None
         page = self._pages.get(parts, "") if parts is not None else ""
         scheme, _, rest = (page or origin or f"http://{host}").partition("://")

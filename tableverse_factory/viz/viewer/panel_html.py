@@ -59,15 +59,7 @@ def format_dropped_scene(row: Row) -> str:
 
 
 def format_facts(row: Row, meta: Row, objects: Sequence[Row], tasks: Sequence[Row], link: str) -> str:
-    """Format certificate, objects with masses, and tasks.
-
-    Args:
-        row: Row of scenes/; empty for a scene outside a dataset.
-        meta: meta.json of the scene.
-        objects: Rows of objects/.
-        tasks: Rows of tasks/.
-        link: Address of the scene; empty without one.
-    """
+    """Format certificate, objects with masses, and tasks; `row` and `link` are empty for a scene outside a dataset."""
     certificate = meta.get("certificate")
     figures = certificate if isinstance(certificate, Mapping) else row
     lines = [(name, write(_parse_number(figures.get(key)))) for name, key, write in _CERTIFICATE]

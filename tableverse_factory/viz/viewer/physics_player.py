@@ -36,12 +36,7 @@ class PhysicsPlayer:
         self._simulation, self._fixed, self._masses, self.running = None, None, {}, False
 
     def open(self, loaded: LoadedScene, names: Mapping[str, str]) -> None:
-        """Set the scene, as exported.
-
-        Args:
-            loaded: The scene.
-            names: Display names of its objects by id.
-        """
+        """Set the scene, as exported, with the display names of its objects by id."""
         self._simulation, self._fixed = Simulation(loaded.model), Simulation(loaded.model)
         self._masses = {body.name: body.mass_kg for body in loaded.bodies}
         options = [f"{name} {names.get(name, '')}" for name in list(self._masses)[:MAX_OBJECTS]]
@@ -63,18 +58,7 @@ class PhysicsPlayer:
         return True
 
     def advance(self, seconds: float, budget_s: float) -> float:
-        """Simulate within a budget.
-
-        Args:
-            seconds: Simulated time [s].
-            budget_s: Wall time [s].
-
-        Returns:
-            Share of the simulated time that the budget allowed.
-
-        Raises:
-            InputError: if the simulation became unstable.
-        """
+        """Simulate some seconds within a budget of wall time [s]; return the share of them that it allowed."""
         if self._simulation is None or seconds <= 0.0:
             return 1.0
         passed = self._simulation.advance(seconds, budget_s)
@@ -87,11 +71,7 @@ class PhysicsPlayer:
         return self._simulation.poses() if self._simulation is not None else {}
 
     def contacts(self, poses: Poses | None) -> Contacts:
-        """Measure the contacts.
-
-        Args:
-            poses: Fixed poses at rest; None for the state of the simulation.
-        """
+        """Measure the contacts at fixed poses at rest; None for the state of the simulation."""
         if self._simulation is None or self._fixed is None:
             return Contacts.empty()
         if poses is None:

@@ -2,13 +2,7 @@
 
 
 class Playhead:
-    """A position between the start and the end of a recording.
-
-    Attributes:
-        duration_s: Duration of the recording [s].
-        time_s: Position [s].
-        playing: Whether the position advances.
-    """
+    """A position `time_s` between the start and the end of a recording [s]."""
 
     def __init__(self, duration_s: float) -> None:
         self.duration_s = max(0.0, duration_s)

@@ -19,14 +19,7 @@ class SceneCache:
     """The scenes of a dataset, or a single exported scene; the last few stay loaded."""
 
     def __init__(self, source: Dataset | Scene) -> None:
-        """Read the list of scenes.
-
-        Args:
-            source: A dataset, or a scene of `load_scene_file`.
-
-        Raises:
-            InputError: if the list cannot be read.
-        """
+        """Read the list of scenes of a dataset, or take a scene of `load_scene_file`."""
         self._dataset = source if isinstance(source, Dataset) else None
         self._single = source if isinstance(source, Scene) else None
         self._index = SceneIndex(source) if isinstance(source, Dataset) else None
@@ -52,11 +45,7 @@ class SceneCache:
         return self._index.search(text, status)
 
     def open(self, scene_id: str) -> LoadedScene:
-        """Return a loaded scene; concurrent calls for one id wait for the same load.
-
-        Raises:
-            InputError: if there is no such scene, it has no files, or they do not load.
-        """
+        """Return a loaded scene; concurrent calls for one id wait for the same load."""
         with self._lock:
             future = self._loaded.get(scene_id)
             must_load = future is None
@@ -76,11 +65,7 @@ class SceneCache:
         return future.result()
 
     def find_dropped_row(self, scene_id: str) -> Row | None:
-        """Return the row of a scene that was dropped or failed; None for all others.
-
-        Raises:
-            InputError: if the row cannot be read.
-        """
+        """Return the row of a scene that was dropped or failed; None for all others."""
         if self._dataset is None or self._index is None or self._index.has_files(scene_id):
             return None
         return self._dataset.scene_row(scene_id)

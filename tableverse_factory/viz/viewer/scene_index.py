@@ -35,11 +35,7 @@ class SearchHits:
         return self._positions.get(scene_id, -1)
 
     def step_from(self, current: str, step: int) -> str | None:
-        """Return the scene `step` positions further, at most to either end.
-
-        Returns:
-            The first scene if the current one was not found; None if nothing was found.
-        """
+        """Return the scene `step` positions further, at most to either end; the first if the current was not found."""
         if not self.scene_ids:
             return None
         position = self.position(current)
@@ -56,11 +52,6 @@ class SceneIndex:
     """The scenes of a dataset."""
 
     def __init__(self, dataset: Dataset) -> None:
-        """Read ids, names and statuses.
-
-        Raises:
-            InputError: if the table of scenes cannot be read.
-        """
         self._dataset = dataset
         self._scenes = self._read(dataset.scenes, ["scene_id", "name", "status"])
         self._ids: list[str] = self._scenes["scene_id"].to_pylist()
@@ -69,12 +60,7 @@ class SceneIndex:
         return len(self._ids)
 
     def search(self, text: str = "", status: str = ANY) -> SearchHits:
-        """Find scenes of a status for which every word occurs in the id, the name or a label of an object.
-
-        Args:
-            text: Words, regardless of case.
-            status: One of `STATUSES`.
-        """
+        """Find scenes of a status for which every word, in any case, is in the id, the name or an object's label."""
         matches = pa.chunked_array([pa.array([True] * len(self._ids), pa.bool_())])
         if status != ANY:
             matches = pc.and_(matches, pc.equal(self._scenes["status"], status))

@@ -17,14 +17,7 @@ class SceneList:
         self._hits = scenes.search("", panel.status.value)
 
     def search(self, current: str) -> str | None:
-        """Search by the controls.
-
-        Returns:
-            The scene to show instead; None if the shown one matches too, or none does.
-
-        Raises:
-            InputError: if the table of objects cannot be read.
-        """
+        """Search by the controls; return the scene to show instead, None if the shown one matches too, or none does."""
         self._hits = self._scenes.search(self._panel.search.value, self._panel.status.value)
         return self._hits.step_from(current, 0) if self._hits.position(current) < 0 else None
 

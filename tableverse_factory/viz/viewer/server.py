@@ -26,20 +26,12 @@ _REQUEST: ContextVar[Any] = ContextVar("viewer_request", default=None)
 
 
 def import_viser() -> ModuleType:
-    """Import viser, which draws in browsers.
-
-    Raises:
-        InputError: `no_extra` if it is not installed.
-    """
+    """Import viser, which draws in browsers; raise `no_extra` if it is not installed."""
     return import_extra("viser", "the viewer", "viewer")
 
 
 class Viewer:
-    """A running viewer.
-
-    Attributes:
-        url: Address of its page.
-    """
+    """A running viewer; `url` is the address of its page."""
 
     def __init__(
         self,

@@ -34,10 +34,10 @@ class Session:
     def __init__(
         self, client: Any, scenes: SceneCache, robot: str | None, link: Callable[[str], str], wake: Callable[[], None]
     ) -> None:
-        """Build the controls.
+        """Build the controls in the browser of a `viser.ClientHandle`.
 
         Args:
-            client: A `viser.ClientHandle`.
+            client: The browser.
             scenes: The scenes to show.
             robot: The arm of trajectories whose robot comes from a file.
             link: Makes the address of a scene; empty if it has none.
@@ -75,12 +75,7 @@ class Session:
         self._lock.run(lambda: self._open(scene_id))
 
     def tick(self, seconds: float, budget_s: float) -> None:
-        """Advance playback, unless another action runs: other sessions wait for their tick.
-
-        Args:
-            seconds: Time since the last tick [s].
-            budget_s: Most wall time for physics [s].
-        """
+        """Advance playback by some seconds, unless another action runs: other sessions wait for their tick."""
         self._lock.try_run(lambda: self._tick(seconds, budget_s))
 
     def _connect_controls(self) -> None:
@@ -152,7 +147,6 @@ class Session:
         )  # last: a damaged one affects nothing else
 
     def _describe(self, loaded: LoadedScene) -> None:
-        """Fill the controls for the scene."""
         panel, objects = self._panel, loaded.object_rows
         self._names = {str(row["object_id"]): _format_name(row) for row in objects}
         self._physics.open(loaded, self._names)

@@ -17,12 +17,7 @@ class SessionLock:
     """Runs the actions of one session one by one; they arrive in threads of viser and of the ticker."""
 
     def __init__(self, client: Any, halt: Action) -> None:
-        """Wrap a client.
-
-        Args:
-            client: A `viser.ClientHandle`, which shows errors.
-            halt: Stops playback after an error.
-        """
+        """Wrap a `viser.ClientHandle`, which shows errors; `halt` stops playback after one."""
         self._client, self._halt = client, halt
         self._lock = threading.RLock()
 

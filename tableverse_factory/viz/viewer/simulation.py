@@ -19,21 +19,13 @@ SHORTEST_M, LONGEST_M, METRES_PER_NEWTON = 0.015, 0.1, 0.03  # limits and scale 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contacts(Frozen):
-    """Contacts of a scene, the strongest first.
+    """Contacts of a scene, the strongest first."""
 
-    Attributes:
-        points: Positions in the table frame. Shape (n, 3) [m].
-        normals: Unit vectors from the first body to the second. Shape (n, 3).
-        forces_n: Forces along the normals [N]. Shape (n,).
-        depths_m: Overlaps; negative for a gap [m]. Shape (n,).
-        total: Number of contacts, those beyond `MAX_CONTACTS` included.
-    """
-
-    points: Points
-    normals: Points
-    forces_n: Numbers
-    depths_m: Numbers
-    total: int
+    points: Points  # positions in the table frame, shape (n, 3) [m]
+    normals: Points  # unit vectors from the first body to the second, shape (n, 3)
+    forces_n: Numbers  # along the normals, shape (n,) [N]
+    depths_m: Numbers  # overlaps; negative for a gap, shape (n,) [m]
+    total: int  # those beyond `MAX_CONTACTS` included
 
     @classmethod
     def empty(cls) -> "Contacts":
@@ -79,14 +71,9 @@ class Simulation:
         mujoco.mj_forward(self._model, self._data)
 
     def advance(self, seconds: float, budget_s: float = float("inf")) -> float:
-        """Step until the time or the budget is spent.
+        """Step until the simulated time is reached; return the simulated time that passed [s].
 
-        Args:
-            seconds: Simulated time [s].
-            budget_s: Wall time [s]; a heavy scene plays slower instead of delaying the others.
-
-        Returns:
-            The simulated time that passed [s].
+        `budget_s` is wall time: a heavy scene plays slower instead of delaying the others [s].
         """
         steps, until, done = round(seconds / self._model.opt.timestep), time.perf_counter() + budget_s, 0
         while done < steps and time.perf_counter() < until and not self.unstable:
@@ -95,12 +82,7 @@ class Simulation:
         return done * float(self._model.opt.timestep)
 
     def push(self, name: str, impulse_ns: Vector3) -> None:
-        """Change the linear momentum of an object; unknown names are ignored.
-
-        Args:
-            name: Name of the object.
-            impulse_ns: Impulse in the table frame [N s].
-        """
+        """Change the linear momentum of an object by an impulse in the table frame [N s]; unknown names are ignored."""
         if name in self._bodies:
             body = self._bodies[name]
             start = int(self._model.body_dofadr[body])
@@ -113,11 +95,7 @@ class Simulation:
         )
 
     def contacts(self, shown: Container[str] | None = None) -> Contacts:
-        """Measure the contacts of the current state.
-
-        Args:
-            shown: Objects whose contacts count; None for all.
-        """
+        """Measure the contacts of the current state, of the `shown` objects only; None for all."""
         mujoco.mj_forward(self._model, self._data)
         contact, force = self._data.contact, np.zeros(6)
         hidden = [body for name, body in self._bodies.items() if shown is not None and name not in shown]
