@@ -100,7 +100,7 @@ def _measure_task(cell: WorkCell, task: Mapping[str, Any], config: Config, rng: 
     with watch.measure(GRASPS):
         cell.grasps(str(task["x_id"]))
     with watch.measure(WHOLE):
-        found = search_trajectory(cell, task, config.trajectories, rng)
+        found = search_trajectory(cell, task, rng)
     cost.cpu_s[WHOLE] += cost.cpu_s[GRASPS]
     cost.tried, cost.survives = found.tried, found.survives
     attempt = found.attempt

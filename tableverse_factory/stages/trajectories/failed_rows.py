@@ -8,7 +8,6 @@ from schemas.config import TrajectoriesConfig
 from schemas.scene import ExportedScene
 
 MAX_DETAIL = 500
-_TASK_COLUMNS = ("scene_id", "task_id", "x_id", "y_id", "relation", "instruction")
 
 
 def with_failed_trajectories(
@@ -18,12 +17,8 @@ def with_failed_trajectories(
 
     `reason` is why the stage did not end: `timeout`, `crash`, `out_of_memory`, or the kind of an error.
     """
-    return replace(
-        scene,
-        trajectory_rows=tuple(
-            build_failed_row(task, config, reason, detail) for task in select_accepted_tasks(scene, config)
-        ),
-    )
+    rows = (build_failed_row(task, config, reason, detail) for task in select_accepted_tasks(scene, config))
+    return replace(scene, trajectory_rows=tuple(rows))
 
 
 def select_accepted_tasks(scene: ExportedScene, config: TrajectoriesConfig) -> Sequence[Mapping[str, Any]]:
@@ -34,7 +29,7 @@ def select_accepted_tasks(scene: ExportedScene, config: TrajectoriesConfig) -> S
 def build_failed_row(task: Mapping[str, Any], config: TrajectoriesConfig, reason: str, detail: str) -> dict[str, Any]:
     """Build the row of a task that was not tried, or whose result is unknown."""
     return {
-        **{name: task[name] for name in _TASK_COLUMNS},
+        **{name: task[name] for name in ("scene_id", "task_id", "x_id", "y_id", "relation", "instruction")},
         "success": False,
         "reason": reason,
         "detail": detail[:MAX_DETAIL],

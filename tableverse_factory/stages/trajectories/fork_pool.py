@@ -25,14 +25,12 @@ from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelE
 
 _DONE, _RAISED, _FATAL = b"d", b"r", b"f"
 _PR_SET_PDEATHSIG = 1
-_POLL_S = 0.2
-_EXIT_S = 10.0
-_MAX_ANSWER = 1 << 30
-_MAX_MESSAGE = 500
+_POLL_S, _EXIT_S = 0.2, 10.0
+_MAX_ANSWER, _MAX_MESSAGE = 1 << 30, 500
+# Errors that every item would raise again, by exact class name: `AnswerInvalidError` concerns one item only
 _FATAL_ERRORS: dict[str, type[TableverseError]] = {
     kind.__name__: kind for kind in (ConfigError, ModelAccessError, ModelError, StoreError)
 }
-"""Errors that every item would raise again, by exact class name: `AnswerInvalidError` concerns one item only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +44,10 @@ class ItemFailure:
 def map_in_fork(
     work: Callable[[int], bytes], count: int, deadline_s: float, memory_mb: float
 ) -> tuple[bytes | ItemFailure, ...]:
-    """Compute the answers to the items 0 to `count` - 1 in forked processes.
+    """Compute the answers to the items 0 to `count` - 1 in forked processes, each within a wall time and memory.
 
-    Args:
-        work: Computes the answer to an item. Its caches live as long as their process, so no answer may depend on them.
-        count: Number of items.
-        deadline_s: Wall time allowed per item [s].
-        memory_mb: Resident memory allowed per process [MB].
-
-    Raises:
-        ConfigError: if `work` raises it; likewise ModelAccessError, ModelError and StoreError. Any other error that
-            `work` raises becomes the failure of its item.
+    Caches of `work` live as long as their process, so no answer may depend on them. An error that `work` raises becomes
+    the failure of its item, but a ConfigError, ModelAccessError, ModelError or StoreError is raised here.
     """
     answers: list[bytes | ItemFailure] = []
     while len(answers) < count:

@@ -21,15 +21,7 @@ _CUBE_M = 0.05
 def check_trajectory_models(config: TrajectoriesConfig, here: bool) -> None:
     """Load the robot and planner, and query the grasp server once.
 
-    Args:
-        config: Their names.
-        here: Whether the stages run on this machine, so that its GPU and network say something about theirs.
-
-    Raises:
-        ConfigError: if the robot is unknown, or its planner is not installed or does not support it.
-        InputError: if the robot's file is not a usable arm.
-        ModelAccessError: if the grasp server refuses access.
-        ModelError: if the planner finds no GPU, or the grasp server gives no valid answer.
+    Only if the stages run `here`, on this machine, do its GPU and network say something about theirs.
     """
     arm = load_arm(config.robot)
     if config.planner == "curobo":

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from schemas.config import TrajectoriesConfig
-from schemas.geometry import Pose
 from tableverse_factory.stages.trajectories.failed_rows import MAX_DETAIL, build_failed_row
 from tableverse_factory.stages.trajectories.search import Attempt, PlannedTask
 
@@ -21,14 +20,19 @@ def build_trajectory_row(
 
 
 def _describe_attempt(attempt: Attempt, found: PlannedTask) -> dict[str, Any]:
+    tally = f" ({found.detail})" if found.detail else ""  # short and never cut
+    w, _, _, z = attempt.base.quaternion_wxyz
     row: dict[str, Any] = {
         "success": attempt.success,
         "failed_phase": attempt.failed_phase or None,
         "reason": attempt.reason or None,
-        "detail": _format_detail(attempt.detail, found.detail) or None,
+        "detail": f"{attempt.detail[: MAX_DETAIL - len(tally)]}{tally}" or None,
         "grasp_stage": attempt.stage,
         "grasp_score": attempt.score,
-        **_describe_base(attempt.base),
+        "base_x_m": float(attempt.base.position[0]),
+        "base_y_m": float(attempt.base.position[1]),
+        "base_z_m": float(attempt.base.position[2]),
+        "base_yaw_rad": float(2 * np.arctan2(z, w)),
     }
     if attempt.motion is not None and attempt.proof is not None:
         verdict = attempt.proof.verdict
@@ -40,19 +44,3 @@ def _describe_attempt(attempt: Attempt, found: PlannedTask) -> dict[str, Any]:
             "survives": list(found.survives) if attempt.success else None,
         }
     return row
-
-
-def _format_detail(furthest: str, tally: str) -> str:
-    """Join the failure of the attempt that came furthest and the tally, which is short and never cut."""
-    tally = f" ({tally})" if tally else ""
-    return f"{furthest[: MAX_DETAIL - len(tally)]}{tally}"
-
-
-def _describe_base(base: Pose) -> dict[str, float]:
-    w, _, _, z = base.quaternion_wxyz
-    return {
-        "base_x_m": float(base.position[0]),
-        "base_y_m": float(base.position[1]),
-        "base_z_m": float(base.position[2]),
-        "base_yaw_rad": float(2 * np.arctan2(z, w)),
-    }

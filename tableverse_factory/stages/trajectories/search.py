@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from schemas.config import TrajectoriesConfig
 from schemas.curation import Relation
-from schemas.geometry import Frozen, Points, Pose
+from schemas.geometry import Frozen, Pose
 from schemas.trajectories import Grasps, Motion, NoMotion, Phase, Placement
 from tableverse_factory.geometry.math.transforms import (
     compose_poses,
@@ -36,7 +35,7 @@ ALIKE_M, ALIKE_COS = 0.015, 0.94
 GRASP_PHASES = (Phase.PRE_GRASP, Phase.GRASP, Phase.POST_GRASP)
 MAX_REASONS = 5  # reasons named in the tally of a task's attempts
 _PHASES = tuple(Phase)
-_TARGET_GRASPS = 3
+_TARGET_GRASPS = 3  # best grasps that a base has to reach, beside the best one at the best placement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,14 +75,29 @@ class PlannedTask:
     survives: tuple[str, ...] = ()  # perturbations under which it succeeds too
 
 
-def search_trajectory(
-    cell: WorkCell, task: Mapping[str, Any], config: TrajectoriesConfig, rng: np.random.Generator
-) -> PlannedTask:
-    """Search a successful trajectory for a row of tasks/, or return how far it came.
+class _PlaceClearance:
+    """Gripper clearance of grasps at each placement, computed lazily."""
 
-    Raises:
-        TableverseError: if the scene lacks an object of the task, or a model does not answer.
-    """
+    def __init__(self, cell: WorkCell, object_id: str, grasps: Grasps, places: tuple[Placement, ...]) -> None:
+        self.cell, self.grasps, self.places, self._object_id = cell, grasps, places, object_id
+        self._known: dict[int, Mask] = {}
+
+    def at(self, place: int) -> Mask:
+        """Test whether each grasp has clearance at a placement. Shape (n,)."""
+        if place not in self._known:
+            standing = self.cell.objects[self._object_id].pose
+            motion = compose_poses(self.places[place].pose, invert_pose(standing))
+            self._known[place] = self.cell.has_room(self._object_id, move_grasps(self.grasps, motion))
+        return self._known[place]
+
+    def anywhere(self) -> Mask:
+        """Test which grasps have clearance at any placement. Shape (n,)."""
+        return np.any([self.at(place) for place in range(len(self.places))], axis=0)
+
+
+def search_trajectory(cell: WorkCell, task: Mapping[str, Any], rng: np.random.Generator) -> PlannedTask:
+    """Search a successful trajectory for a row of tasks/, or return how far it came."""
+    config = cell.config
     goal = load_goal(cell.files, task, config.max_disturbed_m)
     x, y = cell.objects[goal.x_id], cell.objects[goal.y_id]
     others = [scene_object for name, scene_object in cell.objects.items() if name not in (goal.x_id, goal.y_id)]
@@ -94,7 +108,7 @@ def search_trajectory(
     if not len(grasps):
         return PlannedTask(reason="no_grasp", detail=f"no grasp of {goal.x_id} leaves room for the gripper")
     best, reasons = None, Counter[str]()
-    for attempt in islice(_iterate_attempts(cell, goal, grasps, places, config, rng), config.tries):
+    for attempt in islice(_iterate_attempts(cell, goal, grasps, places, rng), config.tries):
         reasons[attempt.reason] += 1
         if best is None or attempt.success or attempt.progress > best.progress:
             best = attempt
@@ -120,89 +134,54 @@ def format_tally(reasons: Counter[str]) -> str:
 
 
 def _iterate_attempts(
-    cell: WorkCell,
-    goal: Goal,
-    grasps: Grasps,
-    places: tuple[Placement, ...],
-    config: TrajectoriesConfig,
-    rng: np.random.Generator,
+    cell: WorkCell, goal: Goal, grasps: Grasps, places: tuple[Placement, ...], rng: np.random.Generator
 ) -> Iterator[Attempt]:
     """Iterate attempts in the order of the stages; each base gets its share of the tries."""
     standing = cell.objects[goal.x_id].pose
-    for stage, chosen in split_by_stage(grasps, config.gamma_strict):
+    for stage, chosen in split_by_stage(grasps, cell.config.gamma_strict):
         room = _select_with_clearance(cell, goal.x_id, chosen, places)
         if not len(room.grasps):
             continue
-        where = cell.bases(_collect_targets(room.grasps, standing, places))
-        share = max(1, -(-config.tries // max(1, len(where))))
+        best_in_object = transform_points(invert_pose(standing), room.grasps.positions[:1])
+        best_placed = transform_points(places[0].pose, best_in_object)
+        where = cell.bases(np.concatenate([room.grasps.positions[:_TARGET_GRASPS], best_placed]))
+        share = max(1, -(-cell.config.tries // max(1, len(where))))
         slipped: set[int] = set()
         for base in where:
-            yield from islice(_iterate_from_base(cell, base, goal, stage, room, slipped, config, rng), share)
+            yield from islice(_iterate_from_base(room, base, goal, stage, slipped, rng), share)
 
 
 def _iterate_from_base(
-    cell: WorkCell,
-    base: Pose,
-    goal: Goal,
-    stage: int,
-    room: "_PlaceClearance",
-    slipped: set[int],
-    config: TrajectoriesConfig,
-    rng: np.random.Generator,
+    room: _PlaceClearance, base: Pose, goal: Goal, stage: int, slipped: set[int], rng: np.random.Generator
 ) -> Iterator[Attempt]:
     """Iterate pairs, the best of both first, skipping grasps that failed before the transfer.
 
     Grasps that lost the object in physics are added to `slipped`, as they would from any other base.
     """
-    grasps, places = room.grasps, room.places
+    cell, grasps, places = room.cell, room.grasps, room.places
     world, standing = cell.world(base), cell.objects[goal.x_id].pose
     home = cell.station.arm.home
     hopeless = set(slipped)
     for index, place in _iterate_pairs(len(grasps), len(places)):
         if index in hopeless or not room.at(place)[index]:
             continue
-        tcp_grasp = _build_gripper_pose(grasps, index)
+        tcp_grasp = Pose(grasps.positions[index].copy(), quaternion_from_matrix(grasps.rotations[index]))
         tcp_place = compose_poses(places[place].pose, compose_poses(invert_pose(standing), tcp_grasp))
         score, width = float(grasps.scores[index]), float(grasps.widths[index])
-        motion = plan_motion(world, home, tcp_grasp, tcp_place, goal.x_id, width, config, rng, cell.planner)
+        motion = plan_motion(world, home, tcp_grasp, tcp_place, goal.x_id, width, cell.config, rng, cell.planner)
         if isinstance(motion, NoMotion):
             attempt = Attempt(base, stage, score, motion.phase, motion.reason, motion.detail)
         else:
             proof = execute_and_check(cell.station, base, motion, goal)
             said = proof.verdict
-            settled = (*room.settled_for(place), *motion.fallbacks)
+            by = places[place].clear_by
+            settled = motion.fallbacks if by == "boxes" else (f"{Phase.PLACE}: clear by {by}", *motion.fallbacks)
             attempt = Attempt(base, stage, score, said.failed_phase, said.reason, said.detail, motion, proof, settled)
         yield attempt
         if attempt.failed_phase in GRASP_PHASES:
             hopeless.add(index)
             if attempt.proof is not None and attempt.reason == "slipped":
                 slipped.add(index)
-
-
-class _PlaceClearance:
-    """Gripper clearance of grasps at each placement, computed lazily."""
-
-    def __init__(self, cell: WorkCell, object_id: str, grasps: Grasps, places: tuple[Placement, ...]) -> None:
-        self.grasps, self.places = grasps, places
-        self._cell, self._object_id = cell, object_id
-        self._known: dict[int, Mask] = {}
-
-    def at(self, place: int) -> Mask:
-        """Test whether each grasp has clearance at a placement. Shape (n,)."""
-        if place not in self._known:
-            standing = self._cell.objects[self._object_id].pose
-            motion = compose_poses(self.places[place].pose, invert_pose(standing))
-            self._known[place] = self._cell.has_room(self._object_id, move_grasps(self.grasps, motion))
-        return self._known[place]
-
-    def anywhere(self) -> Mask:
-        """Test which grasps have clearance at any placement. Shape (n,)."""
-        return np.any([self.at(place) for place in range(len(self.places))], axis=0)
-
-    def settled_for(self, place: int) -> tuple[str, ...]:
-        """List compromises of a placement, in words."""
-        by = self.places[place].clear_by
-        return () if by == "boxes" else (f"{Phase.PLACE}: clear by {by}",)
 
 
 def _select_with_clearance(
@@ -258,14 +237,3 @@ def _iterate_pairs(grasps: int, places: int) -> Iterator[tuple[int, int]]:
     for total in range(grasps + places - 1):
         for grasp in range(max(0, total - places + 1), min(grasps, total + 1)):
             yield grasp, total - grasp
-
-
-def _collect_targets(grasps: Grasps, standing: Pose, places: tuple[Placement, ...]) -> Points:
-    """Collect TCP positions at the best grasps, and of the best grasp at the best placement."""
-    picked = grasps.positions[:_TARGET_GRASPS]
-    in_object = transform_points(invert_pose(standing), grasps.positions[:1])
-    return np.concatenate([picked, transform_points(places[0].pose, in_object)])
-
-
-def _build_gripper_pose(grasps: Grasps, index: int) -> Pose:
-    return Pose(grasps.positions[index].copy(), quaternion_from_matrix(grasps.rotations[index]))

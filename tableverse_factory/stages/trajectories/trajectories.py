@@ -28,13 +28,7 @@ from tableverse_factory.stages.trajectories.work_cell import WorkCell
 def plan_trajectories(
     scene: ExportedScene, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[ExportedScene]:
-    """Add a row per accepted task, and a file of arrays for each executed motion; a scene never fails here.
-
-    Raises:
-        InputError: if the files are not those of an exported scene.
-        ConfigError: if the robot is unknown, or its planner does not support it.
-        ModelError: if the grasp model or the planner does not answer, which no task is to blame for.
-    """
+    """Add a row per accepted task, and a file of arrays for each executed motion; a scene never fails here."""
     settings = config.trajectories
     tasks = select_accepted_tasks(scene, settings)
     for_things, for_tasks = rng.spawn(2)
@@ -65,7 +59,7 @@ def _plan_task(
     cell: WorkCell, task: Mapping[str, Any], config: Config, rng: np.random.Generator
 ) -> tuple[dict[str, Any], bytes]:
     """Plan one task; return its row and arrays, empty if nothing was executed."""
-    found = search_trajectory(cell, task, config.trajectories, rng)
+    found = search_trajectory(cell, task, rng)
     proof = None if found.attempt is None else found.attempt.proof
     name = None if proof is None else arrays_name(task["task_id"])
     arrays = b"" if proof is None else encode_recording(proof.recording)

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from schemas.config import TrajectoriesConfig
-from schemas.geometry import Points, Pose, TriangleMesh, Vector3
+from schemas.geometry import Points, Pose
 from schemas.scene import ExportedScene
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.math.aabb import aabb
@@ -31,35 +31,24 @@ class WorkCell:
     def __init__(
         self, scene: ExportedScene, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
     ) -> None:
-        """Read the scene's files and compile them with the arm.
-
-        Raises:
-            InputError: if the files are not those of an exported scene, or the arm cannot be attached.
-            GeometryError: if a mesh does not decode.
-        """
+        """Read the scene's files and compile them with the arm."""
         self.files: Mapping[str, bytes] = dict(scene.files)
         self.objects = load_scene_objects(self.files, scene.object_rows)
         self.table = read_slab(self.files)
         self.station = Station(self.files, arm)
-        self._config, self._services = config, services
+        self.config, self._services = config, services
         self._rngs = dict(zip(self.objects, rng.spawn(len(self.objects)), strict=True))
-        self._pieces = {
-            name: [_bound_piece(place_mesh(hull, scene_object.pose)) for hull in scene_object.hulls]
-            for name, scene_object in self.objects.items()
-        }
+        placed = {name: [place_mesh(hull, o.pose) for hull in o.hulls] for name, o in self.objects.items()}
+        self._pieces = {name: [(piece, aabb(piece.vertices)) for piece in pieces] for name, pieces in placed.items()}
         self._grasps: dict[str, Grasps] = {}
         self._worlds: dict[bytes, CollisionWorld] = {}
 
     def grasps(self, object_id: str) -> Grasps:
-        """Return grasps of an object with clearance from the others.
-
-        Raises:
-            ModelError: if the grasp model does not answer.
-        """
+        """Return grasps of an object with clearance from the others."""
         if object_id not in self._grasps:
             others = [scene_object for name, scene_object in self.objects.items() if name != object_id]
             self._grasps[object_id] = propose_grasps(
-                self.objects[object_id], others, self.station.arm, self._config, self._rngs[object_id], self._services
+                self.objects[object_id], others, self.station.arm, self.config, self._rngs[object_id], self._services
             )
         return self._grasps[object_id]
 
@@ -85,12 +74,8 @@ class WorkCell:
 
     @cached_property
     def planner(self) -> Planner:
-        """Planner of this cell, made on first use, as children lose a GPU that their parent holds.
-
-        Raises:
-            ModelError: if it cannot run here.
-        """
-        return PLANNERS[self._config.planner]()
+        """Planner of this cell, made on first use, as children lose a GPU that their parent holds."""
+        return PLANNERS[self.config.planner]()
 
     def world(self, base: Pose) -> CollisionWorld:
         """Return the collision world with the arm at this base."""
@@ -98,7 +83,3 @@ class WorkCell:
         if key not in self._worlds:
             self._worlds[key] = CollisionWorld(self.station, base)
         return self._worlds[key]
-
-
-def _bound_piece(piece: TriangleMesh) -> tuple[TriangleMesh, tuple[Vector3, Vector3]]:
-    return piece, aabb(piece.vertices)

@@ -67,7 +67,7 @@ def row_of(found: PlannedTask) -> dict:
 
 
 def test_what_placement_and_motion_settled_for_stands_in_the_row():
-    found = search_trajectory(cell(), scene().task_rows[0], CONFIG.trajectories, np.random.default_rng(3))
+    found = search_trajectory(cell(), scene().task_rows[0], np.random.default_rng(3))
     assert found.attempt is not None
     assert found.attempt.motion is not None, found.attempt.detail
     fallbacks = row_of(found)["fallbacks"]
@@ -89,7 +89,7 @@ def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
     ours = cell()
     assert made == []  # the parent of the processes that search has none
     for seed in (1, 2):
-        found = search_trajectory(ours, scene().task_rows[0], CONFIG.trajectories, np.random.default_rng(seed))
+        found = search_trajectory(ours, scene().task_rows[0], np.random.default_rng(seed))
     assert len(made) == 1
     assert found.tried == CONFIG.trajectories.tries
     assert row_of(found).get("fallbacks") is None

@@ -123,9 +123,9 @@ def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeyp
     """Both tasks whose motions are planned carry the same object: only the place tells the first from the last."""
     undisturbed = trajectories_module.search_trajectory
 
-    def searched(cell, task, config, rng):
+    def searched(cell, task, rng):
         befalls["now"] = task["task_id"] == "task_000"
-        return undisturbed(cell, task, config, rng)
+        return undisturbed(cell, task, rng)
 
     class Treacherous(RrtConnect):
         """Sound, but for the first task."""
