@@ -1,8 +1,7 @@
 """Composite assembly (paper section 3.1): contents are dropped into their containers, one by one, in isolation.
 
-Seen contents start where they were seen, as far as that is free; merely counted ones repeat the mesh of their
-representative and start at random. While one object falls all others stand still, so that copies do not displace seen
-contents; in the end all are settled together.
+Seen contents start where they were seen, counted ones at random with the mesh of their representative. While one falls
+all others stand still, so that copies do not displace seen contents; in the end all are settled together.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,8 +18,7 @@ from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.relations.containers import HollowVessel
 from tableverse_factory.physics.bodies.prior_mass import make_prior_body
-from tableverse_factory.stages.rectify.budget import BUDGET_SPENT, SimulationBudget
-from tableverse_factory.stages.rectify.drop_contents import CompositeMember
+from tableverse_factory.stages.rectify.drop_contents import BUDGET_SPENT, CompositeMember, SimulationBudget
 from tableverse_factory.stages.rectify.fill_container import ContainerFilling, follow_container
 
 

@@ -1,4 +1,4 @@
-"""Start poses for dropping an object into a container."""
+"""Start poses for dropping an object into a container, and the budget of a scene for that."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,6 @@ from tableverse_factory.geometry.math.transforms import (
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.relations.containers import HollowVessel
 from tableverse_factory.physics.mjcf.spec import SceneBody
-from tableverse_factory.stages.rectify.budget import SimulationBudget
 from tableverse_factory.stages.rectify.vertical import UP
 
 HEADINGS = 8  # sideways directions in which an object that overlaps is pushed clear; as many again point halfway up
@@ -29,6 +28,27 @@ TILT_STEPS = (0.15, 0.3, 0.5)  # shares by which a long object is turned upright
 LONG_RATIO = 2.5
 METRES_PER_RAD = 0.05  # cost of turning an object against pushing it
 DRAWS = 16  # random poses tried for one fall; the one that starts lowest is taken
+BUDGET_SPENT = "filling the containers of this scene took as much work as it may"
+
+
+@dataclass(slots=True)
+class SimulationBudget:
+    """Remaining budget of a scene, in work, not in seconds, so that results repeat; all that was started is finished.
+
+    Attributes:
+        dropping_s: Simulated time for dropping contents one by one [s].
+        freeing_s: Simulated time for settling the contents together [s]; separate, so that dropping cannot exhaust it.
+        comparisons: Of two convex pieces each, to find a free start for a fall.
+    """
+
+    dropping_s: float = 60.0
+    freeing_s: float = 60.0
+    comparisons: int = 24_000_000
+
+    @property
+    def may_drop(self) -> bool:
+        """Whether another object may be dropped."""
+        return self.dropping_s > 0.0 and self.comparisons > 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +176,5 @@ def _tilt_upright(member: CompositeMember) -> Iterator[tuple[CompositeMember, fl
 
 
 def _list_push_directions() -> list[np.ndarray]:
-    angles = np.arange(HEADINGS) * (2 * np.pi / HEADINGS)
-    level = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
+    level = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(HEADINGS) * (2 * np.pi / HEADINGS)]
     return [UP, *level, *((flat + UP) / np.sqrt(2.0) for flat in level)]

@@ -1,6 +1,7 @@
 """Fill one container: drop contents into it one by one, then settle them together."""
 
 from collections.abc import Sequence
+from itertools import islice
 
 import numpy as np
 
@@ -10,9 +11,10 @@ from tableverse_factory.geometry.relations.containers import HollowVessel, make_
 from tableverse_factory.geometry.relations.support import meshes_touch
 from tableverse_factory.physics.simulate.at_rest import Rest
 from tableverse_factory.physics.simulate.freefall import simulate_fall
-from tableverse_factory.stages.rectify.budget import BUDGET_SPENT, SimulationBudget
 from tableverse_factory.stages.rectify.drop_contents import (
+    BUDGET_SPENT,
     CompositeMember,
+    SimulationBudget,
     Surroundings,
     draw_random_start,
     find_seen_starts,
@@ -44,8 +46,7 @@ class ContainerFilling:
     def put(self, member: CompositeMember, holder: HollowVessel) -> bool:
         """Drop an object into the container from near its pose; returns whether it came to lie inside."""
         starts = find_seen_starts(member, self._surroundings(), holder)
-        tries = zip(range(SEEN_TRIES), starts, strict=False)
-        return any(self._fell_in(start, holder) for _, start in tries) or self.pour(member, holder)
+        return any(self._fell_in(start, holder) for start in islice(starts, SEEN_TRIES)) or self.pour(member, holder)
 
     def pour(self, member: CompositeMember, holder: HollowVessel) -> bool:
         """Drop an object into the container from random starts; returns whether it came to lie inside."""
@@ -69,7 +70,7 @@ class ContainerFilling:
     def _freed(self, loose: list[CompositeMember]) -> dict[str, str]:
         """Settle contents together; returns those that have to be taken out, with the reason."""
         for _ in range(FREED_TRIES):
-            if not self._budget.may_free:
+            if self._budget.freeing_s <= 0.0:
                 return {member.item.object_id: BUDGET_SPENT for member in loose}
             rest = self._fallen([self.members[self._root]], loose)
             self._budget.freeing_s -= rest.time_s

@@ -1,7 +1,7 @@
 """Phase 1: group objects that move as one, and put the groups on the table (paper section 3.2)."""
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -50,15 +50,14 @@ def ground_groups(parts: Sequence[RigidPart], groups: Sequence[Group]) -> list[R
     grounded = list(parts)
     for members in groups:
         lowest = measure_lowest_m(parts, members)
-        for entity in members:
-            for i in entity:
-                grounded[i] = parts[i].moved(np.array([0.0, 0.0, -lowest]))
+        for i in chain(*members):
+            grounded[i] = parts[i].moved(np.array([0.0, 0.0, -lowest]))
     return grounded
 
 
 def measure_lowest_m(parts: Sequence[RigidPart], members: Group) -> float:
     """Measure the height of the lowest vertex of a group [m]."""
-    return min(parts[i].lowest_now_m for entity in members for i in entity)
+    return min(parts[i].lowest_now_m for i in chain(*members))
 
 
 def connect_components(pairs: Sequence[tuple[int, int]], count: int) -> list[tuple[int, ...]]:

@@ -10,7 +10,6 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.config import RectifyConfig
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
-from tableverse_factory.stages.rectify.clusters import relax_layout
 from tableverse_factory.stages.rectify.fault_check import LET_DOWN_M, is_faultless
 from tableverse_factory.stages.rectify.groups import Group, connect_components, form_entities, ground_groups
 from tableverse_factory.stages.rectify.lccr import RectificationResult
@@ -20,6 +19,7 @@ from tableverse_factory.stages.rectify.quarter_turn_symmetry import (
     rotate_about_origin,
 )
 from tableverse_factory.stages.rectify.radial import compute_azimuths, order_radially, spread_groups
+from tableverse_factory.stages.rectify.relaxation import relax_layout
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, follow_body, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import SupportRelation, read_support
 from tableverse_factory.stages.rectify.vertical import UP, lift_contents, lift_in_turn

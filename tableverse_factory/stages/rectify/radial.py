@@ -1,6 +1,7 @@
 """Phase 2: outward from the most central group, each group along its own azimuth until it is clear (equation (2))."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,11 +20,11 @@ def order_radially(parts: Sequence[RigidPart], groups: Sequence[Group]) -> list[
     The root, which comes first, is the group whose centre lies nearest to the mean of all centres.
     """
     centers = np.array([compute_center(list_members(parts, group)) for group in groups])
-    to_mean = np.linalg.norm(centers - centers.mean(axis=0), axis=1)
+    to_mean = np.rint(np.linalg.norm(centers - centers.mean(axis=0), axis=1) / COINCIDENT_M)
     names = [min(part.object_id for part in list_members(parts, group)) for group in groups]
-    root = min(range(len(groups)), key=lambda k: (_round_distance(to_mean[k]), names[k]))
-    to_root = np.linalg.norm(centers - centers[root], axis=1)
-    order = sorted(range(len(groups)), key=lambda k: (k != root, _round_distance(to_root[k]), names[k]))
+    root = min(range(len(groups)), key=lambda k: (to_mean[k], names[k]))
+    to_root = np.rint(np.linalg.norm(centers - centers[root], axis=1) / COINCIDENT_M)
+    order = sorted(range(len(groups)), key=lambda k: (k != root, to_root[k], names[k]))
     return [groups[k] for k in order]
 
 
@@ -37,10 +38,9 @@ def spread_groups(parts: Sequence[RigidPart], ordered: Sequence[Group], clearanc
         direction = compute_outward(mine, origin)
         bodies, fixed = [part.body for part in mine], [part.body for part in anchors]
         distance = LinearSweep(direction).find_first_clear(bodies, fixed, clearance_m)
-        for entity in group:
-            for i in entity:
-                moved[i] = moved[i].moved(distance * direction)
-                anchors.append(moved[i])
+        for i in chain(*group):
+            moved[i] = moved[i].moved(distance * direction)
+            anchors.append(moved[i])
     return moved
 
 
@@ -66,8 +66,4 @@ def compute_azimuths(parts: Sequence[RigidPart], ordered: Sequence[Group]) -> Fl
 
 def list_members(parts: Sequence[RigidPart], group: Group) -> list[RigidPart]:
     """List the parts of a group."""
-    return [parts[i] for entity in group for i in entity]
-
-
-def _round_distance(distance: float) -> int:
-    return round(float(distance) / COINCIDENT_M)
+    return [parts[i] for i in chain(*group)]

@@ -1,7 +1,6 @@
-"""Least motion of a whole layout that frees it of collisions: a sequence of least-distance problems."""
+"""Least motion that frees a layout of collisions: a sequence of least-distance problems for each cluster of objects."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +11,8 @@ from tableverse_factory.geometry.collision.ldp_solver import SolverEffort, WorkL
 from tableverse_factory.geometry.collision.linear_sweep import MIN_MARGIN_M
 from tableverse_factory.geometry.collision.separating_planes import PlaneFinder, PosedPieces, SeparatingPlane
 from tableverse_factory.geometry.math.transforms import cross_matrix, quaternion_from_rotation_vector, rotation_matrix
+from tableverse_factory.stages.rectify.fault_check import are_near
+from tableverse_factory.stages.rectify.groups import connect_components
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.support import ON_TABLE_M, SupportRelation
 from tableverse_factory.stages.rectify.untangle import release_parts
@@ -22,6 +23,10 @@ Rows = Float64[np.ndarray, "m k"]
 Bounds = Float64[np.ndarray, " m"]
 Constraints = tuple[Rows, Bounds, Int64[np.ndarray, " m"]]  # `rows @ state >= bounds`, and which belong together
 
+Cluster = tuple[int, ...]  # indices of parts, ascending
+Effort = tuple[SolverEffort, SolverEffort]  # left for all clusters: for least-distance problems, and for ways out
+
+LINK_M = 0.01  # objects with a gap of at most this are in one cluster from the start [m]
 # Motions of these sizes weigh the same, about the noise of registration; and the most along or about each axis in one
 # step, the trust region [m, rad].
 NOISE = np.array([0.007, 0.007, 0.003, np.radians(1.0), np.radians(1.0), np.radians(4.0)])
@@ -44,12 +49,47 @@ UPWARD = 0.3  # least vertical part of the normal of a wished contact
 UNIT = 1e-3  # unit of the constraints, so that all numbers are near one [m]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SolverBudget:
-    """Remaining budget of all clusters of a layout: for least-distance problems, and for ways out of entanglements."""
+def relax_layout(
+    parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float
+) -> tuple[list[RigidPart], set[int]]:
+    """Find the least motion of every cluster, where those that would meet are joined; standing parts are upright.
 
-    motions: SolverEffort = field(default_factory=lambda: SolverEffort(MAX_WORK))
-    ways: SolverEffort = field(default_factory=lambda: SolverEffort(MAX_WAYS_OUT))
+    All share one budget, the smallest first, so that a heap does not use up what the others need. Returns the parts,
+    and which of them have not been moved because the least motion of their cluster is too much work or was not found.
+    """
+    pairs = set(support.pairs) | _find_near_pairs(parts, [(i,) for i in range(len(parts))], LINK_M)
+    effort = SolverEffort(MAX_WORK), SolverEffort(MAX_WAYS_OUT)
+    known: dict[Cluster, list[RigidPart] | None] = {}
+    while True:
+        moved, solved = list(parts), []
+        for cluster in sorted(connect_components(sorted(pairs), len(parts)), key=lambda found: (len(found), found)):
+            if cluster not in known:
+                known[cluster] = _relax_cluster(parts, cluster, support, clearance_m, effort)
+            ended = known[cluster]
+            if ended is not None:
+                solved.append(cluster)
+                for i, part in zip(cluster, ended, strict=True):
+                    moved[i] = part
+        met = _find_near_pairs(moved, solved, clearance_m)
+        if not met:
+            return moved, set(range(len(parts))) - {i for cluster in solved for i in cluster}
+        pairs |= met
+
+
+def _relax_cluster(
+    parts: Sequence[RigidPart], cluster: Cluster, support: SupportRelation, clearance_m: float, effort: Effort
+) -> list[RigidPart] | None:
+    own = [parts[i] for i in cluster]
+    if len(own) == 1:
+        return own
+    try:
+        return Relaxation(own, support.of(cluster), clearance_m, effort).result()
+    except SolverError:
+        return None
+
+
+def _find_near_pairs(parts: Sequence[RigidPart], clusters: Sequence[Cluster], reach_m: float) -> set[tuple[int, int]]:
+    return {(i, j) for a, b in combinations(clusters, 2) for i in a for j in b if are_near(parts[i], parts[j], reach_m)}
 
 
 class Relaxation:
@@ -60,12 +100,12 @@ class Relaxation:
     """
 
     def __init__(
-        self, parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float, allowance: SolverBudget
+        self, parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float, effort: Effort
     ) -> None:
         self._parts, self._support = parts, support
         self._clearance = clearance_m + EXTRA_M
         self._separator = PlaneFinder()
-        self._allowance = allowance
+        self._effort, self._effort_of_ways = effort
         self._noise = np.tile(NOISE, len(parts))
         self._pivots = np.array([part.mass_center_now for part in parts])
         self._lowest = {i: _find_lowest_points(part) for i, part in enumerate(parts) if not support.standing[i]}
@@ -110,7 +150,7 @@ class Relaxation:
         stuck = sorted({(i, j) for i, j, plane in planes if plane.spare_m < -STUCK_M})
         if not stuck:
             return at, planes
-        self._allowance.ways.spend(len(stuck) * len(at), f"{len(stuck)} entangled pairs of {len(at)} parts")
+        self._effort_of_ways.spend(len(stuck) * len(at), f"{len(stuck)} entangled pairs of {len(at)} parts")
         before = self._placed(at)
         after = release_parts(before, self._support, stuck, self._clearance)
         free = at.copy()
@@ -156,7 +196,7 @@ class Relaxation:
         bounds, wished = bounds - rows[:, ~free] @ fixed, wished - wishes[:, ~free] @ fixed
         rows, wishes = rows[:, free] * self._noise[free], wishes[:, free] * self._noise[free]
         state = at.ravel().copy()
-        motion = solve_balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS, self._allowance.motions)
+        motion = solve_balanced_motion(rows, bounds, owners, wishes, wished, SOFTNESS, self._effort)
         state[free] = self._noise[free] * motion
         return state.reshape(-1, 6)
 

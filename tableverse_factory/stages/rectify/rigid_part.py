@@ -110,11 +110,6 @@ class RigidPart:
         return translate_pose(about, self.mass_center + self.body.offset)
 
     @property
-    def box_now(self) -> Box2:
-        """Current top-view box [m]."""
-        return self.box + self.body.offset[:2]
-
-    @property
     def lowest_now_m(self) -> float:
         """Current height of the lowest vertex [m]."""
         return self.lowest_m + float(self.body.offset[2])
@@ -130,12 +125,13 @@ def make_rigid_part(item: PlacedObject, pieces: ConvexPieces) -> RigidPart:
     solids = place_pieces(pieces, item.pose, item.scale)
     vertices = place_mesh(item.mesh, item.pose, item.scale).vertices
     volumes, centers = compute_volumes_and_centers(pieces.hulls, LEAST_VOLUME_M3)
+    axes = rotation_matrix(item.pose.quaternion_wxyz)[:2, :2].T
     center = np.average(centers, axis=0, weights=volumes)  # in the mesh's own frame
     return RigidPart(
         object_id=item.object_id,
         container_id=item.contained_in,
         body=MovingSolid(solids, np.zeros(3), item.scale * pieces.uncovered_m),
-        heading=_compute_heading(rotation_matrix(item.pose.quaternion_wxyz)),
+        heading=_normalize(axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1]),
         mass_center=transform_points(item.pose, center[None], item.scale)[0],
         volume_m3=float(volumes.sum()) * item.scale**3,
         footprint_m2=_compute_hull_area(solids.points[:, :2]),
@@ -176,7 +172,7 @@ def follow_body(part: RigidPart, before: RigidPart, after: RigidPart) -> RigidPa
 
 def compute_box(parts: Sequence[RigidPart]) -> Box2:
     """Compute the top-view box around parts [m]."""
-    boxes = np.array([part.box_now for part in parts])
+    boxes = np.array([part.box + part.body.offset[:2] for part in parts])
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
@@ -207,11 +203,6 @@ def _compute_hull_area(points: Points) -> float:
         return float(ConvexHull(points).volume)  # of a plane hull, this is the area
     except QhullError:  # seen edge-on
         return 0.0
-
-
-def _compute_heading(rotation: Float64[np.ndarray, "3 3"]) -> Vector2:
-    axes = rotation[:2, :2].T
-    return _normalize(axes[0] if np.linalg.norm(axes[0]) > 0.5 else axes[1])
 
 
 def _normalize(axis: Vector2) -> Vector2:

@@ -27,11 +27,7 @@ Outline = Float64[np.ndarray, "n 3"]  # half planes (normal, offset) around a fo
 
 @dataclass(frozen=True, slots=True)
 class SupportRelation:
-    """Support relations of a layout.
-
-    In each pair (upper, lower) the lower part carries or contains the upper one, or is leant on by it. The table alone
-    carries standing parts.
-    """
+    """Pairs (upper, lower) of a part and what carries, contains or props it, and whether each part stands alone."""
 
     pairs: frozenset[tuple[int, int]]
     standing: tuple[bool, ...]
@@ -58,13 +54,12 @@ def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelatio
     reader = _Reader(parts)
     pairs: set[tuple[int, int]] = set()
     for i, j in combinations(range(len(parts)), 2):
-        needy = reader.needs_support(i) or reader.needs_support(j)
-        reach = NEEDY_REACH * contact_m if needy else contact_m
+        reach = NEEDY_REACH * contact_m if reader.needy[i] or reader.needy[j] else contact_m
         upper = reader.upper(i, j) if are_within(parts[i].body, parts[j].body, reach) else None
         if upper is not None:
             pairs.add((upper, i + j - upper))
     for i in sorted(range(len(parts)), key=lambda i: (-parts[i].lowest_now_m, parts[i].object_id)):
-        if reader.needs_support(i) and all(upper != i for upper, _ in pairs):
+        if reader.needy[i] and all(upper != i for upper, _ in pairs):
             lower = reader.leans_on(i, [j for j in range(len(parts)) if j != i and (j, i) not in pairs])
             pairs |= set() if lower is None else {(i, lower)}
     uppers = {upper for upper, _ in pairs}
@@ -76,29 +71,26 @@ class _Reader:
         self._parts = parts
         self._falls = [_find_fall_direction(part) for part in parts]
         self._outlines = [_compute_half_planes((part.body.solids.points + part.body.offset)[:, :2]) for part in parts]
+        self._hovers = [part.lowest_now_m > ON_TABLE_M for part in parts]
+        self._ranks = [(-float(part.mass_center_now[2]), part.object_id) for part in parts]
+        # Parts that the table alone cannot carry, within the noise of their poses.
+        self.needy = [fall is not None or hovers for fall, hovers in zip(self._falls, self._hovers, strict=True)]
         self._up, self._down = LinearSweep(np.array([0.0, 0.0, 1.0])), LinearSweep(np.array([0.0, 0.0, -1.0]))
-
-    def needs_support(self, i: int) -> bool:
-        """Whether the table alone cannot carry the part, within the noise of its pose."""
-        return self._falls[i] is not None or self._hovers(i)
-
-    def _hovers(self, i: int) -> bool:
-        return self._parts[i].lowest_now_m > ON_TABLE_M
 
     def upper(self, i: int, j: int) -> int | None:
         """Decide which of two near parts is supported by the other; None if neither."""
         over = {i: self._is_over(i, j), j: self._is_over(j, i)}
-        needy = {k: self.needs_support(k) for k in (i, j)}
+        needy, ranks = self.needy, self._ranks
         if not (over[i] or over[j] or needy[i] or needy[j]):
             return None
         off = {i: self._off(i, j), j: self._off(j, i)}
         likely = [k for k in (i, j) if off[k] <= VERTICAL_NOISE_M and (needy[k] or over[k])]
         if likely:
-            return min(likely, key=lambda k: (not needy[k], off[k], self._rank(k)))
+            return min(likely, key=lambda k: (not needy[k], off[k], ranks[k]))
         if over[i] or over[j]:
-            return min((i, j), key=lambda k: (not self._hovers(k), not needy[k], off[k], self._rank(k)))
+            return min((i, j), key=lambda k: (not self._hovers[k], not needy[k], off[k], ranks[k]))
         steep = [k for k in (i, j) if needy[k] and off[k] <= min(STEEP_NOISE_M, off[i + j - k] / 2)]
-        return min(steep, key=lambda k: (off[k], self._rank(k)), default=None)
+        return min(steep, key=lambda k: (off[k], ranks[k]), default=None)
 
     def leans_on(self, i: int, others: Sequence[int]) -> int | None:
         """Find the nearest of the others on the side to which a part would fall, within reach."""
@@ -110,9 +102,6 @@ class _Reader:
             if gap <= LEANING_REACH_M and side >= 0.0:
                 found.append((gap, self._parts[j].object_id, j))
         return min(found)[2] if found else None
-
-    def _rank(self, k: int) -> tuple[float, str]:
-        return -float(self._parts[k].mass_center_now[2]), self._parts[k].object_id
 
     def _off(self, i: int, j: int) -> float:
         """Measure how far a part must rise or sink to lie upon another one [m]."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from schemas.geometry import Points, Vector3
+from schemas.geometry import Vector3
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
 from tableverse_factory.stages.rectify.rigid_part import RigidPart
 from tableverse_factory.stages.rectify.support import SupportRelation
@@ -32,16 +32,12 @@ def release_parts(
 def _list_ways_out(
     parts: Sequence[RigidPart], k: int, support: SupportRelation, clearance_m: float
 ) -> list[tuple[float, Vector3]]:
-    others = [part.body for i, part in enumerate(parts) if i != k]
-    ways = []
-    for direction in _list_directions(parts[k], support.standing[k]):
-        distance = LinearSweep(direction).find_first_clear([parts[k].body], others, clearance_m)
-        ways.append((distance * (UPWARD_COST if direction[2] > 0.0 else 1.0), distance * direction))
-    return ways
-
-
-def _list_directions(part: RigidPart, standing: bool) -> Points:
-    """List directions evenly around from the part's own heading, and up for a part that does not stand."""
+    """List the ways evenly around from the part's own heading, and up for one that does not stand, with their costs."""
+    part, others = parts[k], [other.body for i, other in enumerate(parts) if i != k]
     angle = np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS + np.arctan2(part.heading[1], part.heading[0])
     around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(AZIMUTHS)])
-    return around if standing else np.vstack([around, UP])
+    ways = []
+    for direction in around if support.standing[k] else np.vstack([around, UP]):
+        distance = LinearSweep(direction).find_first_clear([part.body], others, clearance_m)
+        ways.append((distance * (UPWARD_COST if direction[2] > 0.0 else 1.0), distance * direction))
+    return ways

@@ -29,9 +29,8 @@ from tableverse_factory.physics.bodies.prior_mass import make_prior_body
 from tableverse_factory.physics.simulate.at_rest import GENTLE_S, HOLD_S
 from tableverse_factory.sources.synthetic import utensils, vessels
 from tableverse_factory.sources.synthetic.model import GeneratedObject
-from tableverse_factory.stages.rectify.budget import BUDGET_SPENT, SimulationBudget
 from tableverse_factory.stages.rectify.composites import AssembledLayout, assemble_composites, break_containment_cycles
-from tableverse_factory.stages.rectify.drop_contents import CompositeMember
+from tableverse_factory.stages.rectify.drop_contents import BUDGET_SPENT, CompositeMember, SimulationBudget
 from tableverse_factory.stages.rectify.fill_container import LEFT, RESTLESS, UNSTABLE, ContainerFilling
 from tableverse_factory.stages.rectify.groups import form_entities
 from tableverse_factory.stages.rectify.rigid_part import make_rigid_part

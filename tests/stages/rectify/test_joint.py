@@ -29,7 +29,7 @@ from tableverse_factory.stages.rectify.joint import is_order_kept, rectify_joint
 from tableverse_factory.stages.rectify.lccr import RectificationResult
 from tableverse_factory.stages.rectify.quarter_turn_symmetry import count_quarter_turns
 from tableverse_factory.stages.rectify.rectify import rectify
-from tableverse_factory.stages.rectify.rigid_part import RigidPart, merge_rigid_parts
+from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_box, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import read_support
 from tests.helpers.convex_layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
 
@@ -82,7 +82,7 @@ def test_the_order_around_the_root_stays(items: list[PlacedObject]) -> None:
 
 def ways(parts: Sequence[RigidPart], result: RectificationResult) -> np.ndarray:
     """Unit vectors from the root's centre to that of each other group, seen from above; NaN where they coincide."""
-    boxes = [np.concatenate([parts[i].box_now for entity in group for i in entity]) for group in result.groups]
+    boxes = [np.concatenate([compute_box([parts[i]]) for entity in group for i in entity]) for group in result.groups]
     away = np.array([(box.min(axis=0) + box.max(axis=0)) / 2 for box in boxes])
     away = away[1:] - away[0]
     length = np.linalg.norm(away, axis=1, keepdims=True)
