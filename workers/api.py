@@ -26,8 +26,7 @@ from workers.progress.notebook import open_display
 from workers.progress.tally import Display
 from workers.run import PIPELINE, WITH_TRAJECTORIES, BuildRequest, BuildSummary, run_build
 
-ADDED_STAGES = "+trajectories"
-"""Value of `--stages`: stages that are added to the usual ones."""
+ADDED_STAGES = "+trajectories"  # value of `--stages`: stages that are added to the usual ones
 TRAJECTORIES = "trajectories"
 
 

@@ -48,54 +48,32 @@ WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
 
 @dataclass(frozen=True, slots=True)
 class BuildRequest:
-    """Request of a build.
+    """Request of a build. The same request, repeated before the build is complete, resumes it."""
 
-    Attributes:
-        manifest: Image manifest (Parquet); None to add stages to a finished dataset, whose rows are restored from it.
-        out: Folder of the dataset. An unfinished build in it is resumed.
-        workers: Calls in flight with `ray`; None for one per CPU.
-        address: A running Ray cluster; None for one on this machine that ends with the build.
-        pools: Resources of the actors of each pool, with `ray`.
-        from_stage: Section of the first stage to compute again; None to resume. The same request, repeated before the
-            build is complete, resumes as well.
-        limit: Most scenes of this run; None for all.
-        shards: Shards of this run; None for all.
-        limits: Most that questions to models may cost, over all runs. They never decide the bytes.
-        keep: Whether the output of every stage stays in OUT when its shard is committed.
-        pipeline: Where the pipelines are, as `module:attribute`.
-    """
-
-    manifest: StoragePath | None
-    out: StoragePath
+    manifest: StoragePath | None  # Parquet; None to add stages to a finished dataset, which gives the rows
+    out: StoragePath  # folder of the dataset
     config: Config
     cache_dir: Path
     executor: Literal["local", "ray"] = "local"
-    workers: int | None = None
-    address: str | None = None
-    pools: Pools = field(default_factory=Pools)
-    from_stage: str | None = None
-    limit: int | None = None
-    shards: Collection[int] | None = None
-    limits: SpendingLimits = NO_LIMITS
-    keep: bool = True
-    pipeline: str = PIPELINE
+    workers: int | None = None  # calls in flight with `ray`; None for one per CPU
+    address: str | None = None  # a running Ray cluster; None for one on this machine that ends with the build
+    pools: Pools = field(default_factory=Pools)  # resources of the actors of each pool, with `ray`
+    from_stage: str | None = None  # section of the first stage to compute again; None to resume
+    limit: int | None = None  # most scenes of this run; None for all
+    shards: Collection[int] | None = None  # shards of this run; None for all
+    limits: SpendingLimits = NO_LIMITS  # of all runs together; they never decide the bytes
+    keep: bool = True  # whether the output of every stage stays in OUT when its shard is committed
+    pipeline: str = PIPELINE  # where the pipelines are, as `module:attribute`
 
 
 @dataclass(frozen=True, slots=True)
 class BuildSummary:
-    """Result of one run of a build.
-
-    Attributes:
-        out: Folder of the dataset.
-        tally: The counts of this run.
-        signal: Number of the signal that stopped it; 0 otherwise.
-        over_budget: What all runs spent, if that stopped it.
-    """
+    """Result of one run of a build."""
 
     out: StoragePath
-    tally: Tally
-    signal: int = 0
-    over_budget: ModelCost | None = None
+    tally: Tally  # of this run
+    signal: int = 0  # number of the signal that stopped it; 0 otherwise
+    over_budget: ModelCost | None = None  # what all runs spent, if that stopped it
 
     def read_state(self) -> BuildState:
         """Read the outcomes and costs of all scenes of the dataset, those of earlier runs included."""
@@ -110,17 +88,8 @@ class BuildSummary:
 def run_build(request: BuildRequest, display: Display, signals: StopSignals | None = None) -> BuildSummary:
     """Build the dataset, or resume it.
 
-    Args:
-        request: What to build.
-        display: Shows the progress.
-        signals: Stops the run at SIGINT or SIGTERM, which then returns; None leaves signals alone, so that Ctrl-C
-            raises `KeyboardInterrupt`. Finished scenes are kept in both cases.
-
-    Raises:
-        InputError: if the manifest cannot be read.
-        ConfigError: if the folder of recorded answers is missing.
-        ModelAccessError: if the commit of weights on the hub cannot be determined.
-        BuildError: if OUT holds another build or is being written, if the disk refuses, or workers cannot start.
+    `signals` stops the run at SIGINT or SIGTERM, which then returns; None leaves signals alone, so that Ctrl-C raises
+    `KeyboardInterrupt`. Finished scenes are kept in both cases.
     """
     if request.executor == "local" and request.workers not in (None, 1):
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")

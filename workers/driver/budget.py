@@ -13,15 +13,10 @@ from tableverse_factory.stage import Stage
 
 @dataclass(frozen=True, slots=True)
 class SpendingLimits:
-    """Upper limits on the cost of a dataset over all runs; None for no limit.
+    """Upper limits on the cost of a dataset over all runs; None for no limit."""
 
-    Attributes:
-        calls: Requests to models.
-        usd: At the prices of the configuration [USD].
-    """
-
-    calls: int | None = None
-    usd: float | None = None
+    calls: int | None = None  # requests to models
+    usd: float | None = None  # at the prices of the configuration [USD]
 
 
 NO_LIMITS = SpendingLimits()
@@ -39,18 +34,12 @@ class Budget:
 
     Requests are granted before they are sent, so they never exceed their limit. Their price is unknown before: each
     scene in flight counts as the most expensive one so far, and while no price is known, scenes go one by one.
-
-    Attributes:
-        limits: Of the dataset.
-        spent: By finished scenes of the dataset.
-        max_scene_usd: Most that one scene has cost [USD]; None while no answer had a price.
-        granted: Allowances of scenes in flight, by rank.
     """
 
-    limits: SpendingLimits
-    spent: ModelCost
-    max_scene_usd: float | None = None
-    granted: dict[int, Allowance] = field(default_factory=dict)
+    limits: SpendingLimits  # of the dataset
+    spent: ModelCost  # by finished scenes of the dataset
+    max_scene_usd: float | None = None  # most that one scene has cost [USD]; None while no answer had a price
+    granted: dict[int, Allowance] = field(default_factory=dict)  # allowances of scenes in flight, by rank
     _run: str = field(default_factory=lambda: secrets.token_hex(4))
     _count: int = 0
 
@@ -85,10 +74,7 @@ class Budget:
     def settle(self, rank: int, paid: ModelCost, cost: ModelCost = NO_COST) -> None:
         """Settle the allowance of a scene that returned.
 
-        Args:
-            rank: Of the scene.
-            paid: Its spending.
-            cost: What its answers cost when they were first given; cached ones tell the price, too.
+        `cost` is what its answers cost when they were first given: cached ones tell the price, too.
         """
         del self.granted[rank]
         self.spent += paid

@@ -25,11 +25,7 @@ class CheckpointIndex:
         self._index: tuple[int, Mapping[str, CheckpointRef]] = (-1, {})
 
     def start(self, rank: int) -> InFlightScene:
-        """Create the scene of a row behind its last stage with a checkpoint.
-
-        Raises:
-            BuildError: as `resume`.
-        """
+        """Create the scene of a row behind its last stage with a checkpoint."""
         row = self._spec.rows[rank]
         shard = self._ledger.shard_of(row.scene_id)
         if self._index[0] != shard:  # read when the shard's first scene enters: scenes come in the plan's order
@@ -41,11 +37,7 @@ class CheckpointIndex:
         return scene
 
     def resume(self, scenes: Iterable[InFlightScene], inputs_lost: bool) -> None:
-        """Move scenes behind their last readable checkpoint, if that is further or their inputs are lost.
-
-        Raises:
-            BuildError: if the disk refuses, or a scene whose files are in its shard would need its picture again.
-        """
+        """Move scenes behind their last readable checkpoint, if that is further or their inputs are lost."""
         indexes: dict[int, Mapping[str, CheckpointRef]] = {}
         for scene in scenes:
             shard = self._ledger.shard_of(scene.row.scene_id)

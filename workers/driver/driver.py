@@ -29,8 +29,7 @@ from workers.state.cost_log import sum_costs_by_grant
 from workers.state.ledger import Ledger
 
 MAX_LOSSES_PER_SCENE = 5
-MAX_LOSSES_PER_CALL = 10
-"""Losses without a result between them, per call in flight: one machine that is lost takes many calls along."""
+MAX_LOSSES_PER_CALL = 10  # in a row, per call in flight: one machine that is lost takes many calls along
 _BUDGET_SPENT = BudgetSpentError.__name__
 
 _WAIT_S = 0.2
@@ -63,13 +62,8 @@ class Driver:
     def run(self, check: Callable[[], None]) -> None:
         """Run until every scene is accounted for or postponed, or the budget is spent.
 
-        When the budget is spent, scenes that need no more questions are finished first.
-
-        Args:
-            check: Called several times a second; ends the loop by raising.
-
-        Raises:
-            BuildError: if the disk refuses, workers die faster than they answer, or a model needs a person's action.
+        When the budget is spent, scenes that need no more questions are finished first. `check` is called several times
+        a second and ends the loop by raising.
         """
         while self._todo or self._waiting or self._running:
             check()

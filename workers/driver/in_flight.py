@@ -18,31 +18,22 @@ class InFlightScene:
     """A scene inside the stages.
 
     Attributes:
-        stages: Of its pipeline.
-        records: Names of the checkpoints of its stages; empty for an output that is not kept.
-        input_record: Place of the checkpoint that is the input of its next stage; empty if the payload is.
-        payload: Input of its next stage; empty if it is a checkpoint.
-        position: Its next stage, or the first of those that run.
-        attempts: Most attempts that any stage needed.
-        losses: How often its worker was lost.
         tried: Failed attempts of its stages, by position, in calls that the budget interrupted.
-        child_losses: How often a child was killed from outside in such calls.
-        costs: Costs of the model calls of its stages.
     """
 
     rank: int
     row: ImageRow
-    stages: Sequence[Stage]
-    records: tuple[str, ...]
-    input_record: str = ""
-    payload: Payload = b""
-    position: int = 0
-    attempts: int = 0
-    losses: int = 0
+    stages: Sequence[Stage]  # of its pipeline
+    records: tuple[str, ...]  # names of the checkpoints of its stages; empty for an output that is not kept
+    input_record: str = ""  # place of the checkpoint that is the input of its next stage; empty if the payload is
+    payload: Payload = b""  # input of its next stage; empty if it is a checkpoint
+    position: int = 0  # its next stage, or the first of those that run
+    attempts: int = 0  # most attempts that any stage needed
+    losses: int = 0  # how often its worker was lost
     tried: Counter[int] = field(default_factory=Counter)
-    child_losses: int = 0
+    child_losses: int = 0  # how often a child was killed from outside in such calls
     timings: list[StageTiming] = field(default_factory=list)
-    costs: dict[str, ModelCost] = field(default_factory=dict)
+    costs: dict[str, ModelCost] = field(default_factory=dict)  # costs of the model calls of its stages
 
     @property
     def stage(self) -> Stage:

@@ -14,21 +14,14 @@ class BuildSpec:
     """The work of one run of a build.
 
     Attributes:
-        rows: The whole manifest.
-        pipelines: Stages of each kind of row.
-        config: Of the build.
-        fingerprints: Of the stages of each kind of row (see `fingerprint_stages`).
-        records_dir: Where the outputs of stages are kept.
-        keep: Whether they stay there when their shard is committed.
-        todo: Ranks of the scenes to work on, in the plan's order.
         added_only: Whether only stages that add to exported scenes may run, because the pictures may be unavailable.
     """
 
-    rows: Sequence[ImageRow]
-    pipelines: Pipelines
+    rows: Sequence[ImageRow]  # the whole manifest
+    pipelines: Pipelines  # stages of each kind of row
     config: Config
-    fingerprints: Mapping[SceneKind, Mapping[str, str]]
-    records_dir: StoragePath
-    keep: bool
-    todo: Sequence[int]
+    fingerprints: Mapping[SceneKind, Mapping[str, str]]  # of the stages of each kind of row (see `fingerprint_stages`)
+    records_dir: StoragePath  # where the outputs of stages are kept
+    keep: bool  # whether they stay there when their shard is committed
+    todo: Sequence[int]  # ranks of the scenes to work on, in the plan's order
     added_only: bool = False

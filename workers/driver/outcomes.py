@@ -40,11 +40,7 @@ class OutcomeRecorder:
         self._record(scene, "done", exported=exported)
 
     def record_unfinished(self, scene: InFlightScene, report: StageReport) -> None:
-        """Record a scene that a stage dropped or failed, or postpone it to a later run.
-
-        Raises:
-            BuildError: if a person must act, or too many scenes in a row are postponed.
-        """
+        """Record a scene that a stage dropped or failed, or postpone it to a later run."""
         match report.outcome:
             case Dropped(reason=reason, detail=detail):
                 self._record(scene, "dropped", reason=reason, detail=detail)

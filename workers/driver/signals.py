@@ -57,11 +57,7 @@ class StopSignals:
             signal.signal(number, self._stop)
 
     def check(self) -> None:
-        """Raise if a signal has come.
-
-        Raises:
-            StoppedError: from the first signal on.
-        """
+        """Raise if a signal has come."""
         if self._number:
             raise StoppedError(self._number)
 

@@ -31,13 +31,7 @@ class WorkerManager:
     """
 
     def __init__(self, executor: Executor, pools: Sequence[str], clock: Callable[[], float] = time.monotonic) -> None:
-        """Start the minimum of workers.
-
-        Args:
-            executor: Runs the workers.
-            pools: Those that the build needs.
-            clock: Monotonic [s].
-        """
+        """Start the minimum of workers of the pools that the build needs; `clock` is monotonic [s]."""
         self._executor = executor
         self._names = pools
         self._clock = clock

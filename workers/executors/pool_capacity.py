@@ -14,17 +14,9 @@ _ROUNDING = 1e-9
 def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: Mapping[str, float]) -> None:
     """Refuse pools that the cluster could never hold.
 
-    Each pool must fit with one actor, and with its `min` of actors, on single nodes; all of these together must not
-    exceed the capacity. If the sum fits but not all actors at once, the build runs nevertheless: it retires idle
-    actors, even those of `min`, to make room for others.
-
-    Args:
-        specs: Resources of one actor, by pool; pools that share their actors are given once.
-        nodes: The present nodes; future ones of an autoscaler do not count.
-        capacity: What the build may use of the whole cluster.
-
-    Raises:
-        BuildError: naming the pool, what it needs, what is there, and what to change.
+    Each pool must fit with one actor, and with its `min` of actors, on single nodes (future ones of an autoscaler do
+    not count); all of these together must not exceed the capacity. If the sum fits but not all actors at once, the
+    build runs nevertheless: it retires idle actors, even those of `min`, to make room for others.
     """
     for name, spec in specs.items():
         needs = spec.needs()

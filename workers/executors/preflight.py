@@ -31,31 +31,16 @@ _MAX_SHOWN = 4
 
 @dataclass(frozen=True, slots=True)
 class NodeReport:
-    """Result of the probe of a node.
-
-    Attributes:
-        versions: Of Python, the packages that decide bytes, and our own code.
-        missing: Inputs that it cannot see.
-        token: Content of the token file; empty if it cannot read it.
-    """
+    """Result of the probe of a node."""
 
     node: str
-    versions: Mapping[str, str]
-    missing: tuple[str, ...]
-    token: str
+    versions: Mapping[str, str]  # of Python, the packages that decide bytes, and our own code
+    missing: tuple[str, ...]  # inputs that it cannot see
+    token: str  # content of the token file; empty if it cannot read it
 
 
 def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: StoragePath) -> None:
-    """Check that every node would compute the same as this machine.
-
-    Args:
-        nodes: From `workers.executors.ray_cluster.list_alive_nodes`.
-        inputs: Of the manifest; a sample is tried.
-        shared: A folder that every node must reach, because its workers write there.
-
-    Raises:
-        BuildError: naming the node, what it lacks, and what would help.
-    """
+    """Check that every node computes the same as this machine, sees a sample of the inputs, and reaches `shared`."""
     sampled = sample_inputs(inputs)
     visible = find_visible_inputs(sampled)
     if sampled and not visible:
@@ -93,11 +78,7 @@ def write_shared_token(folder: StoragePath) -> Iterator[tuple[StoragePath, str]]
 
 
 def probe_nodes(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath) -> list[NodeReport]:
-    """Probe the nodes; those that are lost meanwhile are left out, like any node lost later.
-
-    Raises:
-        BuildError: if a node cannot run our code, or does not answer.
-    """
+    """Probe the nodes; those that are lost meanwhile are left out, like any node lost later."""
     probe: Any = ray.remote(num_cpus=0, max_retries=0)(probe_node)
     pending = {
         probe.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node.node_id, soft=False)).remote(
@@ -113,11 +94,7 @@ def probe_nodes(nodes: Sequence[Node], inputs: Sequence[str], token: StoragePath
 
 
 def probe_node(name: str, inputs: Sequence[str], token: str) -> NodeReport:
-    """Probe this machine; runs on the node.
-
-    Raises:
-        StoreError: if an object store does not answer.
-    """
+    """Probe this machine; runs on the node."""
     missing = tuple(uri for uri in inputs if not _is_visible(uri))
     try:
         content = read_whole(parse_path(token)).decode()
@@ -130,17 +107,11 @@ def probe_node(name: str, inputs: Sequence[str], token: str) -> NodeReport:
 
 @dataclass(frozen=True, slots=True)
 class NodeExpectation:
-    """Requirements of an actor on its node, for nodes that join after the start of the build.
+    """Requirements of an actor on its node, for nodes that join after the start of the build."""
 
-    Attributes:
-        versions: Of Python, packages and our own code.
-        inputs: A sample of the manifest's.
-        checked: Ray's ids of the nodes that passed the preflight and need no second one.
-    """
-
-    versions: Mapping[str, str]
-    inputs: tuple[str, ...]
-    checked: tuple[str, ...] = ()
+    versions: Mapping[str, str]  # of Python, packages and our own code
+    inputs: tuple[str, ...]  # a sample of the manifest's
+    checked: tuple[str, ...] = ()  # Ray's ids of the nodes that passed the preflight and need no second one
 
 
 def make_expectation(inputs: Sequence[str], checked: Sequence[Node]) -> NodeExpectation:
@@ -152,8 +123,7 @@ def make_expectation(inputs: Sequence[str], checked: Sequence[Node]) -> NodeExpe
 def find_local_problem(node: str, node_id: str, expected: NodeExpectation) -> str:
     """Find why this machine would not give the same bytes; empty if it would, or passed the preflight.
 
-    Raises:
-        StoreError: if the store of the inputs does not answer, which says nothing about the machine.
+    A StoreError of the inputs' store passes: it says nothing about the machine.
     """
     if node_id in expected.checked:
         return ""
@@ -167,11 +137,7 @@ def find_local_problem(node: str, node_id: str, expected: NodeExpectation) -> st
 
 
 def check_versions(own: Mapping[str, str], answers: Sequence[NodeReport]) -> None:
-    """Refuse nodes whose results could differ from this machine's.
-
-    Raises:
-        BuildError: naming the node and the first differences.
-    """
+    """Refuse nodes whose results could differ from this machine's."""
     for answer in answers:
         differing = [name for name in sorted({*own, *answer.versions}) if own.get(name) != answer.versions.get(name)]
         if differing:
@@ -183,11 +149,7 @@ def check_versions(own: Mapping[str, str], answers: Sequence[NodeReport]) -> Non
 
 
 def check_inputs(n_tried: int, answers: Sequence[NodeReport]) -> None:
-    """Refuse nodes that cannot read the inputs.
-
-    Raises:
-        BuildError: naming the node and an input.
-    """
+    """Refuse nodes that cannot read the inputs."""
     for answer in answers:
         if answer.missing:
             raise BuildError(
@@ -198,11 +160,7 @@ def check_inputs(n_tried: int, answers: Sequence[NodeReport]) -> None:
 
 
 def check_shared_folder(folder: StoragePath, token: str, answers: Sequence[NodeReport]) -> None:
-    """Refuse nodes that see another folder under this name, or none.
-
-    Raises:
-        BuildError: naming the nodes.
-    """
+    """Refuse nodes that see another folder under this name, or none."""
     failing = [answer.node for answer in answers if answer.token != token]
     if failing:
         raise BuildError(

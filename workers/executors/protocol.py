@@ -11,17 +11,11 @@ Payload = Any  # an encoded record: bytes in this process, or a reference into R
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One scene's part of a call.
+    """One scene's part of a call."""
 
-    Attributes:
-        rank: The scene's rank in the plan.
-        chain: The stages to run.
-        payload: Their input; empty if the chain names a checkpoint.
-    """
-
-    rank: int
+    rank: int  # the scene's rank in the plan
     chain: StageChain
-    payload: Payload
+    payload: Payload  # their input; empty if the chain names a checkpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,31 +36,20 @@ class WorkerReady:
 
 @dataclass(frozen=True, slots=True)
 class CallFinished:
-    """A call has ended.
-
-    Attributes:
-        worker: Its worker.
-        answers: One for each of its jobs.
-    """
+    """A call has ended."""
 
     worker: int
-    answers: tuple[JobResult, ...]
+    answers: tuple[JobResult, ...]  # one for each of its jobs
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerLost:
-    """A worker is gone for good; the scenes of its call are not to blame.
-
-    Attributes:
-        ranks: The scenes of its call; none if it never started.
-        why: Description of the loss.
-        inputs_lost: Whether inputs of the call are gone, too.
-    """
+    """A worker is gone for good; the scenes of its call are not to blame."""
 
     worker: int
-    ranks: tuple[int, ...]
-    why: str
-    inputs_lost: bool = False
+    ranks: tuple[int, ...]  # the scenes of its call; none if it never started
+    why: str  # description of the loss
+    inputs_lost: bool = False  # whether inputs of the call are gone, too
 
 
 Event = WorkerReady | CallFinished | WorkerLost
@@ -93,21 +76,13 @@ class Executor(Protocol):
         """Send a call to an idle worker."""
 
     def wait(self, timeout_s: float) -> list[Event]:
-        """Return the new events; wait for the first one at most `timeout_s`.
-
-        Raises:
-            BuildError: if a worker can never run the stages.
-        """
+        """Return the new events; wait for the first one at most `timeout_s`."""
 
     def retire(self, worker: int) -> None:
         """Stop an idle worker."""
 
     def fetch(self, payload: Payload) -> bytes:
-        """Return the bytes of a payload.
-
-        Raises:
-            PayloadLostError: if they are gone.
-        """
+        """Return the bytes of a payload; PayloadLostError if they are gone."""
 
     def close(self) -> None:
         """Stop all workers at once."""

@@ -7,11 +7,7 @@ from tableverse_factory.core.storage.files import redact_uri
 
 
 def parse_host_port(address: str) -> tuple[str, int]:
-    """Parse `HOST:PORT`.
-
-    Raises:
-        BuildError: if it has another form, naming the option or variable; a secret in it is not repeated.
-    """
+    """Parse `HOST:PORT`."""
     source = name_address_source(address, "RAY_ADDRESS")
     reject_secrets(address, source, "auto, or HOST:PORT of the head node")
     host, _, port = address.rpartition(":")
@@ -23,16 +19,7 @@ def parse_host_port(address: str) -> tuple[str, int]:
 
 
 def reject_secrets(address: str, source: str, expected: str) -> None:
-    """Reject user information and queries, without repeating them.
-
-    Args:
-        address: As it was given.
-        source: Option or variable that holds it.
-        expected: What would be right.
-
-    Raises:
-        BuildError: if it holds any.
-    """
+    """Reject user information and queries, without repeating them; `source` names the option or variable."""
     if any(sign in address for sign in "@?#"):
         raise BuildError(
             f"{source}: an address holds no user, password or query: give {expected}; a cluster's token belongs into a "

@@ -24,17 +24,11 @@ CONNECT_TIMEOUT_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A live node of the cluster.
+    """A live node of the cluster."""
 
-    Attributes:
-        node_id: Ray's.
-        name: Its address.
-        resources: Totals by Ray's names; memory in bytes.
-    """
-
-    node_id: str
-    name: str
-    resources: Mapping[str, float]
+    node_id: str  # Ray's
+    name: str  # its address
+    resources: Mapping[str, float]  # totals by Ray's names; memory in bytes
 
 
 def list_alive_nodes() -> tuple[Node, ...]:
@@ -52,11 +46,7 @@ def sum_capacity(nodes: Sequence[Node], workers: int | None) -> dict[str, float]
 
 
 def check_workers(workers: int | None, nodes: Sequence[Node]) -> None:
-    """Refuse more workers than there are CPUs.
-
-    Raises:
-        BuildError: naming both numbers.
-    """
+    """Refuse more workers than there are CPUs."""
     have = sum_capacity(nodes, None).get("CPU", 0.0)
     if workers is not None and workers > have:
         raise BuildError(
@@ -65,11 +55,7 @@ def check_workers(workers: int | None, nodes: Sequence[Node]) -> None:
 
 
 def connect(address: str | None) -> None:
-    """Start Ray on this machine, without a dashboard, or join the cluster at `address`.
-
-    Raises:
-        BuildError: if it does not answer.
-    """
+    """Start Ray on this machine, without a dashboard, or join the cluster at `address`."""
     if address not in (None, "auto"):
         _check_reachable(str(address))
     local: dict[str, Any] = {"include_dashboard": False, "object_store_memory": OBJECT_STORE_BYTES}

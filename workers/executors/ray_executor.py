@@ -52,30 +52,19 @@ class _Call:
 
 @dataclass(frozen=True, slots=True)
 class ClusterSpec:
-    """The cluster, the part of it to use, and what its nodes must see.
+    """The cluster, the part of it to use, and what its nodes must see."""
 
-    Attributes:
-        address: Of a running cluster; None for one on this machine that ends with the build.
-        workers: CPUs that the build may use; None for all.
-        inputs: Of the manifest.
-        shared: A folder that all nodes must reach.
-    """
-
-    address: str | None
-    workers: int | None
-    inputs: Sequence[str]
-    shared: StoragePath
+    address: str | None  # of a running cluster; None for one on this machine that ends with the build
+    workers: int | None  # CPUs that the build may use; None for all
+    inputs: Sequence[str]  # of the manifest
+    shared: StoragePath  # a folder that all nodes must reach
 
 
 class RayExecutor:
     """Executor of actors in pools; the driver starts and replaces them."""
 
     def __init__(self, setup: SandboxSetup, pools: Pools, cluster: ClusterSpec) -> None:
-        """Start Ray on this machine, or join a cluster.
-
-        Raises:
-            BuildError: if the cluster is not reachable or too small for the pools, or a node would give other bytes.
-        """
+        """Start Ray on this machine, or join a cluster."""
         connect(cluster.address)
         try:
             pipelines = load_pipelines(setup.pipeline).values()
@@ -127,11 +116,7 @@ class RayExecutor:
         self._running[report] = _Call(worker, jobs, values, time.monotonic() + self._compute_deadline_s(jobs))
 
     def wait(self, timeout_s: float) -> list[Event]:
-        """Return started actors and finished calls; an actor that died or exceeds its deadline is killed.
-
-        Raises:
-            BuildError: if an actor can never run the stages.
-        """
+        """Return started actors and finished calls; an actor that died or exceeds its deadline is killed."""
         awaited = [*self._running, *self._starting]
         if not awaited:
             return []
@@ -149,11 +134,7 @@ class RayExecutor:
         ray.kill(self._actors.pop(worker))
 
     def fetch(self, payload: Payload) -> bytes:
-        """Fetch a record into this process.
-
-        Raises:
-            PayloadLostError: if the machine that held it is gone.
-        """
+        """Fetch a record into this process; PayloadLostError if the machine that held it is gone."""
         try:
             data: bytes = ray.get(payload)
         except ray.exceptions.RayError as error:

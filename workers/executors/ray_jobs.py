@@ -31,11 +31,7 @@ class JobServer:
     """Client of the jobs of one cluster, through the HTTP port of its head."""
 
     def __init__(self, address: str) -> None:
-        """Connect to `address`, e.g. `http://head:8265`.
-
-        Raises:
-            BuildError: if Ray's job client is not installed, or the cluster does not answer or wants another token.
-        """
+        """Connect to `address`, e.g. `http://head:8265`."""
         self.address = _parse_url(address)
         try:
             with self._translate_errors():
@@ -46,11 +42,7 @@ class JobServer:
             raise BuildError(f"{error}; give {ADDRESS_HINT}") from error
 
     def submit(self, out: str, command: Sequence[str], runtime_env: Mapping[str, Any]) -> str:
-        """Submit a build of `out`; returns the job's id.
-
-        Raises:
-            BuildError: if one is running already, or the cluster refuses it.
-        """
+        """Submit a build of `out`; returns the job's id."""
         if running := self.find_running(out):
             raise BuildError(
                 f"{out} is being built by job {running} on {self.address}: give --stop to end it, or follow it with "
@@ -81,11 +73,7 @@ class JobServer:
         return next((str(job.submission_id) for job in alive), None)
 
     def follow(self, job: str, write: Callable[[str], object]) -> int:
-        """Pass the job's log to `write` as it grows, until the job ends; returns the exit code of its command.
-
-        Raises:
-            BuildError: if the cluster is out of reach for longer than `UNREACHABLE_S`; the job may be running on.
-        """
+        """Pass the job's log to `write` as it grows, until the job ends; returns the exit code of its command."""
         log, last_answer = IncrementalLog(write), time.monotonic()
         while True:
             try:
@@ -102,11 +90,7 @@ class JobServer:
             time.sleep(_POLL_S)
 
     def stop(self, out: str) -> str | None:
-        """Stop the job that builds `out` and wait for its end; returns its id, or None if there is none.
-
-        Raises:
-            BuildError: if it does not end.
-        """
+        """Stop the job that builds `out` and wait for its end; returns its id, or None if there is none."""
         job = self.find_running(out)
         if job is None:
             return None

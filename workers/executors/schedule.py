@@ -6,27 +6,18 @@ from dataclasses import dataclass, replace
 
 TARGET_CALL_S = 0.5  # duration of a batch of scenes [s]: a call has an overhead of a millisecond
 MAX_BATCH = 64
-MIN_GAIN = 1.25
-"""Pools are resized only for a throughput that is better by this factor, because starting a worker is expensive."""
+MIN_GAIN = 1.25  # pools are resized only for a throughput better by this factor: starting a worker is expensive
 
 
 @dataclass(frozen=True, slots=True)
 class PoolLimits:
-    """Limits of one pool.
+    """Limits of one pool."""
 
-    Attributes:
-        needs: Resources of one worker.
-        min_workers: Workers that always run.
-        max_workers: None for as many as fit.
-        batch: Most scenes in one call.
-        recycle_after: Scenes after which a worker is replaced; 0 for never.
-    """
-
-    needs: Mapping[str, float]
-    min_workers: int = 0
-    max_workers: int | None = None
-    batch: int = MAX_BATCH
-    recycle_after: int = 0
+    needs: Mapping[str, float]  # resources of one worker
+    min_workers: int = 0  # workers that always run
+    max_workers: int | None = None  # None for as many as fit
+    batch: int = MAX_BATCH  # most scenes in one call
+    recycle_after: int = 0  # scenes after which a worker is replaced; 0 for never
 
     def with_cap(self, cap: int | None) -> "PoolLimits":
         """Return the limits with at most `cap` workers, even below the minimum; None for no cap."""
@@ -38,15 +29,10 @@ class PoolLimits:
 
 @dataclass(frozen=True, slots=True)
 class ScheduleLimits:
-    """Limits of the schedule.
-
-    Attributes:
-        pools: Limits of each pool.
-        capacity: Of each resource, for all pools together.
-    """
+    """Limits of the schedule."""
 
     pools: Mapping[str, PoolLimits]
-    capacity: Mapping[str, float]
+    capacity: Mapping[str, float]  # of each resource, for all pools together
 
     def fits(self, sizes: Mapping[str, int]) -> bool:
         """Whether pools of these sizes fit at once."""
@@ -62,19 +48,12 @@ class ScheduleLimits:
 
 @dataclass(frozen=True, slots=True)
 class ReadyScene:
-    """A scene that waits for its next stages.
+    """A scene that waits for its next stages."""
 
-    Attributes:
-        rank: Its rank in the plan.
-        pool: Of the workers that can run them.
-        left: Remaining stages, the next one included.
-        alone: Whether it may not share a call, because it was in one whose worker was lost.
-    """
-
-    rank: int
-    pool: str
-    left: int
-    alone: bool = False
+    rank: int  # its rank in the plan
+    pool: str  # of the workers that can run them
+    left: int  # remaining stages, the next one included
+    alone: bool = False  # whether it may not share a call, because it was in one whose worker was lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +72,9 @@ def compute_min_sizes(limits: ScheduleLimits) -> dict[str, int]:
 def compute_pool_sizes(limits: ScheduleLimits, seconds: Mapping[str, float], now: Mapping[str, int]) -> dict[str, int]:
     """Compute the sizes of the pools for which the slowest pool is as fast as possible.
 
-    Starting from the smallest sizes, the pool that takes longest for a scene gets one more worker until its resources
-    are used up: more workers of another pool would not make the build faster.
-
-    Args:
-        limits: Of the pools; the smallest sizes must fit.
-        seconds: Time of one scene in each pool [s].
-        now: The present sizes, which stay unless others are better by `MIN_GAIN`.
+    Starting from the smallest sizes, which must fit, the pool that takes longest for a scene (`seconds`) gets one more
+    worker until its resources are used up: more workers of another pool would not make the build faster. The sizes of
+    `now` stay unless others are better by `MIN_GAIN`.
     """
     best = compute_min_sizes(limits)
     while True:
@@ -139,14 +114,8 @@ def assign_scenes(
     """Assign waiting scenes to idle workers: in each pool those with the fewest stages left first, in the plan's order.
 
     Together with the bounded number of scenes in flight this is the back-pressure: a pool whose successors are busy
-    gets nothing to do.
-
-    Args:
-        ready: Scenes that wait.
-        idle: Idle workers of each pool.
-        placed: Idle and busy workers of each pool.
-        sizes: Target sizes of the pools; workers beyond them get no work.
-        batches: Most scenes per call of each pool.
+    gets nothing to do. `placed` counts idle and busy workers, of which those beyond the target `sizes` get no work;
+    `batches` are the most scenes per call.
     """
     chosen: list[Assignment] = []
     for pool, queue in sorted(_group_by_pool(ready).items()):
@@ -194,12 +163,7 @@ def find_preemptible(
     """Find an idle worker to retire because scenes wait for a pool whose workers cannot be placed; None for none.
 
     `ScheduleLimits` are sums over a cluster, and a worker must fit on one node: sizes that fit by sums may not fit.
-
-    Args:
-        ready: Scenes that wait.
-        idle: Idle workers of each pool.
-        placed: Idle and busy workers of each pool.
-        overdue: Pools with a worker that has been starting for too long.
+    `placed` counts idle and busy workers; `overdue` are pools with a worker that has been starting for too long.
     """
     wanted = {scene.pool for scene in ready}
     if not any(pool in overdue and not placed.get(pool) for pool in wanted):

@@ -35,9 +35,6 @@ def checkpoint_exported_scenes(
         rows: Of the manifest, in the plan's order.
         fingerprints: Of the stages of each kind of row, by its value.
         scene_ids: Scenes that are done.
-
-    Raises:
-        BuildError: if the disk or the store refuses.
     """
     records, wanted = CheckpointStore(out / CHECKPOINTS), set(scene_ids)
     journals, committed = find_journals(list_names(out / WORK)), committed_shards(out)

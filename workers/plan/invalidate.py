@@ -18,9 +18,6 @@ def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
 
     Returns:
         Number of shards that the next build will write.
-
-    Raises:
-        BuildError: if there is no build, or another process is writing it.
     """
     with create_writer_lock(out / WORK / LOCK) as lock:
         publish_ready(out, out / WORK, lock.check)
@@ -28,11 +25,7 @@ def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
 
 
 def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) -> int:
-    """Invalidate scenes of a locked dataset whose ready shards are published; survives a loss of power.
-
-    Raises:
-        BuildError: if the disk refuses.
-    """
+    """Invalidate scenes of a locked dataset whose ready shards are published; survives a loss of power."""
     shard_of = dict(zip(plan.scene_ids, plan.shards, strict=True))
     by_shard: dict[int, list[str]] = {}
     for scene_id in scene_ids:

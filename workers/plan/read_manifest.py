@@ -24,9 +24,6 @@ def read_manifest(path: StoragePath) -> list[ImageRow]:
 
     An invalid row becomes a rejected one with an id of its own (`invalid-…`), as does a row with a repeated id
     (`duplicate-…`): both are dropped in the dataset at stage `manifest`.
-
-    Raises:
-        InputError: if the file is no Parquet file or lacks a column.
     """
     records = _read_records(path)
     rows: list[ImageRow] = []

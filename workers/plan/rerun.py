@@ -58,11 +58,7 @@ def _find_readers(stages: Sequence[Stage], key: str) -> list[int] | None:
 
 
 def find_restart_points(pipelines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
-    """Find the first stage to recompute of each kind of scene, for `--from SECTION`.
-
-    Raises:
-        BuildError: if no stage has this name.
-    """
+    """Find the first stage to recompute of each kind of scene, for `--from SECTION`."""
     used = {kind.value: stages for kind, stages in pipelines.items() if kind.value in kinds}
     points = {kind: _find_position(stages, section) for kind, stages in used.items()}
     if missing := [kind for kind, position in points.items() if position is None]:
@@ -104,9 +100,6 @@ def check_upstream_unchanged(
         differing: Keys of run.json that differ.
         section: Argument of `--from`.
         suggestion: Earliest affected stage; empty if the whole build is affected.
-
-    Raises:
-        BuildError: naming the difference and the stage that reads it.
     """
     for kind, stages in pipelines.items():
         if kind.value not in points:
@@ -153,11 +146,7 @@ def delete_checkpoints(records: CheckpointStore, plan: Plan, pipelines: Pipeline
 
 
 def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]) -> None:
-    """Write the marker that the scenes are invalidated for this run.json: the same command resumes from here.
-
-    Raises:
-        BuildError: if the disk or the store refuses.
-    """
+    """Write the marker that the scenes are invalidated for this run.json: the same command resumes from here."""
     write_atomic(out / WORK / MARKER, _encode_marker(section, record))
 
 
@@ -180,11 +169,7 @@ def read_rerun_stage(out: StoragePath) -> str:
 
 
 def clear_rerun_marker(out: StoragePath) -> None:
-    """Delete the marker before scenes are invalidated, so that it never belongs to another run.json.
-
-    Raises:
-        BuildError: if the disk or the store refuses.
-    """
+    """Delete the marker before scenes are invalidated, so that it never belongs to another run.json."""
     remove(out / WORK / MARKER)
 
 

@@ -40,11 +40,7 @@ AGAIN_OPTION = "--again"  # option of `tableverse trajectories` that recomputes 
 
 
 def check_output_dir(out: StoragePath) -> None:
-    """Refuse a folder with other content.
-
-    Raises:
-        BuildError: naming the content.
-    """
+    """Refuse a folder with other content."""
     if out.is_file():
         raise BuildError(f"{out} is a file: give a folder for the dataset")
     names = list_names(out)
@@ -63,23 +59,12 @@ def start_or_resume(
     guard: Callable[[], None] = lambda: None,
     base: Mapping[str, Any] | None = None,
 ) -> Plan:
-    """Start a build, or check that it may resume the one in `out`.
+    """Start a build, or check that it may resume the one in `out`, whose lock is held.
 
     Stages that were added at the end of the pipelines since are computed for the scenes that are done without them.
-
-    Args:
-        out: The dataset, locked.
-        rows: Of the manifest.
-        pipelines: Stages of each kind of row.
-        config: Of the build.
-        recorded: Inputs besides the manifest and the configuration.
-        section: Of the first stage to recompute; None to resume. A recomputation that is under way from this stage
-            with this configuration is resumed.
-        guard: Called before scenes are invalidated; raises if this process is no longer the writer.
-        base: run.json, if the rows were restored from the dataset itself: only added stages may differ.
-
-    Raises:
-        BuildError: if `out` holds another build, or no stage has this name.
+    `section` is of the first stage to recompute; a recomputation that is under way from it with this configuration is
+    resumed. `guard` raises if this process is no longer the writer. `base` is run.json, if the rows were restored from
+    the dataset itself: only added stages may differ then.
     """
     plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
     fingerprints = {

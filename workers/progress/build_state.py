@@ -37,24 +37,19 @@ class SceneStatus:
     """A scene that is accounted for.
 
     Attributes:
-        stage: The last stage that ran.
-        why: Reason of a drop or kind of a failure; empty if it is done.
-        detail: One line of explanation.
         timings: Of the stages that ran in the build that finished it: (stage, CPU [s], wall [s]).
-        tar_bytes: Size of its files in the shard; None if no shard holds them yet.
-        costs: Of the answers of its models, by role.
     """
 
     scene_id: str
     status: Status
-    stage: str
-    why: str
-    detail: str
+    stage: str  # the last stage that ran
+    why: str  # reason of a drop or kind of a failure; empty if it is done
+    detail: str  # one line of explanation
     attempts: int
     shard: int
     timings: tuple[tuple[str, float, float], ...]
-    tar_bytes: int | None
-    costs: Mapping[str, ModelCost]
+    tar_bytes: int | None  # size of its files in the shard; None if no shard holds them yet
+    costs: Mapping[str, ModelCost]  # of the answers of its models, by role
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,23 +65,14 @@ class StageCost:
 
 @dataclass(frozen=True, slots=True)
 class BuildState:
-    """Snapshot of a build.
+    """Snapshot of a build."""
 
-    Attributes:
-        total: Scenes of the plan.
-        shards: Shards of the plan.
-        committed: Shards that are whole.
-        published: Numbers of the shards in OUT, also of those with scenes to recompute.
-        fingerprint: Of the configuration and the inputs.
-        scenes: All scenes that are accounted for.
-    """
-
-    total: int
-    shards: int
-    committed: int
-    published: tuple[int, ...]
-    fingerprint: str
-    scenes: tuple[SceneStatus, ...]
+    total: int  # scenes of the plan
+    shards: int  # shards of the plan
+    committed: int  # shards that are whole
+    published: tuple[int, ...]  # numbers of the shards in OUT, also of those with scenes to recompute
+    fingerprint: str  # of the configuration and the inputs
+    scenes: tuple[SceneStatus, ...]  # all scenes that are accounted for
 
     @property
     def done(self) -> int:
@@ -126,11 +112,7 @@ class BuildState:
 
 
 def read_build_state(out: StoragePath) -> BuildState:
-    """Read the state of the build in `out`; safe while it runs.
-
-    Raises:
-        BuildError: if there is no build, or a committed shard has lost a file.
-    """
+    """Read the state of the build in `out`; safe while it runs."""
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     published = committed_shards(out)
     check_files(out, published)

@@ -18,19 +18,12 @@ MANIFEST_STAGE = "manifest"
 
 @dataclass(slots=True)
 class _OpenShard:
-    """An open shard as far as its journal was read.
+    """An open shard as far as its journal was read."""
 
-    Attributes:
-        end: Position of the next frame [bytes].
-        scenes: Latest status of each scene.
-        reopened: Scenes whose committed result is void.
-        merged: Whether `scenes` contains the valid committed results.
-    """
-
-    end: int = 0
-    scenes: dict[str, SceneStatus] = field(default_factory=dict)
-    reopened: set[str] = field(default_factory=set)
-    merged: bool = False
+    end: int = 0  # position of the next frame [bytes]
+    scenes: dict[str, SceneStatus] = field(default_factory=dict)  # latest status of each scene
+    reopened: set[str] = field(default_factory=set)  # scenes whose committed result is void
+    merged: bool = False  # whether `scenes` contains the valid committed results
 
 
 class BuildFollower:
@@ -43,11 +36,7 @@ class BuildFollower:
     """
 
     def __init__(self, out: StoragePath) -> None:
-        """Read the plan.
-
-        Raises:
-            BuildError: if there is no build.
-        """
+        """Read the plan."""
         self._out = out
         read_run(out / "run.json")
         plan = read_plan(out / "plan.parquet")
@@ -57,11 +46,7 @@ class BuildFollower:
         self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
 
     def read_tally(self) -> Tally:
-        """Count the scenes; queued and running ones are unknown outside the build.
-
-        Raises:
-            BuildError: if a table is damaged.
-        """
+        """Count the scenes; queued and running ones are unknown outside the build."""
         journals = find_journals(list_names(self._out / WORK))
         if self._has_reopened(journals):
             self._whole.clear()

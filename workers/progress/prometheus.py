@@ -25,8 +25,7 @@ from workers.progress.eta import ProgressRate
 from workers.progress.tally import BOUNDS_S, Durations, Tally
 
 WRITE_EVERY_S = 5.0
-BUCKETS = tuple(number for number in range(len(BOUNDS_S)) if number % 10 in (0, 3, 7))
-"""Indices of the exported bounds: 1, 2 and 5 of every decade."""
+BUCKETS = tuple(n for n in range(len(BOUNDS_S)) if n % 10 in (0, 3, 7))  # of exported bounds: 1, 2, 5 per decade
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +80,8 @@ def collect_samples(
 ) -> Iterator[Sample]:
     """Collect the samples of all metrics, those of one metric together.
 
-    Args:
-        tally: The counts.
-        left_s: Estimated time to the end [s]; None if unknown.
-        updated: Unix time of now.
-        progress: Unix time at which the last stage ended.
-        running: Whether the build runs.
+    `left_s` is the estimated time to the end [s], None if unknown; `updated` and `progress` are the Unix times of now
+    and of the end of the last stage.
     """
     yield from (
         Sample(RUNNING, (), float(running)),
@@ -135,11 +130,7 @@ class MetricsFile:
         self._written = -math.inf
 
     def __enter__(self) -> "MetricsFile":
-        """Test the folder, so that a wrong one is reported before the build starts.
-
-        Raises:
-            InputError: if nothing can be written there.
-        """
+        """Test the folder, so that a wrong one is reported before the build starts."""
         if re.match(r"[a-z0-9]+:/", str(self._path)):
             raise InputError(f"--metrics {self._path}: give a file on this machine, where node_exporter finds it")
         try:

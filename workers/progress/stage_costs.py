@@ -34,9 +34,6 @@ def collect_measurements(out: StoragePath, pool_of: Mapping[str, str]) -> BuildS
     Args:
         out: The dataset.
         pool_of: Pool of every stage.
-
-    Raises:
-        BuildError: if there is no build, or a table is damaged.
     """
     run, plan, state = read_run(out / "run.json"), read_plan(out / "plan.parquet"), read_build_state(out)
     scenes = {scene.scene_id: scene for scene in state.scenes}

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 from schemas.work import Status
 
 _STEPS = (1.0, 1.25, 1.6, 2.0, 2.5, 3.15, 4.0, 5.0, 6.3, 8.0)
+# upper bounds of the buckets of a duration [s]: ten per decade (Renard series R10), from 1 ms to 8,000 s
 BOUNDS_S = tuple(float(f"{step}e{power}") for power in range(-3, 4) for step in _STEPS)
-"""Upper bounds of the buckets of a duration [s]: ten per decade (Renard series R10), from 1 ms to 8,000 s."""
 
 
 class Actors(NamedTuple):
@@ -23,15 +23,10 @@ class Actors(NamedTuple):
 
 @dataclass(slots=True)
 class Durations:
-    """Histogram of the durations of calls, in fixed buckets.
-
-    Attributes:
-        buckets: Calls per bucket; bucket i ends with `BOUNDS_S[i]`, the last one has no end.
-        total_s: Sum of all durations [s].
-    """
+    """Histogram of the durations of calls; bucket i ends with `BOUNDS_S[i]`, the last one has no end."""
 
     buckets: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS_S) + 1))
-    total_s: float = 0.0
+    total_s: float = 0.0  # sum of all durations [s]
 
     def add(self, seconds: float) -> None:
         """Count one call."""
@@ -63,51 +58,27 @@ class Durations:
         return 0.0
 
 
-def _make_durations() -> defaultdict[str, Durations]:
-    return defaultdict(Durations)
-
-
 @dataclass(slots=True)
 class Tally:
-    """Counts of a running build.
+    """Counts of a running build; those without another word are of this run."""
 
-    Attributes:
-        stages: Names of all stages, in the order of the pipelines.
-        total: Scenes of the plan.
-        before: Scenes that were accounted for at the start of this run.
-        shards: All shards.
-        aim: Scenes that will be accounted for when this run ends; None for all of the plan.
-        committed: Shards that are whole.
-        bytes_committed: Bytes of the shards that this run committed.
-        losses: Lost workers and inputs of this run.
-        restarts: Workers started in place of a lost or recycled one.
-        postponed: Scenes left for a later run because a model did not answer.
-        queued: Waiting scenes, by their next stage.
-        running: Calls in flight, by their first stage; a call may run several.
-        passed: Scenes that passed a stage in this run, by stage.
-        ended: Scenes that ended in this run, by stage and status.
-        actors: Workers by pool.
-        wall: Wall time of the calls of this run, by stage.
-        cpu: CPU time of the calls of this run, by stage.
-    """
-
-    stages: tuple[str, ...]
-    total: int
-    before: int
-    shards: int
-    target: int | None = None
-    committed: int = 0
-    bytes_committed: int = 0
-    losses: int = 0
-    restarts: int = 0
-    postponed: int = 0
-    queued: Counter[str] = field(default_factory=Counter)
-    running: Counter[str] = field(default_factory=Counter)
-    passed: Counter[str] = field(default_factory=Counter)
-    ended: Counter[tuple[str, Status]] = field(default_factory=Counter)
-    actors: dict[str, Actors] = field(default_factory=dict)
-    wall: defaultdict[str, Durations] = field(default_factory=_make_durations)
-    cpu: defaultdict[str, Durations] = field(default_factory=_make_durations)
+    stages: tuple[str, ...]  # in the order of the pipelines
+    total: int  # scenes of the plan
+    before: int  # scenes that were accounted for at the start of this run
+    shards: int  # of the plan
+    target: int | None = None  # scenes that will be accounted for when this run ends; None for all of the plan
+    committed: int = 0  # shards that are whole
+    bytes_committed: int = 0  # bytes of the shards that this run committed
+    losses: int = 0  # lost workers and inputs of this run
+    restarts: int = 0  # workers started in place of a lost or recycled one
+    postponed: int = 0  # scenes left for a later run because a model did not answer
+    queued: Counter[str] = field(default_factory=Counter)  # waiting scenes, by their next stage
+    running: Counter[str] = field(default_factory=Counter)  # calls in flight, by their first stage of several
+    passed: Counter[str] = field(default_factory=Counter)  # scenes that passed a stage, by stage
+    ended: Counter[tuple[str, Status]] = field(default_factory=Counter)  # scenes, by stage and status
+    actors: dict[str, Actors] = field(default_factory=dict)  # workers by pool
+    wall: defaultdict[str, Durations] = field(default_factory=lambda: defaultdict(Durations))  # of calls, by stage
+    cpu: defaultdict[str, Durations] = field(default_factory=lambda: defaultdict(Durations))
 
     def record_call(self, stage: str, cpu_s: float, wall_s: float) -> None:
         """Count the durations of one call of a stage [s]."""

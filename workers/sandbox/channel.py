@@ -23,11 +23,7 @@ class Channel:
         self._buffer = bytearray()
 
     def send(self, *messages: bytes) -> None:
-        """Send a frame for each message; small ones in one system call.
-
-        Raises:
-            ChannelClosedError: if the other end is gone.
-        """
+        """Send a frame for each message, small ones in one system call; ChannelClosedError if the other end is gone."""
         pending = bytearray()
         try:
             for message in messages:
@@ -44,11 +40,7 @@ class Channel:
             raise ChannelClosedError from error
 
     def receive(self) -> bytes:
-        """Receive the next message.
-
-        Raises:
-            ChannelClosedError: at the end of the stream, or if it is damaged.
-        """
+        """Receive the next message; ChannelClosedError at the end of the stream, or if it is damaged."""
         try:
             return read_frame(self._receive_exactly)[1]
         except FrameError as error:
@@ -57,8 +49,7 @@ class Channel:
     def wait(self, until: float, watch: Callable[[], None]) -> bool:
         """Wait for a message until the monotonic time `until`, calling `watch` every few milliseconds.
 
-        Returns:
-            Whether there is something to receive; also True if the other end is gone.
+        True if there is something to receive, or the other end is gone.
         """
         if self._buffer:
             return True

@@ -62,11 +62,7 @@ class StageRunner:
     """Runner of any stage of the pipelines, in this process and on one thread."""
 
     def __init__(self, setup: SandboxSetup) -> None:
-        """Import the pipelines and create the services.
-
-        Raises:
-            BuildError: if the pipeline is not there.
-        """
+        """Import the pipelines and create the services."""
         self._pipelines = load_pipelines(setup.pipeline)
         self._config = Config.model_validate_json(setup.config_json)
         folder = parse_path(setup.records_dir)
@@ -76,11 +72,7 @@ class StageRunner:
         self._records = CheckpointStore(folder)
 
     def run_chain(self, chain: StageChain, item: bytes, send: Callable[..., None]) -> None:
-        """Run stages until one is not done, and report each after its checkpoint is written.
-
-        Raises:
-            BuildError: if a checkpoint cannot be written.
-        """
+        """Run stages until one is not done, and report each after its checkpoint is written."""
         if chain.input_record:
             checkpoint = self._records.read(chain.input_record)
             if checkpoint is None:
@@ -127,11 +119,7 @@ class StageRunner:
 
 
 def load_pipelines(reference: str) -> Pipelines:
-    """Load the pipelines at `module:attribute`.
-
-    Raises:
-        BuildError: if there is no such module or attribute.
-    """
+    """Load the pipelines at `module:attribute`."""
     module, _, attribute = reference.partition(":")
     try:
         pipelines: Pipelines = getattr(importlib.import_module(module), attribute)

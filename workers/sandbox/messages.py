@@ -16,15 +16,10 @@ _N_NUMBERS = 3 + 2 * len(astuple(NO_COST))
 
 @dataclass(frozen=True, slots=True)
 class StageDone:
-    """A stage is done.
-
-    Attributes:
-        report: Its report.
-        cpu_s: CPU time of the process so far [s].
-    """
+    """A stage is done."""
 
     report: StageReport
-    cpu_s: float
+    cpu_s: float  # CPU time of the process so far [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +46,7 @@ def encode_message(message: SandboxMessage) -> bytes:
 
 
 def decode_message(data: bytes) -> SandboxMessage:
-    """Decode a message.
-
-    Raises:
-        ValueError: if the bytes are not a valid sandbox message.
-    """
+    """Decode a message."""
     kind, rest = data[:1], data[1:]
     if kind == _NO_INPUT:
         return InputMissing()

@@ -23,8 +23,7 @@ from workers.sandbox.channel import Channel, ChannelClosedError
 from workers.sandbox.messages import InputMissing, StageDone, decode_message
 from workers.sandbox.retries import ChainRun, ChildResult, may_retry
 
-START_TIMEOUT_S = 180.0
-"""Timeout for a child to import the pipeline [s]."""
+START_TIMEOUT_S = 180.0  # timeout for a child to import the pipeline [s]
 _MB = 1_000_000
 _TRACE_CHARS = 4000
 _STDERR_TAIL_BYTES = 64 * 1024
@@ -48,21 +47,12 @@ class Sandbox:
     def run(
         self, chain: StageChain, item: bytes, watch: Callable[[], None] = lambda: None
     ) -> tuple[StageChainReport, bytes]:
-        """Run a chain of stages on one scene until one of them is not done.
+        """Run a chain of stages on one scene until one of them is not done; returns the reports and the last output.
 
         A stage that crashes, hangs or takes too much memory is repeated in a new child as often as the setup allows,
-        from the checkpoint of the stage before it.
-
-        Args:
-            chain: The stages and their scene.
-            item: The encoded input; ignored if the chain names a checkpoint.
-            watch: Called every few milliseconds; an exception of it ends the call and the child.
-
-        Returns:
-            The reports, and the encoded output of the last stage (empty unless it is done).
-
-        Raises:
-            BuildError: if no child can be started, or it cannot write.
+        from the checkpoint of the stage before it. `item` is the encoded input, ignored if the chain names a
+        checkpoint; the output is empty unless all is done. `watch` is called every few milliseconds; an exception of it
+        ends the call and the child.
         """
         run = ChainRun(chain, self._setup.attempts)
         while True:

@@ -6,25 +6,17 @@ from dataclasses import dataclass, field, replace
 from schemas.outcome import Allowance, Failed
 from schemas.work import StageChain, StageChainReport, StageReport
 
-MAX_KILLS = 3
-"""Times that a child may be killed from outside during one chain before the chain fails."""
+MAX_KILLS = 3  # times that a child may be killed from outside during one chain before the chain fails
 
 
 @dataclass(slots=True)
 class ChildResult:
-    """Result of a child for a chain, or for the rest of one.
+    """Result of a child for a chain, or for the rest of one."""
 
-    Attributes:
-        reports: Of the stages that ended.
-        value: The output of the last one, if all are done.
-        killed: Whether the child was killed from outside.
-        input_lost: Whether the checkpoint that is the input was missing.
-    """
-
-    reports: list[StageReport] = field(default_factory=list)
-    value: bytes = b""
-    killed: bool = False
-    input_lost: bool = False
+    reports: list[StageReport] = field(default_factory=list)  # of the stages that ended
+    value: bytes = b""  # the output of the last one, if all are done
+    killed: bool = False  # whether the child was killed from outside
+    input_lost: bool = False  # whether the checkpoint that is the input was missing
 
 
 class ChainRun:

@@ -46,11 +46,7 @@ def decode_checkpoint(framed: bytes) -> bytes | None:
 
 
 def append_checkpoint(descriptor: int, framed: bytes) -> None:
-    """Append a frame to a pack.
-
-    Raises:
-        OSError: if the disk is full or refuses.
-    """
+    """Append a frame to a pack."""
     left = memoryview(framed)
     while left:
         left = left[os.write(descriptor, left) :]
@@ -69,11 +65,7 @@ def scan_pack(pack: Path) -> Iterator[tuple[str, FrameSpan]]:
 
 
 def read_packed_checkpoint(pack: Path, start: int) -> bytes | None:
-    """Read the record in the frame at `start`; None if it is damaged.
-
-    Raises:
-        FileNotFoundError: if there is no such pack.
-    """
+    """Read the record in the frame at `start`; None if it is damaged, FileNotFoundError if there is no such pack."""
     with pack.open("rb") as file:
         file.seek(start)
         try:

@@ -44,8 +44,7 @@ from workers.state.checkpoint_pack import (
 )
 
 CHECKPOINTS = ".stages"
-TOMBSTONE_PREFIX = b"tableverse-at-rest-1 "
-"""Begins a checkpoint that stands for what the committed shard holds of the scene whose id follows."""
+TOMBSTONE_PREFIX = b"tableverse-at-rest-1 "  # before the id of a scene that the committed shard holds
 
 _KEY_CHARS = 16
 _OPEN_PACKS = 2
@@ -55,10 +54,7 @@ _PACK = ".pack"
 def fingerprint_stages(stages: Sequence[Stage], config: Config, recorded: Mapping[str, object]) -> dict[str, str]:
     """Hash everything that decides the output of each stage besides its input.
 
-    Args:
-        stages: Of a pipeline, in order.
-        config: Of the build.
-        recorded: What stages read besides their input and the configuration, by stage.
+    `recorded` is what stages read besides their input and the configuration, by stage.
     """
     return {
         stage.name: content_hash(
@@ -71,10 +67,7 @@ def fingerprint_stages(stages: Sequence[Stage], config: Config, recorded: Mappin
 def name_checkpoints(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> tuple[str, ...]:
     """Name the checkpoint of each stage for a row; empty for the last, whose output is the scene's result.
 
-    Args:
-        shard: Of the scene.
-        row: Of the manifest.
-        fingerprints: Of the pipeline's stages, in order.
+    `fingerprints` are of the pipeline's stages, in order.
     """
     key = content_hash(row.model_dump_json().encode())
     names = []
@@ -91,15 +84,10 @@ def name_cost_checkpoint(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointRef:
-    """Where a checkpoint lies.
+    """Where a checkpoint lies."""
 
-    Attributes:
-        location: Argument of `CheckpointStore.read`.
-        size: Stored bytes, compressed.
-    """
-
-    location: str
-    size: int
+    location: str  # argument of `CheckpointStore.read`
+    size: int  # stored bytes, compressed
 
 
 class CheckpointStore:
@@ -124,11 +112,7 @@ class CheckpointStore:
         }
 
     def read(self, location: str) -> bytes | None:
-        """Read the record at a location of `index`, or of a name; None if it is gone or damaged.
-
-        Raises:
-            BuildError: if the disk or the store refuses, or the committed shard that holds it is damaged.
-        """
+        """Read the record at a location of `index`, or of a name; None if it is gone or damaged."""
         record = self._read_stored(location)
         if record is None or not record.startswith(TOMBSTONE_PREFIX):
             return record
@@ -157,11 +141,7 @@ class CheckpointStore:
             raise BuildError(f"cannot read {self._folder / location}: {error.strerror or error}") from error
 
     def write(self, name: str, record: bytes) -> None:
-        """Write a checkpoint.
-
-        Raises:
-            BuildError: if the disk is full or refuses.
-        """
+        """Write a checkpoint."""
         folder, _, short = name.rpartition("/")
         framed = encode_checkpoint(short, record)
         if isinstance(self._folder, UPath):
@@ -173,11 +153,7 @@ class CheckpointStore:
             raise make_write_error(self._folder / folder, error) from error
 
     def delete(self, shard: int, stages: Collection[str] | None = None) -> None:
-        """Delete the checkpoints of a shard, or of some of its stages.
-
-        Raises:
-            BuildError: if the disk refuses.
-        """
+        """Delete the checkpoints of a shard, or of some of its stages."""
         folder = self._folder / shard_stem(shard)
         if stages is None:
             remove_folder(folder)

@@ -44,8 +44,7 @@ from tableverse_factory.dataset.shards import (
 from tableverse_factory.dataset.trajectory_files import add_digests
 
 STAGING, READY = ".staging", ".ready"
-_WITHOUT = "without "
-"""Precedes, in the ready file, a folder for which the shard has no rows, so that an older file is removed."""
+_WITHOUT = "without "  # in the ready file before a folder for which the shard has no rows: an older file goes
 
 SceneRows = dict[str, list[dict[str, Any]]]  # the rows of one scene in each table
 
@@ -54,11 +53,7 @@ class CommittedShard:
     """A shard as committed, for the scenes that stay as they are when others of it are recomputed."""
 
     def __init__(self, out: StoragePath, number: int) -> None:
-        """Read the shard's tables.
-
-        Raises:
-            BuildError: if one is missing or unreadable.
-        """
+        """Read the shard's tables."""
         self._tar_path = shard_path(out, "mjcf", number)
         self._tar: BinaryIO | None = None
         self._rows: dict[str, SceneRows] = {}
@@ -124,9 +119,6 @@ def commit_shard(
 
     Returns:
         Bytes of the scenes and the tables.
-
-    Raises:
-        BuildError: if the disk is full, or it or the store refuses; the dataset is as before then.
     """
     staging = _staging(work, number)
     remove_folder(staging)
@@ -145,9 +137,6 @@ def publish_ready(out: StoragePath, work: StoragePath, guard: Callable[[], None]
         out: The dataset.
         work: Folder of the work in progress.
         guard: See `commit_shard`.
-
-    Raises:
-        BuildError: if the disk or the store refuses.
     """
     names = list_names(work)
     abort_uploads(out)

@@ -35,11 +35,7 @@ class CostLog:
         self._descriptor = -1
 
     def add(self, cost: ModelCost) -> None:
-        """Append an entry.
-
-        Raises:
-            ModelAccessError: if the disk or the store refuses: uncounted requests must not be sent.
-        """
+        """Append an entry; ModelAccessError if the disk or the store refuses: uncounted requests must not be sent."""
         entry = f"{self.grant}_{cost.calls}_{cost.input_tokens}_{cost.output_tokens}_{cost.usd!r}_"
         try:
             if isinstance(self._folder, UPath):
@@ -60,20 +56,12 @@ class CostLog:
 
 
 def sum_costs(out: StoragePath) -> ModelCost:
-    """Sum the entries of all processes.
-
-    Raises:
-        BuildError: if the log cannot be read.
-    """
+    """Sum the entries of all processes."""
     return sum(sum_costs_by_grant(out).values(), NO_COST)
 
 
 def sum_costs_by_grant(out: StoragePath) -> dict[str, ModelCost]:
-    """Sum the entries of all processes by the allowance that was spent; torn entries do not count.
-
-    Raises:
-        BuildError: if the log cannot be read.
-    """
+    """Sum the entries of all processes by the allowance that was spent; torn entries do not count."""
     folder = out / FOLDER
     names = list_names(folder)
     if isinstance(folder, UPath):

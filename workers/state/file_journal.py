@@ -15,11 +15,7 @@ class FileJournal(Journal):
     """Journal file, in which a recorded result survives a kill."""
 
     def __init__(self, path: Path) -> None:
-        """Open or create the journal and cut off a torn last frame.
-
-        Raises:
-            BuildError: if the disk refuses.
-        """
+        """Open or create the journal and cut off a torn last frame."""
         state = read_file_journal(path)
         super().__init__(state)
         self._path, self._end = path, state.end

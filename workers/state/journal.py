@@ -16,30 +16,17 @@ _NAME = re.compile(rf"shard-(\d{{5,9}}){re.escape(SUFFIX)}")
 
 
 def open_journal(path: StoragePath) -> Journal:
-    """Open or create a journal.
-
-    Raises:
-        BuildError: if the disk or the store refuses.
-    """
+    """Open or create a journal."""
     return ObjectJournal(path) if isinstance(path, UPath) else FileJournal(path)
 
 
 def read_journal(path: StoragePath, start: int = 0) -> JournalState:
-    """Read a journal without changing it; a missing one is empty.
-
-    Args:
-        path: Of the journal.
-        start: Where to begin: 0, or the `end` of an earlier read [bytes].
-    """
+    """Read a journal from `start` [bytes], 0 or an earlier end, without changing it; a missing one is empty."""
     return read_object_journal(path, start) if isinstance(path, UPath) else read_file_journal(path, start)
 
 
 def read_result(path: StoragePath, entry: JournalEntry) -> SceneResult:
-    """Read the result at `entry`.
-
-    Raises:
-        FileNotFoundError: if the journal is gone, because its shard was committed.
-    """
+    """Read the result at `entry`; FileNotFoundError if the journal is gone, because its shard was committed."""
     return read_object_result(path, entry) if isinstance(path, UPath) else read_file_result(path, entry)
 
 

@@ -17,15 +17,11 @@ RESULT, REOPEN = b"+", b"-"  # first byte of a frame's label; the scene id follo
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """Position of a scene's encoded result in its journal [bytes].
-
-    Attributes:
-        segment: Start of the object that holds it; 0 if the journal is one file.
-    """
+    """Position of a scene's encoded result in its journal [bytes]."""
 
     offset: int
     size: int
-    segment: int = 0
+    segment: int = 0  # start of the object that holds it; 0 if the journal is one file
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,19 +35,12 @@ class JournalFrame:
 
 @dataclass(frozen=True, slots=True)
 class JournalState:
-    """Content of a journal.
+    """Content of a journal."""
 
-    Attributes:
-        results: The latest result of each scene.
-        reopened: Scenes that were taken back; each needs a result here before its shard can be written again.
-        end: End of the last whole frame [bytes].
-        lost: Bytes that hold no whole frame: torn by a kill, or damaged on the disk.
-    """
-
-    results: dict[str, JournalEntry]
-    reopened: frozenset[str]
-    end: int
-    lost: int = 0
+    results: dict[str, JournalEntry]  # the latest result of each scene
+    reopened: frozenset[str]  # scenes that were taken back: each needs a result before its shard can be written
+    end: int  # end of the last whole frame [bytes]
+    lost: int = 0  # bytes that hold no whole frame: torn by a kill, or damaged on the disk
 
 
 EMPTY_JOURNAL = JournalState({}, frozenset(), 0)
@@ -104,10 +93,7 @@ class Journal(ABC):
 def scan_journal(stream: BinaryIO, start: int, base: int = 0) -> Iterator[JournalFrame]:
     """Read the whole frames of a file or object, up to the first that is torn.
 
-    Args:
-        stream: Holds the frames.
-        start: Where to begin in the stream [bytes].
-        base: Where the stream begins in the journal, which is its `JournalEntry.segment` [bytes].
+    `base` is where the stream begins in the journal, its `JournalEntry.segment` [bytes].
     """
     for span in scan_frames(stream, start):
         yield JournalFrame(span.label[:1], span.label[1:].decode(), JournalEntry(base + span.offset, span.size, base))

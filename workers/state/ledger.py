@@ -33,17 +33,10 @@ class Ledger:
         guard: Callable[[], None] = lambda: None,
         post_export: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
-        """Repair what a kill left, and commit shards that were complete.
+        """Repair what a kill left, and commit shards that were complete; `rows` are in the plan's order.
 
-        Args:
-            out: The dataset.
-            plan: Of the build.
-            rows: Of the manifest, in the plan's order.
-            guard: Called before anything is written; raises if this process is no longer the writer.
-            post_export: Tables that each post-export stage writes (`tableverse_factory.stage.post_export_tables`).
-
-        Raises:
-            BuildError: if the disk is full, it or the store refuses, or a committed shard has lost a file.
+        `guard` is called before anything is written and raises if this process is no longer the writer; `post_export`
+        has the tables that each post-export stage writes.
         """
         self._guard, self._post_export = guard, post_export or {}
         self.bytes_committed = 0
@@ -75,11 +68,7 @@ class Ledger:
         return self._plan.n_shards - len(self._missing)
 
     def record(self, result: SceneResult) -> bool:
-        """Record a scene's result, and commit its shard if it was the last one missing.
-
-        Raises:
-            BuildError: if the disk is full or refuses; nothing recorded earlier is lost.
-        """
+        """Record a scene's result, and commit its shard if it was the last one missing."""
         shard = self.shard_of(result.scene_id)
         self._guard()
         if shard not in self._journals:
@@ -92,21 +81,13 @@ class Ledger:
         return complete
 
     def tick(self) -> None:
-        """Write results that have waited long enough; called several times a second.
-
-        Raises:
-            BuildError: as `record`.
-        """
+        """Write results that have waited long enough; called several times a second."""
         self._guard()
         for journal in self._journals.values():
             journal.tick()
 
     def close(self) -> None:
-        """Close the journals, which stay.
-
-        Raises:
-            BuildError: as `record`.
-        """
+        """Close the journals, which stay."""
         self._guard()
         for journal in self._journals.values():
             journal.close()

@@ -14,11 +14,7 @@ LOCK = "lock"  # its name in the folder of the work
 
 
 class WriterLock(Protocol):
-    """Lock held while the block lasts.
-
-    Raises:
-        BuildError: on entry, naming the process that holds it.
-    """
+    """Lock held while the block lasts."""
 
     def __enter__(self) -> Self: ...
 
@@ -27,20 +23,11 @@ class WriterLock(Protocol):
     ) -> None: ...
 
     def check(self) -> None:
-        """Check the lock before anything is written.
-
-        Raises:
-            BuildError: if it was lost in the meantime.
-        """
+        """Check the lock before anything is written."""
 
 
 def create_writer_lock(path: StoragePath, note: Callable[[str], None] | None = None) -> WriterLock:
-    """Create the lock at `path` without taking it.
-
-    Args:
-        path: Of the lock.
-        note: Called once with a message if taking the lock means to wait.
-    """
+    """Create the lock at `path` without taking it; `note` gets one message if taking it means to wait."""
     return Lease(path, note) if isinstance(path, UPath) else FileLock(path)
 
 

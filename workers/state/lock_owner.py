@@ -14,17 +14,12 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 @dataclass(frozen=True, slots=True)
 class LockOwner:
-    """A process.
-
-    Attributes:
-        pid_namespace: Boot and process namespace within which `pid` is unique; empty if unknown.
-        started: Start time in kernel ticks, since process ids are reused.
-    """
+    """A process."""
 
     pid: int
     host: str
-    pid_namespace: str = ""
-    started: int = 0
+    pid_namespace: str = ""  # boot and process namespace within which `pid` is unique; empty if unknown
+    started: int = 0  # start time in kernel ticks, since process ids are reused
 
     @property
     def is_dead(self) -> bool:

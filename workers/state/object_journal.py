@@ -40,11 +40,7 @@ class ObjectJournal(Journal):
     """Journal in a store, which buffers results."""
 
     def __init__(self, folder: UPath) -> None:
-        """Read the journal; the first result creates the first object.
-
-        Raises:
-            StoreError: if the store refuses or does not answer.
-        """
+        """Read the journal; the first result creates the first object."""
         state = read_object_journal(folder)
         super().__init__(state)
         self._folder, self._start = folder, state.end
