@@ -45,13 +45,12 @@ _EXPLANATIONS = {
 }
 
 
-PERTURBATION_NAMES = {
+PERTURBATION_NAMES = {  # of `robotics.execution.perturbations`
     "friction_halved": "half friction",
     "friction_doubled": "double friction",
     "mass_minus_30": "−30 % mass",
     "mass_plus_30": "+30 % mass",
 }
-"""Names of `robotics.execution.perturbations`."""
 
 
 def format_millimetres(metres: float | None) -> str:

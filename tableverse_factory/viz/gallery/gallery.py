@@ -6,7 +6,6 @@ text, and ids are checked before they become file names.
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -30,9 +29,8 @@ from tableverse_factory.viz.gallery.search_index import FILE_NAME, LOST_PAGE_SIZ
 
 PAGE_SIZE = 24
 
-DRAW_ALL_LIMIT, FILMS_PER_SCENE, SAMPLE_SIZE = 60, 6, 6
-"""By default, all scenes are drawn up to this number, with this many films each; of more scenes, a sample of this size.
-A scene takes some four CPU seconds, a film three."""
+DRAW_ALL_LIMIT, FILMS_PER_SCENE = 60, 6  # all scenes up to this number are drawn, some 4 CPU s each, a film 3
+SAMPLE_SIZE = 6  # of more scenes
 
 STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))  # stages of the funnel, in order
 
@@ -40,27 +38,14 @@ _STATIC = ("gallery.css", "gallery.js")
 _CHUNK = 4  # scenes per task of a process when most are not drawn, which takes some hundredths of a second each
 
 
-@dataclass(frozen=True, slots=True)
-class GalleryOptions:
-    """Amount of drawing; every scene has a page and a small picture in any case.
-
-    Attributes:
-        renders: Number of scenes drawn from every side, the first ones.
-        films: Most films per drawn scene.
-    """
-
-    renders: int
-    films: int
-
-
-def choose_options(n_done: int, renders: int | None = None, films: int | None = None) -> GalleryOptions:
-    """Fill in the defaults: everything of few scenes; of many, the first ones without films."""
+def choose_amounts(n_done: int, renders: int | None = None, films: int | None = None) -> tuple[int, int]:
+    """Fill in how many scenes are drawn from every side, and films of each: all of few scenes, of many no films."""
     few = n_done <= DRAW_ALL_LIMIT
     if renders is None:
         renders = n_done if few else SAMPLE_SIZE
     if films is None:
         films = FILMS_PER_SCENE if few else 0
-    return GalleryOptions(renders, films)
+    return renders, films
 
 
 def write_gallery(
@@ -76,7 +61,7 @@ def write_gallery(
 
     The dataset is only read; only committed shards are shown. `dest` may be new, empty, or an earlier gallery with
     nothing else in it, which is replaced once the new one is complete. The first `renders` scenes are drawn from every
-    side, with at most `films` films each (defaults: `choose_options`); `progress` gets the numbers of drawn and of all
+    side, with at most `films` films each (defaults: `choose_amounts`); `progress` gets the numbers of drawn and of all
     scenes. `robot` is the arm of recordings of other robots than ours: a file, or `menagerie:NAME`.
     """
     root = find_local_folder(dataset.path)
@@ -87,12 +72,12 @@ def write_gallery(
         for name in ("scenes", "pictures"):
             (folder / name).mkdir(parents=True)
         records = read_records(dataset)
-        options = choose_options(len(records.done), renders, films)
+        renders, films = choose_amounts(len(records.done), renders, films)
         address = dataset.path.rstrip("/") if root is None else str(root)
         title = address.rpartition("/")[2] or "dataset"
-        drawn = min(options.renders, len(records.done))
+        drawn = min(renders, len(records.done))
         site = Site(folder, title, address, len(records.done), len(records.lost), drawn)
-        cards = _write_scenes(site, records.done, options, jobs, progress, robot)
+        cards = _write_scenes(site, records.done, films, jobs, progress, robot)
         _write_index_pages(site, records, cards)
         write_marker(folder, f"tableverse-factory {__version__}", records.entered)
         replace_folder(folder, target, Path(scratch) / "replaced", str(dest))
@@ -102,18 +87,18 @@ def write_gallery(
 def _write_scenes(
     site: Site,
     done: Sequence[SceneRecord],
-    options: GalleryOptions,
+    films: int,
     jobs: int,
     progress: Callable[[int, int], None] | None,
     robot: str | None,
 ) -> list[SceneCard]:
     ids = ["", *(scene.scene_id for scene in done), ""]
     scene_jobs = [
-        SceneJob(scene, position < options.renders, ids[position], ids[position + 2], position // PAGE_SIZE + 1)
+        SceneJob(scene, position < site.n_rendered, ids[position], ids[position + 2], position // PAGE_SIZE + 1)
         for position, scene in enumerate(done)
     ]
     close_datasets()
-    work, cards = partial(write_scene, site, options.films, robot), []
+    work, cards = partial(write_scene, site, films, robot), []
     for card in parallel_map(work, scene_jobs, jobs, "draws scenes", 1 if site.renders_all else _CHUNK):
         cards.append(card)
         if progress is not None:
@@ -133,18 +118,11 @@ def _write_index_pages(site: Site, records: Records, cards: Sequence[SceneCard])
     shown = _split_pages(list(zip(records.done, cards, strict=True)), PAGE_SIZE) or [[]]
     names = [make_page_name(n) for n in range(1, len(shown) + 1)]
     reasons = records.count_reasons([code for card in cards for code in card.reason_codes])
+    filtered = {"moves": records.has_trajectories, "reasons": reasons}
     for number, items in reversed(list(enumerate(shown, 1))):
         pager = {"page": number, "pages": len(shown), "names": names}
         template, figures = ("index.html", _summarize_records(records)) if number == 1 else ("page.html", {})
-        site.write(
-            names[number - 1],
-            template,
-            items=items,
-            pager=pager,
-            moves=records.has_trajectories,
-            reasons=reasons,
-            **figures,
-        )
+        site.write(names[number - 1], template, items=items, pager=pager, **filtered, **figures)
 
 
 def _summarize_records(records: Records) -> dict[str, Any]:

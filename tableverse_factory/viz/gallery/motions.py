@@ -48,11 +48,6 @@ def write_motions(scene: Scene, folder: Path, films: int, robot: str | None = No
     )
 
 
-def make_plain_cards(rows: Sequence[Mapping[str, Any]]) -> tuple[MotionCard, ...]:
-    """Make cards without opening the recordings."""
-    return tuple(MotionCard(row) for row in rows)
-
-
 def choose_filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozenset[str]:
     """Choose the tasks to film: one of each relation and outcome first, then others, in the order of the tasks."""
     seen: set[tuple[str, bool]] = set()

@@ -4,12 +4,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from PIL import Image
 
-from schemas.geometry import Camera, Picture, Points, Pose
+from schemas.geometry import Camera, Picture, Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH, TALLEST, read_photograph
@@ -33,6 +33,7 @@ QUALITY = RenderQuality(samples=2, sky_rays=0)
 
 _JPEG_QUALITY = 84
 _AZIMUTH = float(np.deg2rad(28.0))
+_CAPTIONS = {"photo": "photograph"}  # of the others, their names
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,28 +47,17 @@ class PictureSet:
     top: str = ""
     sketch: str = ""  # a small and quick picture, without photograph and render
     photo_height: int = HEIGHT  # of photograph and twin, `WIDTH` wide [px]
-
-    @property
-    def width(self) -> int:
-        """Width of every large picture [px]."""
-        return WIDTH
-
-    @property
-    def height(self) -> int:
-        """Height of the other views, `WIDTH` wide [px]."""
-        return HEIGHT
+    width: ClassVar[int] = WIDTH  # of every large picture [px]
+    height: ClassVar[int] = HEIGHT  # of the other views [px]
 
     @property
     def thumbs(self) -> tuple[tuple[str, str], ...]:
         """The small pictures of the card with their captions, the most informative first."""
         for names in (("photo", "twin"), ("front", "top"), ("sketch",)):
-            shown = tuple((getattr(self, name), _CAPTIONS[name]) for name in names if getattr(self, name))
+            shown = tuple((getattr(self, name), _CAPTIONS.get(name, name)) for name in names if getattr(self, name))
             if shown:
                 return shown
         return ()
-
-
-_CAPTIONS = {"photo": "photograph", "twin": "twin", "front": "front", "top": "top", "sketch": "sketch"}
 
 
 def write_pictures(scene: Scene, folder: Path, render: bool) -> PictureSet:
@@ -131,16 +121,12 @@ def _build_before(scenery: Scenery, meta: Mapping[str, Any]) -> Scenery | None:
         moves[name] = compose_poses(placed, invert_pose(settled))
     names = (*scenery.names, *[""] * (len(scenery.parts) - len(scenery.names)))  # the table has no name
     shown = [
-        (replace(part, vertices=_move_vertices(part.vertices, moves.get(name))), color)
+        (replace(part, vertices=transform_points(moves[name], part.vertices)) if name in moves else part, color)
         for name, part, color in zip(names, scenery.parts, scenery.colors, strict=True)
         if name not in unseen
     ]
     parts, colors = zip(*shown, strict=True)
     return Scenery(tuple(name for name in scenery.names if name not in unseen), parts, colors)
-
-
-def _move_vertices(vertices: Points, move: Pose | None) -> Points:
-    return vertices if move is None else transform_points(move, vertices)
 
 
 def _load_photograph(scene: Scene) -> Picture | None:
@@ -159,17 +145,13 @@ def _load_photo_camera(meta: Mapping[str, Any]) -> PosedCamera | None:
         return None
     try:
         fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-        photo = resize_camera(Camera(fx, fy, cx, cy, *_read_size(camera)), WIDTH)
+        width, height = int(camera["width"]), int(camera["height"])
+        if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= TALLEST * width):
+            raise ValueError(f"{width} × {height} pixels")
+        photo = resize_camera(Camera(fx, fy, cx, cy, width, height), WIDTH)
         return PosedCamera(photo, read_meta_pose(pose, "the camera"))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"meta.json: invalid camera: {json.dumps(camera)[:200]}: {error}"[:400]) from error
-
-
-def _read_size(camera: Mapping[str, Any]) -> tuple[int, int]:
-    width, height = int(camera["width"]), int(camera["height"])
-    if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= TALLEST * width):
-        raise ValueError(f"{width} × {height} pixels")
-    return width, height
 
 
 def _save(picture: Picture, stem: Path, thumb: bool) -> None:

@@ -218,16 +218,12 @@ _MASS_EDGES_G = (10, 30, 100, 300, 1000, 3000)
 
 
 def _count_masses(masses_kg: Sequence[float | None]) -> tuple[Bar, ...]:
-    names = [*(_format_grams(edge) for edge in _MASS_EDGES_G), "more"]
+    names = [*(f"{edge} g" if edge < 1000 else f"{edge // 1000} kg" for edge in _MASS_EDGES_G), "more"]
     counts = dict.fromkeys(names, 0)
     for mass in masses_kg:
         if mass is not None:
             counts[names[sum(1000 * mass >= edge for edge in _MASS_EDGES_G)]] += 1
     return make_bars(counts, len(names), by_count=False)
-
-
-def _format_grams(grams: int) -> str:
-    return f"{grams} g" if grams < 1000 else f"{grams // 1000} kg"
 
 
 def _count_integers(values: Sequence[int | None], low: int | None = None, high: int | None = None) -> tuple[Bar, ...]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.viz.gallery.motions import MotionCard, make_plain_cards, write_motions
+from tableverse_factory.viz.gallery.motions import MotionCard, write_motions
 from tableverse_factory.viz.gallery.pages import Site
 from tableverse_factory.viz.gallery.pictures import PictureSet, write_pictures
 from tableverse_factory.viz.gallery.records import SceneFacts, SceneRecord, read_scene_facts
@@ -54,7 +54,7 @@ def _draw_scene(
         scene = _open_dataset(site.out).scene_at(job.scene.row)
         facts, pictures = read_scene_facts(scene.meta), write_pictures(scene, folder, job.render)
         if not job.render:
-            return facts, pictures, make_plain_cards(job.scene.trajectories), ""
+            return facts, pictures, tuple(map(MotionCard, job.scene.trajectories)), ""
         return facts, pictures, write_motions(scene, folder, films, robot), ""
     except Exception as error:  # noqa: BLE001 - its files are untrusted; its page states the error
         return SceneFacts(), None, (), site.describe_error(error)

@@ -25,12 +25,14 @@ def write_search_index(
     names = Counter(name for scene in done for name in set(scene.labels))
     labels = sorted(names, key=lambda name: (-names[name], name))
     number = {name: index for index, name in enumerate(labels)}
+    pages = [make_lost_name(position // LOST_PAGE_SIZE + 1) for position in range(len(lost))]
     index = {
         "labels": labels,
         "offered": min(MOST_LABELS, len(labels)),
         "done": [_encode_done(scene, card, number) for scene, card in zip(done, cards, strict=True)],
         "lost": [
-            _encode_lost(scene, make_lost_name(position // LOST_PAGE_SIZE + 1)) for position, scene in enumerate(lost)
+            [scene.scene_id, _encode_title(scene), str(scene.row["status"]), scene.reason, page]
+            for scene, page in zip(lost, pages, strict=True)
         ],
     }
     text = json.dumps(index, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
@@ -42,7 +44,7 @@ def _encode_done(scene: SceneRecord, card: SceneCard, number: dict[str, int]) ->
     row = scene.row
     return [
         scene.scene_id,
-        0 if scene.title == scene.scene_id else scene.title,
+        _encode_title(scene),
         row["quality_score"],
         0 if row["usable"] is False else 1,
         list(card.reason_codes),
@@ -57,9 +59,8 @@ def _encode_done(scene: SceneRecord, card: SceneCard, number: dict[str, int]) ->
     ]
 
 
-def _encode_lost(scene: SceneRecord, page: str) -> list[Any]:
-    title = 0 if scene.title == scene.scene_id else scene.title
-    return [scene.scene_id, title, str(scene.row["status"]), scene.reason, page]
+def _encode_title(scene: SceneRecord) -> str | int:
+    return 0 if scene.title == scene.scene_id else scene.title
 
 
 def _to_micrometres(metres: float | None) -> float | None:

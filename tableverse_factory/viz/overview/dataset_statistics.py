@@ -91,7 +91,12 @@ def compute_statistics(dataset: Dataset) -> Statistics:
             **{s: sum(o.count for o in outcomes if o.status == s) for s in ("done", "dropped", "failed")},
             "usable": dataset.scenes.count_rows(filter=done & pc.field("usable")),
         },
-        objects=_count_objects(dataset.objects),
+        objects={
+            "total": dataset.objects.count_rows(),
+            "contained": dataset.objects.count_rows(filter=pc.field("contained_in").is_valid()),
+            "hinged": dataset.objects.count_rows(filter=pc.field("has_hinge")),
+            "graspable": dataset.objects.count_rows(filter=pc.field("graspable")),
+        },
         kinds=_make_ranking(_count_values(_scan_column(dataset.scenes, "kind", done))),
         sources=_make_ranking(_count_values(_scan_column(dataset.scenes, "source", done))),
         labels=_make_ranking(labels),
@@ -143,12 +148,10 @@ def _count_outcomes(scenes: ds.Dataset) -> list[SceneLoss]:
 def _count_motion_losses(trajectories: ds.Dataset) -> tuple[MotionLoss, ...]:
     failed = trajectories.to_table(columns=["failed_phase", "reason"], filter=~pc.field("success"))
     counts = failed.group_by(["failed_phase", "reason"]).aggregate([([], "count_all")]).to_pylist()
-    losses = (
-        MotionLoss(
-            (row["failed_phase"] or "")[:MAX_LABEL_CHARS], (row["reason"] or "")[:MAX_LABEL_CHARS], row["count_all"]
-        )
-        for row in counts
-    )
+    most = MAX_LABEL_CHARS
+    losses = [
+        MotionLoss((row["failed_phase"] or "")[:most], (row["reason"] or "")[:most], row["count_all"]) for row in counts
+    ]
     return tuple(sorted(losses, key=lambda loss: (-loss.count, loss.phase, loss.reason)))
 
 
@@ -192,15 +195,6 @@ def _sample_tail(counts: pa.Table) -> tuple[tuple[int, int], ...]:
         return ()
     ranks = np.unique(np.rint(np.geomspace(1, len(sizes), _TAIL_POINTS)).astype(np.int64))
     return tuple((int(rank), int(sizes[rank - 1])) for rank in ranks)
-
-
-def _count_objects(objects: ds.Dataset) -> dict[str, int]:
-    return {
-        "total": objects.count_rows(),
-        "contained": objects.count_rows(filter=pc.field("contained_in").is_valid()),
-        "hinged": objects.count_rows(filter=pc.field("has_hinge")),
-        "graspable": objects.count_rows(filter=pc.field("graspable")),
-    }
 
 
 def _count_objects_per_scene(scenes: ds.Dataset, done: pc.Expression) -> Histogram:

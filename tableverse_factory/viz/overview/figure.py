@@ -2,8 +2,7 @@
 
 import io
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -24,6 +23,7 @@ BLUE, TEAL, AMBER, RED, PURPLE = "#2f6db3", "#2a9d8f", "#e0a030", "#c8503c", "#7
 SIZE_IN = (15.0, 10.6)
 DPI = 110
 LABEL_CHARS = 20
+MOST_ROWS = 12  # of a panel with horizontal bars
 
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -51,7 +51,9 @@ _METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
 
 def draw_overview(statistics: Statistics, steps: Sequence[FunnelStep], kind: Literal["png", "svg"]) -> bytes:
     """Draw the figure as the bytes of a PNG or SVG file."""
-    with _use_style():
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_STYLE)
         figure = Figure(figsize=SIZE_IN, dpi=DPI, facecolor="white")
         _draw_headline(figure, statistics)
         grid = figure.add_gridspec(3, 3, left=0.105, right=0.985, top=0.86, bottom=0.055, hspace=0.42, wspace=0.44)
@@ -74,14 +76,6 @@ def draw_overview(statistics: Statistics, steps: Sequence[FunnelStep], kind: Lit
         figure.savefig(out, format=kind, metadata=_METADATA[kind])
     # Matplotlib repeats each text in a comment; untrusted text must stay glyph outlines only.
     return re.sub(rb" *<!--.*?-->\n?", b"", out.getvalue(), flags=re.DOTALL) if kind == "svg" else out.getvalue()
-
-
-@contextmanager
-def _use_style() -> Iterator[None]:
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE)
-        yield
 
 
 def _draw_headline(figure: Figure, statistics: Statistics) -> None:
@@ -130,7 +124,8 @@ def _draw_histogram(axes: Axes, title: str, histogram: Histogram, color: str) ->
     edges, counts = np.array(histogram.edges), np.array(histogram.counts)
     axes.bar(edges[:-1], counts, width=0.86 * np.diff(edges), align="edge", color=color)
     if edges[1] - edges[0] == 1:
-        axes.set_xticks(*_choose_ticks(edges[:-1]))
+        shown = edges[: -1 : -(-len(counts) // 15)]  # at most 15 ticks, each below the middle of its bar
+        axes.set_xticks(shown + 0.43, [f"{value:g}" for value in shown])
     axes.set_ylabel("scenes")
     axes.grid(axis="y", color=GRID)
     _use_integer_ticks(axes, "y")
@@ -138,24 +133,19 @@ def _draw_histogram(axes: Axes, title: str, histogram: Histogram, color: str) ->
     _add_note(axes, f"mean {middle:.1f}")
 
 
-def _choose_ticks(values: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Choose at most 15 ticks, each below the middle of its bar."""
-    step = -(-len(values) // 15)
-    shown = values[::step]
-    return shown + 0.43, [f"{value:g}" for value in shown]
-
-
-def _draw_ranking(axes: Axes, title: str, ranking: Ranking, color: str, unit: str, most: int = 12) -> None:
+def _draw_ranking(axes: Axes, title: str, ranking: Ranking, color: str, unit: str) -> None:
     axes.set_title(title)
-    if _mark_empty(axes, ranking.total):
-        return
-    shown = ranking.top[:most]
-    counts = np.array([count for _, count in shown])
-    axes.barh(np.arange(len(shown)), counts, color=color, height=0.72)
+    if not _mark_empty(axes, ranking.total):
+        _draw_rows(axes, ranking.top[:MOST_ROWS], color, unit)
+
+
+def _draw_rows(axes: Axes, rows: Sequence[tuple[str, int]], color: str | list[str], unit: str) -> None:
+    counts = np.array([count for _, count in rows])
+    axes.barh(np.arange(len(rows)), counts, color=color, height=0.72)
     for row, count in enumerate(counts):
         axes.text(count + 0.01 * counts.max(), row, f"{count:,}", va="center", fontsize=7.5, color=FAINT)
     axes.set_xlim(0, 1.14 * counts.max())
-    _label_rows(axes, [name for name, _ in shown], most)
+    _label_rows(axes, [name for name, _ in rows], MOST_ROWS)
     axes.set_xlabel(unit)
     _use_integer_ticks(axes, "x")
 
@@ -177,15 +167,10 @@ def _draw_long_tail(axes: Axes, statistics: Statistics) -> None:
     axes.set_xlabel("rank of the category")
     axes.set_ylabel("objects")
     axes.grid(color=GRID)
-    half = _count_names_of_half(statistics.labels)
-    if half:
-        _add_note(axes, f"{half:,} of {statistics.labels.names:,} make half")
-
-
-def _count_names_of_half(labels: Ranking) -> int:
-    """Count the most frequent names that make half of all; 0 if the ranking lists too few."""
+    labels = statistics.labels
     reached = np.cumsum([count for _, count in labels.top]) >= labels.total / 2
-    return int(np.argmax(reached)) + 1 if reached.any() else 0
+    if reached.any():  # the ranking lists enough names
+        _add_note(axes, f"{int(np.argmax(reached)) + 1:,} of {labels.names:,} make half")
 
 
 def _draw_log_histogram(axes: Axes, title: str, histogram: Histogram, color: str, unit: Callable[[float], str]) -> None:
@@ -210,18 +195,10 @@ def _draw_log_histogram(axes: Axes, title: str, histogram: Histogram, color: str
 
 def _draw_losses(axes: Axes, statistics: Statistics) -> None:
     axes.set_title("Why scenes were lost")
-    shown = statistics.losses[:12]
-    if _mark_empty(axes, len(shown), "none was"):
-        return
-    counts = np.array([loss.count for loss in shown])
-    colors = [RED if loss.status == "failed" else AMBER for loss in shown]
-    axes.barh(np.arange(len(shown)), counts, color=colors, height=0.72)
-    for row, count in enumerate(counts):
-        axes.text(count + 0.01 * counts.max(), row, f"{count:,}", va="center", fontsize=7.5, color=FAINT)
-    axes.set_xlim(0, 1.14 * counts.max())
-    _label_rows(axes, [f"{loss.stage}: {loss.reason}" for loss in shown], 12)
-    axes.set_xlabel("scenes")
-    _use_integer_ticks(axes, "x")
+    shown = statistics.losses[:MOST_ROWS]
+    if not _mark_empty(axes, len(shown), "none was"):
+        colors = [RED if loss.status == "failed" else AMBER for loss in shown]
+        _draw_rows(axes, [(f"{loss.stage}: {loss.reason}", loss.count) for loss in shown], colors, "scenes")
 
 
 def _add_note(axes: Axes, text: str) -> None:

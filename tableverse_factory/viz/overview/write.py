@@ -1,7 +1,6 @@
 """Overview of a dataset as files: `overview.png`, `overview.svg`, `statistics.json`."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,7 @@ def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
         raise InputError(f"{dest}: a file; give a folder")
     if root == dest.resolve() or root in dest.resolve().parents:
         raise InputError(f"{dest}: lies within the dataset, whose bytes stay as they were built; give another folder")
-    statistics, steps = _compute_all(dataset)
-    content = _to_json(statistics, steps)
+    statistics, steps, content = _compute_all(dataset)
     files = {
         "statistics.json": (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),
         "overview.svg": draw_overview(statistics, steps, "svg"),
@@ -40,31 +38,23 @@ def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
 
 def make_report(dataset: Dataset) -> dict[str, Any]:
     """Make the content of `statistics.json`."""
-    return _to_json(*_compute_all(dataset))
+    return _compute_all(dataset)[2]
 
 
-def _compute_all(dataset: Dataset) -> tuple[Statistics, tuple[FunnelStep, ...]]:
+def _compute_all(dataset: Dataset) -> tuple[Statistics, tuple[FunnelStep, ...], dict[str, Any]]:
     statistics = compute_statistics(dataset)
-    return statistics, compute_funnel(statistics.scenes["entered"], statistics.losses, list_stages(statistics))
+    steps = compute_funnel(statistics.scenes["entered"], statistics.losses, _list_stages(statistics))
+    funnel = [
+        {"stage": step.stage, "left": step.left} | {status: step.count_lost(status) for status in ("dropped", "failed")}
+        for step in steps
+    ]
+    return statistics, steps, {**statistics.to_json(), "funnel": funnel}
 
 
-def list_stages(statistics: Statistics) -> tuple[str, ...]:
+def _list_stages(statistics: Statistics) -> tuple[str, ...]:
     """List the stages of the pipelines of this dataset in order; layouts start at another stage than pictures."""
     kinds = {name for name, _ in statistics.kinds.top}
     pipelines = [stages for kind, stages in pipeline.PIPELINES.items() if kind.value in kinds] or [pipeline.STAGES]
     shared = [stage.name for stage in pipelines[0] if all(stage in stages for stages in pipelines)]
     own = [stage.name for stages in pipelines for stage in stages if stage.name not in shared]
     return (*dict.fromkeys(own), *shared)
-
-
-def _to_json(statistics: Statistics, steps: Sequence[FunnelStep]) -> dict[str, Any]:
-    funnel = [
-        {
-            "stage": step.stage,
-            "left": step.left,
-            "dropped": step.count_lost("dropped"),
-            "failed": step.count_lost("failed"),
-        }
-        for step in steps
-    ]
-    return {**statistics.to_json(), "funnel": funnel}

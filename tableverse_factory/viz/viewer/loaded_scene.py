@@ -26,8 +26,7 @@ from tableverse_factory.viz.viewer.layouts import SETTLED, Poses, read_layouts
 from tableverse_factory.viz.viewer.motion_playback import MotionPlayback
 from tableverse_factory.viz.viewer.orbit_camera import OrbitCamera, make_front_camera, make_orbit_camera
 
-StaticVisuals = tuple[tuple[bytes, Pose], ...]
-"""GLB of each static body in its own frame, and its pose in the table frame."""
+StaticVisuals = tuple[tuple[bytes, Pose], ...]  # GLB of each static body in its own frame, pose in the table frame
 
 PHOTOGRAPH_PX = 640
 _QUALITY = 85
@@ -53,7 +52,11 @@ class LoadedScene:
         self.scene = scene
         self.meta: Mapping[str, Any] = scene.meta if "meta.json" in scene.files() else {}
         self.model = scene.model()
-        _check_joints(self.model)
+        if (self.model.jnt_type != mujoco.mjtJoint.mjJNT_FREE).any():
+            raise InputError(
+                "it has joints besides free ones, which exported scenes do not have; "
+                "view it with python -m mujoco.viewer"
+            )
         contents = read_model_contents(self.model)
         self.bodies = tuple(_encode_body(content, number) for number, content in enumerate(contents.objects))
         self.static = _encode_static(contents)
@@ -77,22 +80,12 @@ class LoadedScene:
         return file.getvalue()
 
     @property
-    def motion_rows(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of trajectories/ in the order of the tasks, read at each call."""
-        return tuple(self.scene.trajectory_rows())
-
-    @property
     def object_rows(self) -> tuple[Mapping[str, Any], ...]:
         """Rows of objects/; made from the files of the scene if it belongs to no dataset."""
         labels = {str(item["object_id"]): item.get("label") for item in self.meta.get("objects", [])}
         return tuple(self.scene.object_rows()) or tuple(
             {"object_id": body.name, "label": labels.get(body.name), "mass_kg": body.mass_kg} for body in self.bodies
         )
-
-    @property
-    def task_rows(self) -> tuple[Mapping[str, Any], ...]:
-        """Rows of tasks/; none if the scene belongs to no dataset."""
-        return tuple(self.scene.task_rows())
 
     def motion(self, task_id: str, robot: str | None) -> MotionPlayback:
         """Load the recorded motion of a task; raise an `InputError` if there is none, or the arm must be given."""
@@ -138,13 +131,6 @@ def _read_image_size(meta: Mapping[str, Any]) -> tuple[int, int]:
     width, height = (camera.get(key) if isinstance(camera, Mapping) else None for key in ("width", "height"))
     known = isinstance(width, int) and isinstance(height, int) and 0 < width <= 10**5 and 0 < height <= 10**5
     return (int(width), int(height)) if known else (PHOTOGRAPH_PX, PHOTOGRAPH_PX * 3 // 4)  # type: ignore[arg-type]
-
-
-def _check_joints(model: mujoco.MjModel) -> None:
-    if (model.jnt_type != mujoco.mjtJoint.mjJNT_FREE).any():
-        raise InputError(
-            "it has joints besides free ones, which exported scenes do not have; view it with python -m mujoco.viewer"
-        )
 
 
 def _encode_static(contents: ModelContents) -> StaticVisuals:

@@ -13,8 +13,7 @@ from tableverse_factory.delivery.episodes.cameras import place_film_camera
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.robotics.execution.arrays import Recording
-from tableverse_factory.viz.gallery.formatting import format_code
-from tableverse_factory.viz.gallery.formatting import format_phase as phase_words
+from tableverse_factory.viz.gallery.formatting import format_code, format_phase
 from tableverse_factory.viz.viewer.orbit_camera import OrbitCamera, make_orbit_camera
 
 _VIEW_PX = 640, 480
@@ -75,14 +74,14 @@ class MotionPlayback:
 
     def phase(self, sample: int) -> str:
         """Return the name of the phase."""
-        return phase_words(_PHASES[int(self._recording.phase[sample])].value)
+        return format_phase(_PHASES[int(self._recording.phase[sample])].value)
 
 
 def describe_outcome(row: Mapping[str, Any]) -> str:
     """Describe the outcome of a task in one line: success, or phase, reason and the decisive values."""
     if row["success"]:
         return "success"
-    where = f" in {phase_words(str(row['failed_phase']))}" if row["failed_phase"] else ""
+    where = f" in {format_phase(str(row['failed_phase']))}" if row["failed_phase"] else ""
     why = format_code(sanitize_line(str(row["reason"] or "no reason given"), 80))
     detail = f" ({sanitize_line(str(row['detail']), 300)})" if row["detail"] else ""
     return f"failed{where}: {why}{detail}"

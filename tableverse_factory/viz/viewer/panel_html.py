@@ -48,11 +48,10 @@ def format_photograph(jpeg: bytes | None) -> str:
 def format_dropped_scene(row: Row) -> str:
     """Format the reason why a scene was dropped or failed."""
     reason = str(row.get("reason") or row.get("error_kind") or "")
-    explanation = explain_reason(reason)
     lines = [
         f"<b>{escape_text(row.get('status'))}</b> at {escape_text(row.get('stage'))}: "
         f"{escape_text(reason.replace('_', ' '))}",
-        escape_text(explanation) if explanation else "",
+        escape_text(explain_reason(reason)),
         escape_text(row.get("detail") or "", 500),
     ]
     return _format_section(_format_title(row) + "".join(f"<p>{line}</p>" for line in lines if line), "Facts")

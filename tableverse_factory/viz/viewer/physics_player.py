@@ -73,7 +73,7 @@ class PhysicsPlayer:
     def contacts(self, poses: Poses | None) -> Contacts:
         """Measure the contacts at fixed poses at rest; None for the state of the simulation."""
         if self._simulation is None or self._fixed is None:
-            return Contacts.empty()
+            return Contacts(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0)
         if poses is None:
             return self._simulation.contacts()
         self._fixed.reset(poses)

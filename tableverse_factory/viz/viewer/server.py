@@ -21,8 +21,8 @@ from tableverse_factory.viz.viewer.ticker import Ticker
 _Handler = Callable[[Any], Awaitable[None]]
 _START_TIMEOUT_S = 30.0
 
+# The HTTP request with which the browser of the current task opened its WebSocket.
 _REQUEST: ContextVar[Any] = ContextVar("viewer_request", default=None)
-"""The HTTP request with which the browser of the current task opened its WebSocket."""
 
 
 def import_viser() -> ModuleType:
@@ -42,15 +42,9 @@ class Viewer:
         robot: str | None = None,
         allowed: Sequence[str] = (),
     ) -> None:
-        """Start the server.
+        """Start the server; port 0 takes a free one, and browsers whose address names no scene see the `first`.
 
-        Args:
-            scenes: The scenes to show.
-            first: The scene for browsers whose address names none.
-            host: Address to listen on.
-            port: Port to listen on; 0 takes a free one.
-            robot: The arm of trajectories whose robot comes from a file.
-            allowed: Addresses of this server as browsers see it behind a proxy.
+        `robot` is the arm of trajectories whose robot comes from a file; `allowed` is that of `OriginPolicy`.
 
         Raises:
             InputError: `port_in_use`, `bad_host`, `bad_origin`, or `no_extra`.

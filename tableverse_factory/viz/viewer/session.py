@@ -36,12 +36,8 @@ class Session:
     ) -> None:
         """Build the controls in the browser of a `viser.ClientHandle`.
 
-        Args:
-            client: The browser.
-            scenes: The scenes to show.
-            robot: The arm of trajectories whose robot comes from a file.
-            link: Makes the address of a scene; empty if it has none.
-            wake: Called when playback starts.
+        `robot` is the arm of trajectories whose robot comes from a file; `link` makes the address of a scene, empty if
+        it has none; `wake` is called when playback starts.
         """
         self._client, self._scenes, self._link, self._wake = client, scenes, link, wake
         self._lock = SessionLock(client, self._halt)
@@ -80,22 +76,17 @@ class Session:
 
     def _connect_controls(self) -> None:
         panel = self._panel
-        for control, action in (
-            (panel.search, self._search),
-            (panel.status, self._search),
-            (panel.scene, lambda: self._open(panel.scene.value)),
-            (panel.looks, self._show),
-            (panel.pieces, self._show),
-            (panel.contacts, self._show),
-            (panel.names, self._show),
-            (panel.ghosts, self._show),
-            (panel.layout, self._change_layout),
-            (panel.texture, self._change_texture),
-            (panel.texture_number, self._change_texture),
-            (panel.task, self._choose_task),
-            (panel.time, self._scrub),
+        for action, *controls in (
+            (self._search, panel.search, panel.status),
+            (lambda: self._open(panel.scene.value), panel.scene),
+            (self._show, panel.looks, panel.pieces, panel.contacts, panel.names, panel.ghosts),
+            (self._reset_layout, panel.layout),
+            (self._change_texture, panel.texture, panel.texture_number),
+            (self._choose_task, panel.task),
+            (self._scrub, panel.time),
         ):
-            control.on_update(self._lock.make_callback(action))
+            for control in controls:
+                control.on_update(self._lock.make_callback(action))
         for button, action in (
             (panel.camera, self._reset_camera),
             (panel.step, self._step),
@@ -141,10 +132,8 @@ class Session:
         self._describe(loaded)
         self._reset_camera()
         self._show()
-        self._motion.set_rows(loaded.motion_rows)
-        self._panel.photograph.content = format_photograph(
-            loaded.photograph
-        )  # last: a damaged one affects nothing else
+        self._motion.set_rows(loaded.scene.trajectory_rows())
+        self._panel.photograph.content = format_photograph(loaded.photograph)  # last: it may be damaged
 
     def _describe(self, loaded: LoadedScene) -> None:
         panel, objects = self._panel, loaded.object_rows
@@ -152,7 +141,7 @@ class Session:
         self._physics.open(loaded, self._names)
         panel.camera.show_names = "Picture's camera" if loaded.has_camera else "View from the front"
         link = self._link(self._scene_id)
-        panel.facts.content = format_facts(loaded.scene.row, loaded.meta, objects, loaded.task_rows, link)
+        panel.facts.content = format_facts(loaded.scene.row, loaded.meta, objects, loaded.scene.task_rows(), link)
         layouts = [name for name in LAYOUTS if name in loaded.layouts]
         panel.layout.options, panel.layout.value = layouts, SETTLED
         panel.ghosts.options, panel.ghosts.value = [NO_GHOST, *layouts], NO_GHOST
@@ -174,7 +163,7 @@ class Session:
         self._canvas.show_ghost(ghosts if ghosts in loaded.layouts else None, loaded.layouts.get(ghosts, {}))
         self._place()
 
-    def _change_layout(self) -> None:
+    def _reset_layout(self) -> None:
         self._halt()
         self._motion.deselect()
         self._physics.reset(self._layout())
@@ -226,9 +215,7 @@ class Session:
         if pressed == PLAY:
             self._simulate()
         elif pressed != PAUSE:
-            self._motion.deselect()
-            self._physics.reset(self._layout())
-            self._place()
+            self._reset_layout()
         self._physics.show_status()
 
     def _push(self) -> None:

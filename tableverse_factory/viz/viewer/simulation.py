@@ -27,11 +27,6 @@ class Contacts(Frozen):
     depths_m: Numbers  # overlaps; negative for a gap, shape (n,) [m]
     total: int  # those beyond `MAX_CONTACTS` included
 
-    @classmethod
-    def empty(cls) -> "Contacts":
-        """Make a record without contacts."""
-        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), 0)
-
     def __len__(self) -> int:
         return len(self.forces_n)
 

@@ -16,8 +16,7 @@ from tableverse_factory.viz.gallery.gallery import (
     DRAW_ALL_LIMIT,
     FILMS_PER_SCENE,
     SAMPLE_SIZE,
-    GalleryOptions,
-    choose_options,
+    choose_amounts,
     write_gallery,
 )
 from tableverse_factory.viz.gallery.pictures import write_pictures
@@ -29,11 +28,11 @@ pytestmark = pytest.mark.heavy
 
 
 def test_few_scenes_are_all_drawn_and_many_by_sample():
-    assert choose_options(DRAW_ALL_LIMIT) == GalleryOptions(DRAW_ALL_LIMIT, FILMS_PER_SCENE)
-    assert choose_options(DRAW_ALL_LIMIT + 1) == GalleryOptions(SAMPLE_SIZE, 0)
-    assert choose_options(20_000, renders=300) == GalleryOptions(300, 0)
-    assert choose_options(3, films=0) == GalleryOptions(3, 0)
-    assert choose_options(3, renders=0, films=2) == GalleryOptions(0, 2)
+    assert choose_amounts(DRAW_ALL_LIMIT) == (DRAW_ALL_LIMIT, FILMS_PER_SCENE)
+    assert choose_amounts(DRAW_ALL_LIMIT + 1) == (SAMPLE_SIZE, 0)
+    assert choose_amounts(20_000, renders=300) == (300, 0)
+    assert choose_amounts(3, films=0) == (3, 0)
+    assert choose_amounts(3, renders=0, films=2) == (0, 2)
 
 
 def test_scenes_that_are_not_drawn_have_picture_page_and_the_command_that_draws_them(tmp_path):

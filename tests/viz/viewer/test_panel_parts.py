@@ -286,7 +286,7 @@ def test_a_scene_that_lies_in_a_folder_opens_too(tmp_path):
     assert list(scene.layouts) == ["observed", "rectified", "settled"]
     assert shelf.search("", "any").scene_ids == ["scene"]
     assert {row["object_id"] for row in scene.object_rows} == {X_ID, Y_ID}
-    assert scene.task_rows == ()
+    assert not scene.scene.task_rows()
     with pytest.raises(InputError, match="no such file"):
         load_scene_file(folder / "none.xml")
 
