@@ -20,9 +20,8 @@ from tests.helpers.builds import write_manifest
 BIN = Path(sys.executable).parent
 START_S = 120.0
 TINY = f"""#!{sys.executable}
-from functools import partial
 import workers.run
-workers.run.BuildRequest = partial(workers.run.BuildRequest, pipeline="tests.helpers.tiny_pipeline:PIPELINES")
+workers.run.PIPELINE = "tests.helpers.tiny_pipeline:PIPELINES"
 from tableverse_factory.cli.main import main
 main()
 """
