@@ -42,8 +42,8 @@ def report(
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.viz.destination import choose_destination
     from tableverse_factory.viz.gallery.gallery import write_gallery
-    from tableverse_factory.viz.output_folder import choose_destination
 
     dataset = open_dataset(out)
     check_robot_option(out, robot, needed=False)

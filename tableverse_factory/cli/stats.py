@@ -30,7 +30,7 @@ def stats(
     import json
 
     from tableverse_factory.dataset.dataset import open_dataset
-    from tableverse_factory.viz.output_folder import choose_destination
+    from tableverse_factory.viz.destination import choose_destination
     from tableverse_factory.viz.overview.write import make_report, write_statistics
 
     dataset = open_dataset(out)

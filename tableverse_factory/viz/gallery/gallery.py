@@ -15,13 +15,8 @@ from tableverse_factory import pipeline
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.core.version import __version__
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.viz.destination import find_local_folder, replace_folder, resolve_destination, write_marker
 from tableverse_factory.viz.funnel import compute_funnel
-from tableverse_factory.viz.gallery.destination import (
-    find_local_folder,
-    replace_folder,
-    resolve_destination,
-    write_marker,
-)
 from tableverse_factory.viz.gallery.pages import Site, make_lost_name, make_page_name
 from tableverse_factory.viz.gallery.records import Records, SceneRecord, make_charts, read_records
 from tableverse_factory.viz.gallery.scene import SceneCard, SceneJob, close_datasets, write_scene

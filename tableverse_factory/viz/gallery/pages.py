@@ -12,8 +12,6 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.core.version import __version__
 from tableverse_factory.viz.gallery.formatting import FILTERS
 
-_LONGEST = 500
-
 
 @dataclass(frozen=True, slots=True)
 class Site:
@@ -47,7 +45,7 @@ class Site:
     def describe_error(self, error: Exception) -> str:
         """Describe an error without the path of the dataset; unexpected errors with their type."""
         text = str(error) if isinstance(error, InputError | ValueError) else f"{type(error).__name__}: {error}"
-        return sanitize_line(text.replace(self.out, self.named), _LONGEST)
+        return sanitize_line(text.replace(self.out, self.named), 500)
 
 
 def make_page_name(number: int) -> str:

@@ -167,19 +167,15 @@ def read_records(dataset: Dataset) -> Records:
     for row in dataset.scenes.to_table().to_pylist():
         scene_id = row["scene_id"]
         if row["status"] == "done" and row["tar_offset"] is not None:
-            _check_scene_id(scene_id)
+            try:
+                check_id(scene_id)
+            except ValueError as error:
+                raise InputError(f"the dataset is damaged: scene {error}") from error
             rows = (table.get(scene_id, []) for table in (objects, tasks, tried))
             records.done.append(SceneRecord(row, *rows))
         else:
             records.lost.append(SceneRecord(row, (), (), ()))
     return records
-
-
-def _check_scene_id(scene_id: str) -> None:
-    try:
-        check_id(scene_id)
-    except ValueError as error:
-        raise InputError(f"the dataset is damaged: scene {error}") from error
 
 
 def _group_by_scene(table: Any) -> dict[str, list[Row]]:

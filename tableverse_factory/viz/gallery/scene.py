@@ -49,13 +49,11 @@ def write_scene(site: Site, films: int, robot: str | None, job: SceneJob) -> Sce
 def _draw_scene(
     site: Site, films: int, robot: str | None, job: SceneJob
 ) -> tuple[SceneFacts, PictureSet | None, tuple[MotionCard, ...], str]:
-    folder = site.folder / "pictures"
+    folder, motions = site.folder / "pictures", tuple(map(MotionCard, job.scene.trajectories))
     try:
         scene = _open_dataset(site.out).scene_at(job.scene.row)
         facts, pictures = read_scene_facts(scene.meta), write_pictures(scene, folder, job.render)
-        if not job.render:
-            return facts, pictures, tuple(map(MotionCard, job.scene.trajectories)), ""
-        return facts, pictures, write_motions(scene, folder, films, robot), ""
+        return facts, pictures, write_motions(scene, folder, films, robot) if job.render else motions, ""
     except Exception as error:  # noqa: BLE001 - its files are untrusted; its page states the error
         return SceneFacts(), None, (), site.describe_error(error)
 

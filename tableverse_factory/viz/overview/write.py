@@ -14,11 +14,7 @@ from tableverse_factory.viz.overview.figure import draw_overview
 
 
 def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
-    """Write the statistics of the committed shards and return the paths of the files; earlier files are replaced.
-
-    Raises:
-        InputError: if `dest` is not a folder or lies within the dataset.
-    """
+    """Write the statistics of the committed shards into a folder apart from the dataset; return the files' paths."""
     root = Path(dataset.path).resolve()
     if dest.exists() and not dest.is_dir():
         raise InputError(f"{dest}: a file; give a folder")

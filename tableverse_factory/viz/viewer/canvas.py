@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.geometry import Pose, TriangleMesh
+from schemas.geometry import Pose
 from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.geometry.math.transforms import identity_pose
 from tableverse_factory.viz.viewer.glb import encode_visuals
@@ -17,7 +17,7 @@ from tableverse_factory.viz.viewer.simulation import Contacts
 
 GHOST_COLORS = {"observed": (226, 125, 30), "rectified": (150, 80, 200), "settled": (40, 130, 90)}
 CONTACT_COLOR = (190, 0, 40)
-_GHOST_OPACITY = 0.38
+_GHOST = {"opacity": 0.38, "cast_shadow": False, "receive_shadow": False}
 _LIGHT = {"hdri": "studio", "environment_intensity": 0.3}  # environment map of viser, dim enough for white objects
 
 _SKY = np.linspace((206, 214, 222), (240, 242, 244), 64).astype(np.uint8)[:, None].repeat(2, axis=1)
@@ -117,25 +117,20 @@ class Canvas:
         """Show the objects transparently at the poses of another layout; None hides them."""
         if layout is not None and layout not in self._ghosts:
             self._ghosts[layout] = [
-                self._add_ghost(f"/ghosts/{layout}/{number}", body.shape, poses[body.name], layout)
+                self._client.scene.add_mesh_simple(
+                    f"/ghosts/{layout}/{number}",
+                    body.shape.vertices,
+                    body.shape.faces,
+                    color=GHOST_COLORS[layout],
+                    **_GHOST,
+                    **_pose_arguments(poses[body.name]),
+                )
                 for number, body in enumerate(self._bodies)
                 if body.name in poses and len(body.shape.faces)
             ]
         for name, handles in self._ghosts.items():
             for handle in handles:
                 handle.visible = name == layout
-
-    def _add_ghost(self, name: str, mesh: TriangleMesh, pose: Pose, layout: str) -> Any:
-        return self._client.scene.add_mesh_simple(
-            name,
-            mesh.vertices,
-            mesh.faces,
-            color=GHOST_COLORS[layout],
-            opacity=_GHOST_OPACITY,
-            cast_shadow=False,
-            receive_shadow=False,
-            **_pose_arguments(pose),
-        )
 
     def show_contacts(self, contacts: Contacts | None) -> None:
         """Show an arrow per contact along its normal, its length by the force; None hides them."""

@@ -22,7 +22,7 @@ from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import concatenate_meshes
 from tableverse_factory.physics.mjcf.file_check import check_files
 from tableverse_factory.viz.viewer.glb import encode_pieces, encode_visuals
-from tableverse_factory.viz.viewer.layouts import SETTLED, Poses, read_layouts
+from tableverse_factory.viz.viewer.layouts import Poses, read_layouts
 from tableverse_factory.viz.viewer.motion_playback import MotionPlayback
 from tableverse_factory.viz.viewer.orbit_camera import OrbitCamera, make_front_camera, make_orbit_camera
 
@@ -60,14 +60,9 @@ class LoadedScene:
         contents = read_model_contents(self.model)
         self.bodies = tuple(_encode_body(content, number) for number, content in enumerate(contents.objects))
         self.static = _encode_static(contents)
-        settled = {content.name: content.pose for content in contents.objects}
-        self.layouts: dict[str, Poses] = read_layouts(self.meta, settled)
+        self.settled = {content.name: content.pose for content in contents.objects}  # as exported
+        self.layouts: dict[str, Poses] = read_layouts(self.meta, self.settled)
         self.viewpoint, self.has_camera = self._make_camera()
-
-    @property
-    def settled(self) -> Poses:
-        """Exported poses of the objects."""
-        return self.layouts[SETTLED]
 
     @cached_property
     def photograph(self) -> bytes | None:
@@ -107,11 +102,7 @@ class LoadedScene:
 
 
 def load_scene_file(path: Path) -> Scene:
-    """Load an exported scene from its folder: `scene.xml`, its assets, `meta.json` and the photograph.
-
-    Raises:
-        InputError: if there is none, or it names files outside its folder.
-    """
+    """Load an exported scene from its folder: `scene.xml`, its assets (none elsewhere), `meta.json`, photograph."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the scene.xml of an exported scene, or a dataset")
     root = path.resolve().parent

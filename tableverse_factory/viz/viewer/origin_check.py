@@ -21,12 +21,10 @@ class OriginPolicy:
     """Allows pages of this server, and the origins that the user names."""
 
     def __init__(self, bound: str, allowed: Sequence[str] = ()) -> None:
-        """Collect the names of this machine and the pages that the user allows.
+        """Collect the names of this machine, which listens on the address `bound`, and the pages that are allowed.
 
-        Args:
-            bound: Address that this server listens on.
-            allowed: Addresses of this server as browsers see it behind a proxy: `https://NAME.github.dev`, with a path
-                if the proxy adds one; an invalid one raises `bad_origin`.
+        These are addresses of this server as browsers see it behind a proxy: `https://NAME.github.dev`, with a path if
+        the proxy adds one; an invalid one raises `bad_origin`.
         """
         self._names = {"localhost", bound.lower(), socket.gethostname().lower()}
         self._pages: dict[tuple[str, str, int], str] = {}

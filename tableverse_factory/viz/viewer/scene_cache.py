@@ -20,6 +20,7 @@ class SceneCache:
 
     def __init__(self, source: Dataset | Scene) -> None:
         """Read the list of scenes of a dataset, or take a scene of `load_scene_file`."""
+        self.has_links = isinstance(source, Dataset)  # whether scenes have addresses of their own
         self._dataset = source if isinstance(source, Dataset) else None
         self._single = source if isinstance(source, Scene) else None
         self._index = SceneIndex(source) if isinstance(source, Dataset) else None
@@ -28,11 +29,6 @@ class SceneCache:
 
     def __len__(self) -> int:
         return 1 if self._index is None else len(self._index)
-
-    @property
-    def has_links(self) -> bool:
-        """Whether scenes have addresses of their own."""
-        return self._dataset is not None
 
     def first(self) -> str | None:
         """Return the scene to begin with; None for an empty dataset."""
@@ -56,7 +52,8 @@ class SceneCache:
                 self._loaded.popitem(last=False)
         if must_load:
             try:
-                future.set_result(LoadedScene(self._scene(scene_id)))
+                scene = self._dataset.scene(scene_id) if self._dataset is not None else self._single_scene
+                future.set_result(LoadedScene(scene))
             except BaseException as error:  # noqa: BLE001 - it is passed on to all who wait
                 with self._lock:
                     if self._loaded.get(scene_id) is future:
@@ -74,6 +71,3 @@ class SceneCache:
     def _single_scene(self) -> Scene:
         assert self._single is not None  # noqa: S101 - without a dataset there is a scene
         return self._single
-
-    def _scene(self, scene_id: str) -> Scene:
-        return self._dataset.scene(scene_id) if self._dataset is not None else self._single_scene

@@ -16,9 +16,9 @@ from tableverse_factory.geometry.math.transforms import invert_pose, transform_p
 from tableverse_factory.viz.viewer.glb import choose_piece_color
 from tableverse_factory.viz.viewer.loaded_scene import LoadedScene, load_scene_file, merge_poses
 from tableverse_factory.viz.viewer.motion_playback import MotionPlayback, describe_outcome
+from tableverse_factory.viz.viewer.motion_player import Playhead
 from tableverse_factory.viz.viewer.origin_check import OriginPolicy
 from tableverse_factory.viz.viewer.panel_html import escape_text, format_dropped_scene, format_facts
-from tableverse_factory.viz.viewer.playhead import Playhead
 from tableverse_factory.viz.viewer.scene_cache import MAX_SCENES, SceneCache
 from tableverse_factory.viz.viewer.scene_index import SceneIndex
 from tableverse_factory.viz.viewer.simulation import Simulation

@@ -10,11 +10,15 @@ from typer.testing import CliRunner
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.viz.gallery.destination import check_replaceable, find_local_folder, replace_folder
+from tableverse_factory.viz.destination import (
+    check_replaceable,
+    choose_destination,
+    find_local_folder,
+    replace_folder,
+)
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tableverse_factory.viz.gallery.pages import Site
 from tableverse_factory.viz.gallery.scene import list_commands
-from tableverse_factory.viz.output_folder import choose_destination
 from tests.helpers.gallery_dataset import scene_members, write_dataset
 from tests.viz.gallery.test_gallery import digest
 

@@ -1,4 +1,4 @@
-"""Destination folder of a gallery: check that a new gallery may replace its content, and replace it safely."""
+"""Destination folders of reports: the default ones, and the safe replacement of an earlier gallery."""
 
 import json
 import os
@@ -13,6 +13,12 @@ MARKER = "tableverse-gallery.json"  # file in every gallery that lists its files
 
 _LOCAL = ("file://", "local://")
 _ELSE = "give a new or an empty folder"
+
+
+def choose_destination(out: str, suffix: str) -> Path:
+    """Return the default folder of a report: beside the dataset, whose own bytes stay as built."""
+    path = Path(out.rstrip("/").rpartition("/")[2]) if "://" in out else Path(out).resolve()
+    return path.with_name(f"{path.name}-{suffix}")
 
 
 def find_local_folder(path: str) -> Path | None:
