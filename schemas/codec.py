@@ -40,11 +40,7 @@ _SCHEMA = pa.schema([("tree", pa.large_binary()), ("blobs", pa.list_(pa.large_bi
 
 
 def encode(record: Any) -> bytes:
-    """Encode a record of `RECORD_TYPES`, or a tuple, mapping or scalar made of them.
-
-    Raises:
-        TypeError: if anything inside is of a type that is not listed.
-    """
+    """Encode a record of `RECORD_TYPES`, or a tuple, mapping or scalar made of them; TypeError for any other type."""
     blobs: list[bytes | memoryview] = []
     tree = json.dumps(_to_tree(record, blobs), separators=(",", ":")).encode()
     batch = pa.record_batch([pa.array([tree], pa.large_binary()), _make_list(blobs)], _SCHEMA)
@@ -52,11 +48,7 @@ def encode(record: Any) -> bytes:
 
 
 def decode(data: bytes) -> Any:
-    """Decode the record that `encode` was given.
-
-    Raises:
-        ValueError: if the bytes are not such a message or name an unknown type.
-    """
+    """Decode what `encode` gave; ValueError if the bytes are no such message or name an unknown type."""
     try:
         batch = pa.ipc.read_record_batch(pa.py_buffer(data), _SCHEMA)
         batch.validate(full=True)  # offsets of a damaged message would point outside of it

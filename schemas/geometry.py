@@ -68,8 +68,7 @@ class Texture(Frozen):
 
     Attributes:
         picture: Shape (h, w, 3) sRGB.
-        corner_uv: Points of the picture at each face's corners, 0–1, u to the right, v upwards; beyond, the
-            picture repeats. Shape (m, 3, 2).
+        corner_uv: Points of the picture at each face's corners, 0–1, u right, v up; beyond, it repeats. (m, 3, 2).
     """
 
     picture: Picture

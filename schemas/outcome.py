@@ -37,7 +37,6 @@ class Failed:
     Attributes:
         error_kind: `exception`, `crash`, `timeout`, `out_of_memory`, `lost` (its process or machine was killed
             repeatedly), or the class of a `TableverseError`.
-        message: One bounded line.
     """
 
     error_kind: str
@@ -52,10 +51,7 @@ Outcome = Done[T] | Dropped | Failed
 
 @dataclass(frozen=True, slots=True)
 class ModelCost:
-    """Cost of requests to model servers, retries included.
-
-    Tokens are as servers counted them, or 0; dollars by the prices of the configuration [USD].
-    """
+    """Cost of requests with retries: tokens as servers counted them, or 0; the configured price [USD]."""
 
     calls: int = 0
     input_tokens: int = 0

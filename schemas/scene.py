@@ -62,13 +62,13 @@ class Certificate:
 
     Attributes:
         epsilon_m: Depth below which a touch is not counted as a collision [m].
-        piece_penetration_before_m: Deepest pair penetration before settling, after LCCR, on the convex pieces; beside
-            it on the visual meshes [m].
-        piece_penetration_m: Deepest pair penetration in the exported state, on the pieces; beside it on the meshes [m].
+        piece_penetration_before_m: Deepest pair penetration before settling, after LCCR, on the convex pieces [m].
+        piece_penetration_m: The same in the exported state [m]; `mesh_penetration_m` on the visual meshes.
         drift_m: Largest displacement of an object over 5 s of further simulation [m].
         drift_rad: Largest rotation of an object over the same time [rad].
         displacement_m: Displacement of each object's centre from where the picture put it [m]; without copies.
-        fell: Ids of objects that left the table; `left_container` has those that left the container that held them.
+        fell: Ids of objects that left the table.
+        left_container: Ids of objects that left the container that held them.
         at_rest: Whether drift is within 1 mm and 1 degree for every object and nothing fell.
         colliding: Whether any pair is deeper than `epsilon_m`, on pieces or meshes, in the exported state.
     """

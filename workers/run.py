@@ -20,13 +20,12 @@ from tableverse_factory.dataset.consolidated_tables import remove_merged_tables,
 from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
 from tableverse_factory.dataset.shard_plan import Plan, check_shards, read_plan
 from tableverse_factory.models.local.recorded_weights import pin_commits
-from tableverse_factory.rebuild import manifest_from_dataset
+from tableverse_factory.rebuild import MANIFEST_STAGE, manifest_from_dataset
 from tableverse_factory.run_record import collect_external_inputs, read_run
 from tableverse_factory.stage import Pipelines, post_export_tables
 from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
 from workers.driver.driver import Driver
-from workers.driver.job_spec import BuildSpec
-from workers.driver.outcomes import MANIFEST_STAGE
+from workers.driver.in_flight import BuildSpec
 from workers.driver.signals import StoppedError, StopSignals
 from workers.executors.local_executor import LocalExecutor
 from workers.executors.protocol import Executor
@@ -86,10 +85,9 @@ class BuildSummary:
 
 
 def run_build(request: BuildRequest, display: Display, signals: StopSignals | None = None) -> BuildSummary:
-    """Build the dataset, or resume it.
+    """Build the dataset, or resume it; finished scenes survive every stop.
 
-    `signals` stops the run at SIGINT or SIGTERM, which then returns; None leaves signals alone, so that Ctrl-C raises
-    `KeyboardInterrupt`. Finished scenes are kept in both cases.
+    `signals` stops the run at SIGINT or SIGTERM, which then returns; without it Ctrl-C raises `KeyboardInterrupt`.
     """
     if request.executor == "local" and request.workers not in (None, 1):
         raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
@@ -103,7 +101,9 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
         if given is None:
             rows, recorded, base = _restore_from_dataset(request, lock.check)
         else:
-            rows, recorded, base = given, _read_recorded_inputs(request), None
+            run = request.out / "run.json"
+            before = read_run(run) if run.exists() else None
+            rows, recorded, base = given, collect_external_inputs(request.config, before), None
         plan = start_or_resume(
             request.out, rows, pipelines, request.config, recorded, request.from_stage, lock.check, base
         )
@@ -138,12 +138,6 @@ def _read_rows(request: BuildRequest) -> list[ImageRow] | None:
     rows = read_manifest(request.manifest)
     check_shards(request.shards, len(rows), request.config.run.shard_size)
     return rows
-
-
-def _read_recorded_inputs(request: BuildRequest) -> dict[str, Any]:
-    """Read what the build depends on besides its manifest, as it was at the start of the build."""
-    run = request.out / "run.json"
-    return collect_external_inputs(request.config, read_run(run) if run.exists() else None)
 
 
 def _restore_from_dataset(

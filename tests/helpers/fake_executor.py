@@ -12,7 +12,7 @@ from tableverse_factory.stage import Stage
 from tests.helpers.builds import Silent
 from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
 from workers.driver.driver import Driver
-from workers.driver.job_spec import BuildSpec
+from workers.driver.in_flight import BuildSpec
 from workers.executors.protocol import CallFinished, Event, Job, JobResult, WorkerLost, WorkerReady
 from workers.executors.schedule import PoolLimits, ScheduleLimits
 from workers.progress.tally import Tally

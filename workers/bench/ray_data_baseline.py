@@ -1,10 +1,9 @@
 """A pipeline written with Ray Data, the baseline of `tableverse bench factory`.
 
-`python -m workers.bench.ray_data_baseline MANIFEST OUT WORKERS PIPELINE`. Every stage is one `map_batches`, records
-travel between stages as bytes of the same codec, the last one writes a tar and the rows of objects and tasks per batch,
-and `write_parquet` writes the rows of scenes. Ray Data fuses the chain into one task per block, so nothing crosses a
-process boundary between stages. It has no sandbox, no deadline, no row for a failed scene, no plan, no resume and no
-flush to the disk, and its file names differ from run to run.
+`python -m workers.bench.ray_data_baseline MANIFEST OUT WORKERS PIPELINE`. Every stage is one `map_batches` on bytes of
+the same codec, the last one writes a tar and the rows of objects and tasks per batch, and `write_parquet` those of
+scenes. Ray Data fuses the chain into one task per block. There is no sandbox, deadline, row for a failed scene, plan,
+resume or flush to the disk, and file names differ from run to run.
 """
 
 import sys

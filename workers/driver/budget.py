@@ -72,10 +72,7 @@ class Budget:
         return self.granted[rank]
 
     def settle(self, rank: int, paid: ModelCost, cost: ModelCost = NO_COST) -> None:
-        """Settle the allowance of a scene that returned.
-
-        `cost` is what its answers cost when they were first given: cached ones tell the price, too.
-        """
+        """Settle the allowance of a scene; `cost`, when answers were first given, tells the price of cached ones."""
         del self.granted[rank]
         self.spent += paid
         usd = max(paid.usd, cost.usd)

@@ -4,8 +4,7 @@ from collections.abc import Iterable, Mapping
 
 from schemas.codec import decode
 from tableverse_factory.core.errors import BuildError
-from workers.driver.in_flight import InFlightScene
-from workers.driver.job_spec import BuildSpec
+from workers.driver.in_flight import BuildSpec, InFlightScene
 from workers.state.checkpoint_store import (
     CHECKPOINTS,
     CheckpointRef,

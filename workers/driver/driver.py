@@ -9,8 +9,7 @@ from tableverse_factory.core.errors import BudgetSpentError, BuildError
 from tableverse_factory.stage import Stage
 from workers.driver.budget import Budget, calls_model
 from workers.driver.checkpoints import CheckpointIndex
-from workers.driver.in_flight import InFlightScene
-from workers.driver.job_spec import BuildSpec
+from workers.driver.in_flight import BuildSpec, InFlightScene
 from workers.driver.outcomes import OutcomeRecorder
 from workers.driver.worker_manager import WorkerManager
 from workers.executors.protocol import (
@@ -31,16 +30,11 @@ from workers.state.ledger import Ledger
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10  # in a row, per call in flight: one machine that is lost takes many calls along
 _BUDGET_SPENT = BudgetSpentError.__name__
-
 _WAIT_S = 0.2
 
 
 class Driver:
-    """Scheduler of the scenes that the ledger lacks.
-
-    Attributes:
-        out_of_budget: Whether a scene waits for a budget that is spent.
-    """
+    """Scheduler of the scenes that the ledger lacks."""
 
     def __init__(
         self, spec: BuildSpec, ledger: Ledger, executor: Executor, budget: Budget, tally: Tally, display: Display
@@ -57,7 +51,7 @@ class Driver:
             executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in spec.pipelines[kind]})
         )
         self._losses_in_a_row = 0
-        self.out_of_budget = False
+        self.out_of_budget = False  # whether a scene waits for a budget that is spent
 
     def run(self, check: Callable[[], None]) -> None:
         """Run until every scene is accounted for or postponed, or the budget is spent.

@@ -1,25 +1,37 @@
-"""A scene inside the stages: how far it has come, and where the input of its next stage lies."""
+"""The work of a run, and a scene inside the stages: how far it has come, and where the input of its next stage lies."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from schemas.codec import encode
-from schemas.manifest import ImageRow
+from schemas.config import Config
+from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import ModelCost
 from schemas.work import StageTiming
-from tableverse_factory.stage import Stage
+from tableverse_factory.core.storage.files import StoragePath
+from tableverse_factory.stage import Pipelines, Stage
 from workers.executors.protocol import Payload
 from workers.state.checkpoint_store import CheckpointRef
 
 
+@dataclass(frozen=True, slots=True)
+class BuildSpec:
+    """The work of one run of a build."""
+
+    rows: Sequence[ImageRow]  # the whole manifest
+    pipelines: Pipelines  # stages of each kind of row
+    config: Config
+    fingerprints: Mapping[SceneKind, Mapping[str, str]]  # of the stages of each kind of row (see `fingerprint_stages`)
+    records_dir: StoragePath  # where the outputs of stages are kept
+    keep: bool  # whether they stay there when their shard is committed
+    todo: Sequence[int]  # ranks of the scenes to work on, in the plan's order
+    added_only: bool = False  # whether only stages that add to exported scenes may run: the pictures may be gone
+
+
 @dataclass(slots=True)
 class InFlightScene:
-    """A scene inside the stages.
-
-    Attributes:
-        tried: Failed attempts of its stages, by position, in calls that the budget interrupted.
-    """
+    """A scene inside the stages."""
 
     rank: int
     row: ImageRow
@@ -30,7 +42,7 @@ class InFlightScene:
     position: int = 0  # its next stage, or the first of those that run
     attempts: int = 0  # most attempts that any stage needed
     losses: int = 0  # how often its worker was lost
-    tried: Counter[int] = field(default_factory=Counter)
+    tried: Counter[int] = field(default_factory=Counter)  # failed attempts by position, in calls the budget interrupted
     child_losses: int = 0  # how often a child was killed from outside in such calls
     timings: list[StageTiming] = field(default_factory=list)
     costs: dict[str, ModelCost] = field(default_factory=dict)  # costs of the model calls of its stages
@@ -42,21 +54,18 @@ class InFlightScene:
 
     def start(self, checkpoints: Mapping[str, CheckpointRef]) -> None:
         """Move behind the last stage with a checkpoint, or to the first stage."""
-        done = [position for position, name in enumerate(self.records) if name in checkpoints]
-        if done:
-            self.position, self.payload, self.input_record = (
-                done[-1] + 1,
-                b"",
-                checkpoints[self.records[done[-1]]].location,
-            )
-        else:
-            self.position, self.payload, self.input_record = 0, encode(self.row), ""
+        self.position = 1 + self._find_last(checkpoints)
+        self.payload = b"" if self.position else encode(self.row)
+        self.input_record = checkpoints[self.records[self.position - 1]].location if self.position else ""
 
     def resume(self, checkpoints: Mapping[str, CheckpointRef], input_lost: bool) -> None:
         """Move behind the last stage with a checkpoint if that is further, or if the input is lost."""
-        furthest = max((position for position, name in enumerate(self.records) if name in checkpoints), default=-1)
-        if input_lost or furthest >= self.position:
+        if input_lost or self._find_last(checkpoints) >= self.position:
             self.start(checkpoints)
             passed = {stage.name for stage in self.stages[: self.position]}
             self.timings = [timing for timing in self.timings if timing.stage in passed]
             self.costs = {stage: cost for stage, cost in self.costs.items() if stage in passed}
+
+    def _find_last(self, checkpoints: Mapping[str, CheckpointRef]) -> int:
+        """Find the position of the last stage with a checkpoint; -1 for none."""
+        return max((position for position, name in enumerate(self.records) if name in checkpoints), default=-1)

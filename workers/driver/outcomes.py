@@ -5,21 +5,17 @@ from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import SceneResult, StageReport, Status
 from tableverse_factory.core.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
+from tableverse_factory.rebuild import MANIFEST_STAGE
 from tableverse_factory.stage import Stage
 from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
 from workers.driver.checkpoints import CheckpointIndex
-from workers.driver.in_flight import InFlightScene
-from workers.driver.job_spec import BuildSpec
+from workers.driver.in_flight import BuildSpec, InFlightScene
 from workers.progress.tally import Display, Tally
 from workers.state.ledger import Ledger
 
-MANIFEST_STAGE = "manifest"
-_FATAL_KINDS = frozenset({ModelAccessError.__name__, StoreError.__name__})
-"""Kinds of failures that would recur for every scene: they stop the build."""
-_CONFIG_ERROR = ConfigError.__name__
-"""Stops the build where a stage adds to finished scenes: a misspelt key must not add failed rows to them."""
-_MODEL_SILENT = ModelError.__name__
-"""Postpones the scene where a stage adds to finished scenes: with failed rows it would count as done for ever."""
+_FATAL_KINDS = frozenset({ModelAccessError.__name__, StoreError.__name__})  # they would recur for every scene
+_CONFIG_ERROR = ConfigError.__name__  # fatal where a stage adds to finished scenes: a misspelt key must not fail them
+_MODEL_SILENT = ModelError.__name__  # postpones a scene there: with failed rows it would count as done for ever
 _MAX_SILENT_IN_A_ROW = 5  # postponed scenes in a row that stop the build: the model server is down
 _MAX_TRACES = 3  # failures of a stage that are shown with their traceback
 
@@ -63,11 +59,10 @@ class OutcomeRecorder:
 
     def record_rejected(self, row: ImageRow) -> None:
         """Record a rejected row of the manifest as dropped."""
-        result = SceneResult(
-            row.scene_id, "dropped", MANIFEST_STAGE, row.rejected, "", row.rejected_detail, 0, (), None
-        )
         self._tally.ended[MANIFEST_STAGE, "dropped"] += 1
-        self._write(result)
+        self._write(
+            SceneResult(row.scene_id, "dropped", MANIFEST_STAGE, row.rejected, "", row.rejected_detail, 0, (), None)
+        )
 
     def _postpone(self, scene: InFlightScene, why: str) -> None:
         """Leave a finished scene unchanged, without the rows of the stage that adds; a later run tries again."""
@@ -93,20 +88,8 @@ class OutcomeRecorder:
         ):
             status, reason, error_kind, detail, exported = "done", "", "", "", encoded
         self._tally.ended[scene.stage.name, status] += 1
-        self._write(
-            SceneResult(
-                scene.row.scene_id,
-                status,
-                scene.stage.name,
-                reason,
-                error_kind,
-                detail,
-                scene.attempts,
-                tuple(scene.timings),
-                exported,
-                tuple(scene.costs.items()),
-            )
-        )
+        ended = (scene.row.scene_id, status, scene.stage.name, reason, error_kind, detail, scene.attempts)
+        self._write(SceneResult(*ended, tuple(scene.timings), exported, tuple(scene.costs.items())))
 
     def _encode_failed_rows(self, scene: InFlightScene, why: str, detail: str) -> bytes | None:
         """Encode the input of a stage that adds, with rows of failure; None if the input is lost."""

@@ -5,7 +5,7 @@ import signal
 import socket
 import sys
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 
 HARD_END_S = 2.5
 STOPPED_MESSAGE = "stopped; everything finished is kept: run the same command to go on"
@@ -43,9 +43,7 @@ class StopSignals:
         self.install()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         signal.set_wakeup_fd(self._previous_descriptor)
         self._writer.close()
         for number, handler in self._before.items():

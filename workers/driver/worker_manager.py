@@ -24,11 +24,7 @@ _SMOOTHING = 0.05  # weight of the newest scene in the moving average of its poo
 
 
 class WorkerManager:
-    """Manager of the workers of all pools.
-
-    Attributes:
-        restarts: Workers started in place of a lost or recycled one.
-    """
+    """Manager of the workers of all pools."""
 
     def __init__(self, executor: Executor, pools: Sequence[str], clock: Callable[[], float] = time.monotonic) -> None:
         """Start the minimum of workers of the pools that the build needs; `clock` is monotonic [s]."""
@@ -39,22 +35,17 @@ class WorkerManager:
         self._caps: dict[str, int] = {}
         self._known_limits = executor.limits
         self._seconds: dict[str, float] = {}
-        self._sizes = self._compute_sizes({})
+        self.sizes = self._compute_sizes({})  # targets
         self._pool: dict[int, str] = {}
         self._starting: dict[int, float] = {}
         self._idle: set[int] = set()
         self._served: Counter[int] = Counter()
         self._until_resize = RESIZE_INTERVAL
-        self.restarts = 0
+        self.restarts = 0  # workers started in place of a lost or recycled one
         self._departed: Counter[str] = Counter()
         for name, pool in self._limits.pools.items():
             for _ in range(pool.min_workers):
                 self._start(name)
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Target sizes of the pools."""
-        return self._sizes
 
     @property
     def alive(self) -> Counter[str]:
@@ -64,31 +55,27 @@ class WorkerManager:
     @property
     def max_in_flight(self) -> int:
         """Most scenes between their first and last stage."""
-        return compute_max_in_flight(self._sizes, self._choose_batch_sizes())
+        return compute_max_in_flight(self.sizes, self._choose_batch_sizes())
 
     @property
     def max_calls_in_flight(self) -> int:
         """Most calls in flight at once."""
-        return sum(self._sizes.values())
+        return sum(self.sizes.values())
 
     def dispatch(self, ready: Sequence[ReadyScene], make_job: Callable[[int], Job]) -> tuple[int, ...]:
-        """Send waiting scenes to idle workers, and start or retire workers.
-
-        Returns:
-            Ranks of the scenes that were sent.
-        """
+        """Send waiting scenes to idle workers, and start or retire workers; returns the ranks that were sent."""
         self._resize()
         self._preempt(ready)
-        for worker in scale_down(self._group_idle(), self._count_placed(), self._sizes):
+        for worker in scale_down(self._group_idle(), self._count_placed(), self.sizes):
             self._retire(worker)
         idle = self._group_idle()
-        for pool in scale_up(ready, idle, self.alive, self._sizes):
+        for pool in scale_up(ready, idle, self.alive, self.sizes):
             self._start(pool)
-        chosen = assign_scenes(ready, idle, self._count_placed(), self._sizes, self._choose_batch_sizes())
-        for choice in chosen:
-            self._idle.discard(choice.worker)
-            self._executor.submit(choice.worker, tuple(make_job(rank) for rank in choice.ranks))
-        return tuple(rank for choice in chosen for rank in choice.ranks)
+        chosen = assign_scenes(ready, idle, self._count_placed(), self.sizes, self._choose_batch_sizes())
+        for worker, ranks in chosen:
+            self._idle.discard(worker)
+            self._executor.submit(worker, tuple(make_job(rank) for rank in ranks))
+        return tuple(rank for _, ranks in chosen for rank in ranks)
 
     def on_event(self, event: Event) -> None:
         """Update the pools after an event of the executor."""
@@ -123,7 +110,7 @@ class WorkerManager:
             self._known_limits, self._until_resize = limits, 0
             self._caps.clear()
         if self._until_resize <= 0:
-            self._until_resize, self._sizes = RESIZE_INTERVAL, self._compute_sizes(self._sizes)
+            self._until_resize, self.sizes = RESIZE_INTERVAL, self._compute_sizes(self.sizes)
 
     def _preempt(self, ready: Sequence[ReadyScene]) -> None:
         """Retire an idle worker if one of another pool cannot be placed, and cap its pool so that it stays away."""
@@ -138,7 +125,7 @@ class WorkerManager:
             pool, self._preempted_at = self._pool[worker], now
             self._retire(worker)
             self._caps[pool] = max(1, self.alive[pool])
-            self._sizes = self._compute_sizes(self._sizes)
+            self.sizes = self._compute_sizes(self.sizes)
 
     @property
     def _limits(self) -> ScheduleLimits:

@@ -121,10 +121,7 @@ def make_expectation(inputs: Sequence[str], checked: Sequence[Node]) -> NodeExpe
 
 
 def find_local_problem(node: str, node_id: str, expected: NodeExpectation) -> str:
-    """Find why this machine would not give the same bytes; empty if it would, or passed the preflight.
-
-    A StoreError of the inputs' store passes: it says nothing about the machine.
-    """
+    """Find why this machine would give other bytes; empty if it would not. A StoreError is no fault of its."""
     if node_id in expected.checked:
         return ""
     answer = probe_node(node, expected.inputs, "")

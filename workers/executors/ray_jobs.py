@@ -172,7 +172,8 @@ def _make_client(address: str) -> Any:
     if find_spec("aiohttp") is None:
         raise BuildError("submitting needs Ray's job client: pip install 'tableverse-factory[cluster]'")
     os.environ["RAY_API_SERVER_ADDRESS"] = address
-    if _has_token():
+    given = os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH")
+    if given or (Path.home() / ".ray" / "auth_token").is_file():
         os.environ.setdefault("RAY_AUTH_MODE", "token")  # read when ray is imported, so before it
     import ray.exceptions
     from ray.job_submission import JobSubmissionClient
@@ -185,8 +186,3 @@ def _make_client(address: str) -> Any:
             f"{address} asks for a token, and has refused the one given or none was: write the cluster's into a file "
             "that only you can read and name that in RAY_AUTH_TOKEN_PATH (with RAY_AUTH_MODE=token)"
         ) from None
-
-
-def _has_token() -> bool:
-    token = os.environ.get("RAY_AUTH_TOKEN") or os.environ.get("RAY_AUTH_TOKEN_PATH")
-    return bool(token) or (Path.home() / ".ray" / "auth_token").is_file()

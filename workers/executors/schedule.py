@@ -56,14 +56,6 @@ class ReadyScene:
     alone: bool = False  # whether it may not share a call, because it was in one whose worker was lost
 
 
-@dataclass(frozen=True, slots=True)
-class Assignment:
-    """Scenes for one call of a worker."""
-
-    worker: int
-    ranks: tuple[int, ...]
-
-
 def compute_min_sizes(limits: ScheduleLimits) -> dict[str, int]:
     """Compute the smallest sizes with which a build can end: one worker each, or the minimum."""
     return {name: max(1, pool.min_workers) for name, pool in limits.pools.items()}
@@ -110,31 +102,28 @@ def assign_scenes(
     placed: Mapping[str, int],
     sizes: Mapping[str, int],
     batches: Mapping[str, int],
-) -> tuple[Assignment, ...]:
-    """Assign waiting scenes to idle workers: in each pool those with the fewest stages left first, in the plan's order.
+) -> tuple[tuple[int, tuple[int, ...]], ...]:
+    """Assign waiting scenes to idle workers: the worker of each call, and its ranks.
 
-    Together with the bounded number of scenes in flight this is the back-pressure: a pool whose successors are busy
-    gets nothing to do. `placed` counts idle and busy workers, of which those beyond the target `sizes` get no work;
-    `batches` are the most scenes per call.
+    In each pool those with the fewest stages left come first, in the plan's order. Together with the bounded number of
+    scenes in flight this is the back-pressure: a pool whose successors are busy gets nothing to do. `placed` counts
+    idle and busy workers, of which those beyond the target `sizes` get no work; `batches` are the most scenes per call.
     """
-    chosen: list[Assignment] = []
+    chosen: list[tuple[int, tuple[int, ...]]] = []
     for pool, queue in sorted(_group_by_pool(ready).items()):
         workers = sorted(idle.get(pool, ()))
         fair = math.ceil(len(queue) / max(1, sizes[pool]))
         for worker in workers[: max(0, len(workers) - max(0, placed.get(pool, 0) - sizes[pool]))]:
             if not queue:
                 break
-            chosen.append(Assignment(worker, _take_batch(queue, min(batches[pool], fair))))
+            chosen.append((worker, _take_batch(queue, min(batches[pool], fair))))
     return tuple(chosen)
 
 
 def scale_up(
     ready: Sequence[ReadyScene], idle: Mapping[str, Sequence[int]], alive: Mapping[str, int], sizes: Mapping[str, int]
 ) -> tuple[str, ...]:
-    """Name a pool for each worker to start: scenes wait for it and none of its workers is idle.
-
-    Starting workers count as `alive`.
-    """
+    """Name a pool for each worker to start: scenes wait, and none is idle; starting ones are `alive`."""
     return tuple(
         pool
         for pool, queue in sorted(_group_by_pool(ready).items())
@@ -146,10 +135,7 @@ def scale_up(
 def scale_down(
     idle: Mapping[str, Sequence[int]], placed: Mapping[str, int], sizes: Mapping[str, int]
 ) -> tuple[int, ...]:
-    """Select idle workers to retire from pools above their target size.
-
-    Starting workers do not count as `placed`: they may never fit on a node.
-    """
+    """Select idle workers to retire from pools above `sizes`; starting ones are not `placed`: they may never fit."""
     return tuple(
         worker
         for pool, workers in sorted(idle.items())

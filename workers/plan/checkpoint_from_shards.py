@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
 from upath import UPath
@@ -27,14 +28,8 @@ def checkpoint_exported_scenes(
 ) -> None:
     """Write a checkpoint of the exported scene for each of these done scenes: one in a shard is named, not copied.
 
-    This precedes the invalidation of the scenes, so a kill in between only leaves valid checkpoints.
-
-    Args:
-        out: The dataset, locked and with ready shards published.
-        plan: Of the build.
-        rows: Of the manifest, in the plan's order.
-        fingerprints: Of the stages of each kind of row, by its value.
-        scene_ids: Scenes that are done.
+    This precedes the invalidation of the scenes, so a kill in between only leaves valid checkpoints. `out` is locked
+    and its ready shards are published; `fingerprints` are of the stages of each kind of row, by its value.
     """
     records, wanted = CheckpointStore(out / CHECKPOINTS), set(scene_ids)
     journals, committed = find_journals(list_names(out / WORK)), committed_shards(out)
@@ -53,7 +48,6 @@ def checkpoint_exported_scenes(
 
 
 def _write_tombstone(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:
-    """Write a checkpoint that refers to the scene in its shard."""
     records.write(names[scene_id], TOMBSTONE_PREFIX + scene_id.encode())
 
 
@@ -63,9 +57,5 @@ def _read_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> I
     for scene_id, entry in read_journal(journal).results.items():
         exported = read_result(journal, entry).exported if scene_id in scene_ids else None
         if exported is not None:
-            yield _strip_trajectories(decode(exported))
-
-
-def _strip_trajectories(scene: ExportedScene) -> ExportedScene:
-    files = strip_motions(scene.files)
-    return ExportedScene(scene.scene_id, files, scene.certificate, scene.scene_row, scene.object_rows, scene.task_rows)
+            scene: ExportedScene = decode(exported)
+            yield replace(scene, files=strip_motions(scene.files), trajectory_rows=())

@@ -14,11 +14,7 @@ from workers.state.lock import LOCK, create_writer_lock
 
 
 def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
-    """Reopen scenes; their committed shards stay until the next build has all of their scenes again.
-
-    Returns:
-        Number of shards that the next build will write.
-    """
+    """Reopen scenes, which stay committed until the next build has theirs; returns how many shards it will write."""
     with create_writer_lock(out / WORK / LOCK) as lock:
         publish_ready(out, out / WORK, lock.check)
         return invalidate_scenes(out, read_plan(out / "plan.parquet"), scene_ids)

@@ -14,22 +14,15 @@ from workers.progress.build_state import SceneStatus
 from workers.state.checkpoint_store import CheckpointStore
 from workers.state.ledger import WORK
 
-MARKER = "again.json"
-"""File in the work folder that names the stage and the build, from the invalidation until the build is complete."""
-
+MARKER = "again.json"  # names the stage and the build, from the invalidation until the build is complete
 _STAGE_PLACEHOLDER = "STAGE"
 
 
 def find_first_affected_stage(stages: Sequence[Stage], differing: Collection[str]) -> int | None:
-    """Find the position of the first stage that differing keys of run.json affect.
+    """Find the position of the first stage that differing keys of run.json affect, such as `config.settle.max_time_s`.
 
-    Args:
-        stages: Of a pipeline.
-        differing: Dotted keys, such as `config.settle.max_time_s`.
-
-    Returns:
-        The position; the number of stages if none is affected; None if the whole dataset is: by another seed, manifest
-        or version of a package. Our own code counts as affecting none: its user decides.
+    The number of stages if none is affected; None if the whole dataset is: by another seed, manifest or version of a
+    package. Our own code counts as affecting none: its user decides.
     """
     affected = [len(stages)]
     for key in differing:
@@ -60,20 +53,23 @@ def _find_readers(stages: Sequence[Stage], key: str) -> list[int] | None:
 def find_restart_points(pipelines: Pipelines, kinds: Collection[str], section: str) -> dict[str, int]:
     """Find the first stage to recompute of each kind of scene, for `--from SECTION`."""
     used = {kind.value: stages for kind, stages in pipelines.items() if kind.value in kinds}
-    points = {kind: _find_position(stages, section) for kind, stages in used.items()}
-    if missing := [kind for kind, position in points.items() if position is None]:
+    points = {
+        kind: [position for position, stage in enumerate(stages) if section in (stage.section, stage.name)]
+        for kind, stages in used.items()
+    }
+    if missing := [kind for kind, found in points.items() if not found]:
         known = dict.fromkeys(stage.section for kind in missing for stage in used[kind])
         raise BuildError(f"--from {section[:80]!r}: no such stage for a {missing[0]}; there are {', '.join(known)}")
-    return {kind: position for kind, position in points.items() if position is not None}
+    return {kind: found[0] for kind, found in points.items()}
 
 
-def _find_position(stages: Sequence[Stage], section: str) -> int | None:
-    return next((position for position, stage in enumerate(stages) if section in (stage.section, stage.name)), None)
+def _list_restarts(pipelines: Pipelines, points: Mapping[str, int]) -> list[tuple[str, Sequence[Stage], int]]:
+    return [(kind.value, stages, points[kind.value]) for kind, stages in pipelines.items() if kind.value in points]
 
 
 def is_append_only(pipelines: Pipelines, points: Mapping[str, int]) -> bool:
     """Whether all pipelines restart at a stage that adds to exported scenes, which are then its input."""
-    return all(stages[points[kind.value]].is_post_export for kind, stages in pipelines.items() if kind.value in points)
+    return all(stages[point].is_post_export for _, stages, point in _list_restarts(pipelines, points))
 
 
 def suggest_restart_stage(pipelines: Pipelines, kinds: Collection[str], differing: Collection[str]) -> str:
@@ -92,24 +88,14 @@ def suggest_restart_stage(pipelines: Pipelines, kinds: Collection[str], differin
 def check_upstream_unchanged(
     pipelines: Pipelines, points: Mapping[str, int], differing: Collection[str], section: str, suggestion: str
 ) -> None:
-    """Refuse to keep outputs of stages that a change of the configuration affects.
-
-    Args:
-        pipelines: Stages of each kind of scene.
-        points: First stage to recompute, by kind.
-        differing: Keys of run.json that differ.
-        section: Argument of `--from`.
-        suggestion: Earliest affected stage; empty if the whole build is affected.
-    """
-    for kind, stages in pipelines.items():
-        if kind.value not in points:
-            continue
+    """Refuse to keep outputs of stages that a change affects; `suggestion` is the earliest, or empty for all."""
+    for _, stages, point in _list_restarts(pipelines, points):
         position = find_first_affected_stage(stages, differing)
         if position is None:
             raise BuildError(
                 f"{', '.join(sorted(differing)[:4])} changed, which no --from can make good: give another OUT"
             )
-        if position < points[kind.value]:
+        if position < point:
             raise BuildError(
                 f"{', '.join(sorted(differing)[:4])} changed, which {stages[position].name} reads already: "
                 f"give --from {suggestion} instead of --from {section}, or another OUT"
@@ -121,11 +107,8 @@ def list_scenes_to_recompute(
 ) -> list[str]:
     """List the ids of the scenes that are done, or ended at one of the stages to recompute."""
     kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))
-    recomputed = {
-        kind.value: {stage.name for stage in stages[points[kind.value] :]}
-        for kind, stages in pipelines.items()
-        if kind.value in points
-    }
+    restarts = _list_restarts(pipelines, points)
+    recomputed = {kind: {stage.name for stage in stages[point:]} for kind, stages, point in restarts}
     return [
         scene.scene_id
         for scene in scenes
@@ -135,14 +118,9 @@ def list_scenes_to_recompute(
 
 def delete_checkpoints(records: CheckpointStore, plan: Plan, pipelines: Pipelines, points: Mapping[str, int]) -> None:
     """Delete the checkpoints of the stages to recompute."""
-    stages = {
-        stage.name
-        for kind, stages in pipelines.items()
-        if kind.value in points
-        for stage in stages[points[kind.value] :]
-    }
+    again = {stage.name for _, stages, point in _list_restarts(pipelines, points) for stage in stages[point:]}
     for shard in range(plan.n_shards):
-        records.delete(shard, stages)
+        records.delete(shard, again)
 
 
 def write_rerun_marker(out: StoragePath, section: str, record: Mapping[str, Any]) -> None:

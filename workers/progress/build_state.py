@@ -31,14 +31,12 @@ _TIMINGS = ("scene_id", "stage", "cpu_s", "wall_s")
 _ATTEMPTS = 4
 _N_THREADS = 8
 
+_Listing = tuple[frozenset[int], frozenset[int]]  # shards with a journal, and published ones, listed in this order
+
 
 @dataclass(frozen=True, slots=True)
 class SceneStatus:
-    """A scene that is accounted for.
-
-    Attributes:
-        timings: Of the stages that ran in the build that finished it: (stage, CPU [s], wall [s]).
-    """
+    """A scene that is accounted for."""
 
     scene_id: str
     status: Status
@@ -47,7 +45,7 @@ class SceneStatus:
     detail: str  # one line of explanation
     attempts: int
     shard: int
-    timings: tuple[tuple[str, float, float], ...]
+    timings: tuple[tuple[str, float, float], ...]  # (stage, CPU [s], wall [s]) in the build that finished it
     tar_bytes: int | None  # size of its files in the shard; None if no shard holds them yet
     costs: Mapping[str, ModelCost]  # of the answers of its models, by role
 
@@ -101,11 +99,15 @@ class BuildState:
 
     def compute_stage_costs(self) -> tuple[StageCost, ...]:
         """Compute the CPU times of the stages, in the order in which they ran."""
-        seconds: dict[str, list[float]] = {}
+        times: dict[str, list[float]] = {}
         for scene in self.scenes:
             for stage, cpu_s, _ in scene.timings:
-                seconds.setdefault(stage, []).append(cpu_s)
-        return tuple(_make_stage_cost(stage, sorted(values)) for stage, values in seconds.items())
+                times.setdefault(stage, []).append(cpu_s)
+        ascending = {stage: sorted(seconds) for stage, seconds in times.items()}
+        return tuple(
+            StageCost(stage, len(seconds), median(seconds), seconds[math.ceil(0.9 * len(seconds)) - 1], sum(seconds))
+            for stage, seconds in ascending.items()
+        )
 
     def _count(self, status: str) -> int:
         return sum(scene.status == status for scene in self.scenes)
@@ -120,20 +122,15 @@ def read_build_state(out: StoragePath) -> BuildState:
     return BuildState(
         total=len(plan.scene_ids),
         shards=plan.n_shards,
-        committed=sum(shard.whole for shard in shards),
+        committed=sum(whole for whole, _ in shards),
         published=tuple(sorted(published)),
         fingerprint=run["fingerprint"],
-        scenes=tuple(scene for shard in shards for scene in shard.scenes),
+        scenes=tuple(scene for _, scenes in shards for scene in scenes),
     )
 
 
 def read_committed_scenes(out: StoragePath, shard: int) -> dict[str, SceneStatus]:
-    """Read the scenes of a committed shard.
-
-    Raises:
-        FileNotFoundError: if the shard is being replaced.
-        BuildError: if a table is damaged.
-    """
+    """Read the scenes of a committed shard by id; FileNotFoundError if the shard is being replaced."""
     timings: dict[str, list[tuple[str, float, float]]] = {}
     for row in read_shard(out, "timings", shard, _TIMINGS).to_pylist():
         timings.setdefault(row["scene_id"], []).append((row["stage"], row["cpu_s"], row["wall_s"]))
@@ -170,25 +167,11 @@ def make_scene_status(result: SceneResult, shard: int) -> SceneStatus:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Listing:
-    """Shards with a journal, and published ones, from one listing of each folder, in this order."""
-
-    journals: frozenset[int]
-    published: frozenset[int]
-
-
-@dataclass(frozen=True, slots=True)
-class _Shard:
-    whole: bool
-    scenes: tuple[SceneStatus, ...]
-
-
 def _list_shards(out: StoragePath) -> _Listing:
-    return _Listing(find_journals(list_names(out / WORK)), committed_shards(out))
+    return find_journals(list_names(out / WORK)), committed_shards(out)
 
 
-def _read_shards(out: StoragePath, n_shards: int) -> list[_Shard]:
+def _read_shards(out: StoragePath, n_shards: int) -> list[tuple[bool, list[SceneStatus]]]:
     """Read every shard, in order; in a store several at once, because reads mostly wait for answers."""
     read = partial(_read_with_retries, out, _list_shards(out))
     if not isinstance(out, UPath):
@@ -197,7 +180,7 @@ def _read_shards(out: StoragePath, n_shards: int) -> list[_Shard]:
         return list(threads.map(read, range(n_shards)))
 
 
-def _read_with_retries(out: StoragePath, listing: _Listing, shard: int) -> _Shard:
+def _read_with_retries(out: StoragePath, listing: _Listing, shard: int) -> tuple[bool, list[SceneStatus]]:
     for _ in range(_ATTEMPTS):
         try:
             return _read_shard(out, shard, listing)
@@ -206,22 +189,17 @@ def _read_with_retries(out: StoragePath, listing: _Listing, shard: int) -> _Shar
     return _read_shard(out, shard, listing)
 
 
-def _read_shard(out: StoragePath, shard: int, listing: _Listing) -> _Shard:
-    """Read one shard: results in its journal take precedence over committed rows."""
+def _read_shard(out: StoragePath, shard: int, listing: _Listing) -> tuple[bool, list[SceneStatus]]:
+    """Read whether a shard is whole, and its scenes: results in its journal take precedence over committed rows."""
+    journals, published = listing
     path = journal_path(out, shard)
-    journal = read_journal(path) if shard in listing.journals else EMPTY_JOURNAL
-    whole = shard in listing.published
-    if not whole and shard in listing.journals and not journal.results and is_committed(out, shard):
+    journal = read_journal(path) if shard in journals else EMPTY_JOURNAL
+    whole = shard in published
+    if not whole and shard in journals and not journal.results and is_committed(out, shard):
         raise FileNotFoundError(str(path))
     # one result at a time: each holds all files of its scene
     scenes = [make_scene_status(read_result(path, entry), shard) for entry in journal.results.values()]
     if whole:
         replaced = journal.reopened | set(journal.results)
         scenes += [scene for name, scene in read_committed_scenes(out, shard).items() if name not in replaced]
-    return _Shard(whole and not journal.reopened, tuple(scenes))
-
-
-def _make_stage_cost(stage: str, seconds: list[float]) -> StageCost:
-    """Make the cost of a stage from its CPU times in ascending order [s]."""
-    p90 = seconds[math.ceil(0.9 * len(seconds)) - 1]
-    return StageCost(stage, len(seconds), median(seconds), p90, sum(seconds))
+    return whole and not journal.reopened, scenes

@@ -1,7 +1,6 @@
 """Progress of a build: a live table on a terminal, a line now and then in a log."""
 
 import time
-from types import TracebackType
 
 from rich.console import Console, RenderableType
 from rich.live import Live
@@ -55,9 +54,7 @@ class ProgressDisplay:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leave the last state on the screen, if there was progress."""
         if self._tally is not None and self._tally.accounted > self._tally.before:
             self._draw(time.monotonic())

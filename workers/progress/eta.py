@@ -34,10 +34,7 @@ class ProgressRate:
         self._calls = -1
 
     def update(self, now: float, tally: Tally) -> None:
-        """Add the tally of the time `now` [s].
-
-        Sampling starts with the first finished call: before it, actors start and models load.
-        """
+        """Add the tally of the time `now` [s]; sampling starts when a call has ended, since before it models load."""
         calls = {stage: wall.count for stage, wall in tally.wall.items()}
         total = sum(calls.values()) + tally.accounted
         if total != self._calls:

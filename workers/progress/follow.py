@@ -1,19 +1,18 @@
 """Repeated reads of a running build: committed shards are read once, of journals only new entries."""
 
-from collections import Counter
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed
+from tableverse_factory.rebuild import MANIFEST_STAGE
 from tableverse_factory.run_record import read_run
 from workers.progress.build_state import SceneStatus, make_scene_status, read_committed_scenes
 from workers.progress.tally import Tally
 from workers.state.journal import find_journal_end, find_journals, read_journal, read_result
 from workers.state.ledger import WORK, journal_path
-
-MANIFEST_STAGE = "manifest"
 
 
 @dataclass(slots=True)
@@ -27,16 +26,9 @@ class _OpenShard:
 
 
 class BuildFollower:
-    """Follower of the build in OUT, which only reads.
-
-    A committed shard is read once and then only counted, so that the cost of a read depends on the changes.
-
-    Attributes:
-        shards: Of the plan.
-    """
+    """Follower of the build in OUT, which only reads; the cost of a read depends on the changes since the last one."""
 
     def __init__(self, out: StoragePath) -> None:
-        """Read the plan."""
         self._out = out
         read_run(out / "run.json")
         plan = read_plan(out / "plan.parquet")
@@ -53,7 +45,7 @@ class BuildFollower:
             self._counted = Tally((MANIFEST_STAGE,), self._total, before=0, shards=self.shards)
         for shard in sorted((journals | committed_shards(self._out)) - self._whole):
             self._read_shard(shard)
-        tally = self._copy_counted()
+        tally = deepcopy(self._counted)
         for open_shard in self._open.values():
             _count(tally, open_shard.scenes.values())
         tally.committed = len(self._whole)
@@ -85,16 +77,6 @@ class BuildFollower:
         _count(self._counted, scenes.values())
         self._whole.add(shard)
         del self._open[shard]
-
-    def _copy_counted(self) -> Tally:
-        """Copy the tally of the committed shards."""
-        counted = self._counted
-        tally = Tally(counted.stages, self._total, before=0, shards=self.shards)
-        tally.passed, tally.ended = Counter(counted.passed), Counter(counted.ended)
-        for ours, theirs in ((tally.wall, counted.wall), (tally.cpu, counted.cpu)):
-            for stage, durations in theirs.items():
-                ours[stage].buckets, ours[stage].total_s = list(durations.buckets), durations.total_s
-        return tally
 
 
 def _read_new(open_shard: _OpenShard, path: StoragePath, shard: int) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from html import escape
 from importlib import import_module
-from types import TracebackType
 from typing import Any, Literal
 
 from rich.console import Console, RenderableType
@@ -39,9 +38,7 @@ class NotebookDisplay:
         self._handle = self._publish(_to_mime(Text("preparing …")), raw=True, display_id=True)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._tally is not None:
             self._draw(self._tally, time.monotonic())
 

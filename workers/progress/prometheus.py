@@ -12,8 +12,8 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Literal
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -113,15 +113,14 @@ def collect_samples(
 def prometheus_text(dataset: str, samples: Iterable[Sample]) -> str:
     """Format samples in Prometheus' text format 0.0.4; those of one metric must be adjacent."""
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Collector([_make_family(dataset, *group) for group in itertools.groupby(samples, _get_metric)]))
+    registry.register(
+        _Collector([_make_family(dataset, *group) for group in itertools.groupby(samples, attrgetter("metric"))])
+    )
     return generate_latest(registry).decode()
 
 
 class MetricsFile:
-    """File of the metrics of a build while the block lasts (a `workers.progress.tally.Display`).
-
-    The file is replaced as a whole, at most every five seconds, and at the end.
-    """
+    """File of the metrics of a build while the block lasts, replaced every five seconds and at the end."""
 
     def __init__(self, path: Path, dataset: str) -> None:
         self._path, self._dataset = path, dataset
@@ -140,9 +139,7 @@ class MetricsFile:
             raise InputError(f"--metrics {self._path} cannot be written: {error.strerror or error}") from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._tally is not None:
             self._write(self._tally, running=False)
         with suppress(OSError):
@@ -180,17 +177,11 @@ def dataset_name(out: object) -> str:
 
 
 class _Collector:
-    """Collector of finished metric families."""
-
     def __init__(self, families: list[Family]) -> None:
         self._families = families
 
     def collect(self) -> list[Family]:
         return self._families
-
-
-def _get_metric(sample: Sample) -> Metric:
-    return sample.metric
 
 
 def _make_family(dataset: str, metric: Metric, samples: Iterable[Sample]) -> Family:

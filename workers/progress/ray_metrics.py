@@ -14,10 +14,10 @@ UPDATE_EVERY_S = 2.0
 
 
 class RayMetrics:
-    """Ray's instruments, updated with the changes of a tally (a `workers.progress.tally.Display`).
+    """Ray's instruments, updated with the changes of a tally; Ray puts `ray_` before their names.
 
-    Ray puts `ray_` before the names. A duration is passed on as the middle of its bucket, which is at most 28 %
-    wide; Ray's sums are made of the middles of its own buckets in any case.
+    A duration is passed on as the middle of its bucket, which is at most 28 % wide: Ray's sums are made of middles
+    anyway.
     """
 
     def __init__(self, dataset: str) -> None:

@@ -29,12 +29,7 @@ class _Sizes:
 
 
 def collect_measurements(out: StoragePath, pool_of: Mapping[str, str]) -> BuildSample:
-    """Collect the timings, sizes and tokens of every scene that is accounted for.
-
-    Args:
-        out: The dataset.
-        pool_of: Pool of every stage.
-    """
+    """Collect the timings, sizes and tokens of every scene that is accounted for; `pool_of` every stage."""
     run, plan, state = read_run(out / "run.json"), read_plan(out / "plan.parquet"), read_build_state(out)
     scenes = {scene.scene_id: scene for scene in state.scenes}
     sizes = _measure_sizes(out, state)
@@ -65,7 +60,7 @@ def _measure_sizes(out: StoragePath, state: BuildState) -> _Sizes:
         if not scenes:
             continue
         sizes.tar += [float(scene.tar_bytes or 0) for scene in scenes]
-        tables = sum(_read_size(shard_path(out, table, shard)) for table in _TABLES)
+        tables = sum(shard_path(out, table, shard).stat().st_size for table in _TABLES)
         tables += sum(list_sizes(out / table).get(shard_name(table, shard), 0) for table in SPARSE)
         sizes.tables += [tables / len(scenes)] * len(scenes)
         if shard_stem(shard) in with_checkpoints:
@@ -78,10 +73,6 @@ def _measure_sizes(out: StoragePath, state: BuildState) -> _Sizes:
 
 def _sum_tokens(scenes: Iterable[SceneStatus], field_name: str) -> Values:
     return np.array([sum(getattr(cost, field_name) for cost in scene.costs.values()) for scene in scenes], float)
-
-
-def _read_size(place: StoragePath) -> int:
-    return place.stat().st_size
 
 
 def _collect_stage_times(

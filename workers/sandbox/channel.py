@@ -47,10 +47,7 @@ class Channel:
             raise ChannelClosedError from error
 
     def wait(self, until: float, watch: Callable[[], None]) -> bool:
-        """Wait for a message until the monotonic time `until`, calling `watch` every few milliseconds.
-
-        True if there is something to receive, or the other end is gone.
-        """
+        """Wait until the monotonic time `until`, calling `watch`; True for a message, or if the other end is gone."""
         if self._buffer:
             return True
         while True:

@@ -30,7 +30,7 @@ from tableverse_factory.core.storage.files import parse_path
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.models.services import Services
-from tableverse_factory.stage import Pipelines, Stage
+from tableverse_factory.stage import Pipelines
 from workers.sandbox.channel import Channel, ChannelClosedError
 from workers.sandbox.error_text import bound_drop, bound_failure, make_failure
 from workers.sandbox.messages import InputMissing, StageDone, encode_message
@@ -97,14 +97,15 @@ class StageRunner:
         """Run one stage; every exception becomes its outcome."""
         started, cpu = time.monotonic(), _measure_cpu_s()
         self._meter.reset()
-        stage, last = self._stage(call)
+        stages = self._pipelines[SceneKind(call.kind)]
+        stage = stages[call.position]
         value, trace = b"", ""
         outcome: Dropped | Failed | None = None
         try:
             answer = stage.run(
                 decode(item), self._config, make_rng(self._config.run.seed, call.scene_id, stage.name), self._services
             )
-            if last and isinstance(answer, Done):
+            if call.position == len(stages) - 1 and isinstance(answer, Done):
                 _check_last_output(answer.value, call.scene_id)
             outcome, value = _encode_outcome(answer, stage.name)
         except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row
@@ -112,10 +113,6 @@ class StageRunner:
             trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
         wall_s, spent = time.monotonic() - started, (self._meter.cost, self._meter.paid)
         return StageReport(outcome, 1, _measure_cpu_s() - cpu, wall_s, trace, *spent), value
-
-    def _stage(self, call: StageCall) -> tuple[Stage, bool]:
-        stages = self._pipelines[SceneKind(call.kind)]
-        return stages[call.position], call.position == len(stages) - 1
 
 
 def load_pipelines(reference: str) -> Pipelines:

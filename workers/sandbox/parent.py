@@ -28,11 +28,7 @@ _MB = 1_000_000
 _TRACE_CHARS = 4000
 _STDERR_TAIL_BYTES = 64 * 1024
 _THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "BLIS_NUM_THREADS",
+    *(f"{library}_NUM_THREADS" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "BLIS")),
     "VECLIB_MAXIMUM_THREADS",
 )
 
@@ -86,8 +82,6 @@ class Sandbox:
 
 
 class _Child:
-    """One child process."""
-
     def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
         self._setup = setup
         self._errors: BinaryIO = tempfile.TemporaryFile()  # noqa: SIM115 closed in kill

@@ -52,10 +52,7 @@ _PACK = ".pack"
 
 
 def fingerprint_stages(stages: Sequence[Stage], config: Config, recorded: Mapping[str, object]) -> dict[str, str]:
-    """Hash everything that decides the output of each stage besides its input.
-
-    `recorded` is what stages read besides their input and the configuration, by stage.
-    """
+    """Hash what decides each stage's output besides its input: the configuration, and what is `recorded` for it."""
     return {
         stage.name: content_hash(
             json.dumps([config.run.seed, stage.name, stage.select_values(config), recorded.get(stage.name)]).encode()
@@ -65,10 +62,7 @@ def fingerprint_stages(stages: Sequence[Stage], config: Config, recorded: Mappin
 
 
 def name_checkpoints(shard: int, row: ImageRow, fingerprints: Mapping[str, str]) -> tuple[str, ...]:
-    """Name the checkpoint of each stage for a row; empty for the last, whose output is the scene's result.
-
-    `fingerprints` are of the pipeline's stages, in order.
-    """
+    """Name the checkpoint of each stage for a row; empty for the last, whose output is the scene's result."""
     key = content_hash(row.model_dump_json().encode())
     names = []
     for stage, fingerprint in fingerprints.items():

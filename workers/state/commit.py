@@ -106,19 +106,12 @@ def commit_shard(
     guard: Callable[[], None],
     post_export: Mapping[str, Sequence[str]],
 ) -> int:
-    """Write and publish a shard.
+    """Write and publish a shard; returns the bytes of its scenes and tables.
 
-    Args:
-        out: The dataset.
-        work: Folder of the work in progress, on the same file system or in the same store.
-        number: Of the shard.
-        rows: Its manifest rows, in the plan's order.
-        read_result: Returns a scene's new result, or None if what the committed shard has of it stays.
-        guard: Called before each step that others see; raises if this process is no longer the writer.
-        post_export: Tables that each post-export stage writes.
-
-    Returns:
-        Bytes of the scenes and the tables.
+    `work` is on the same file system or in the same store, `rows` are in the plan's order. `read_result` returns a
+    scene's new result, or None if what the committed shard has of it stays. `guard` is called before each step that
+    others see and raises if this process is no longer the writer. `post_export` has the tables that each post-export
+    stage writes.
     """
     staging = _staging(work, number)
     remove_folder(staging)
@@ -131,13 +124,7 @@ def commit_shard(
 
 
 def publish_ready(out: StoragePath, work: StoragePath, guard: Callable[[], None] = lambda: None) -> None:
-    """Finish commits that a kill interrupted after their decision, and discard the others.
-
-    Args:
-        out: The dataset.
-        work: Folder of the work in progress.
-        guard: See `commit_shard`.
-    """
+    """Finish commits that a kill interrupted after their decision, and discard the others."""
     names = list_names(work)
     abort_uploads(out)
     for name in names:
@@ -199,21 +186,13 @@ def _add_scene(
         scene = {**scene, "n_trajectories": len(rows["trajectories"]), "n_successes": successes}
     scene = {
         **scene,
+        **{name: getattr(row, name) or None for name in ("name", "url", "source", "licence", "content_sha256")},
+        **{name: getattr(result, name) or None for name in ("reason", "error_kind", "detail")},
+        **{name: getattr(result, name) for name in ("status", "stage", "attempts")},
         "scene_id": row.scene_id,
         "kind": row.kind.value,
-        "name": row.name or None,
-        "url": row.url or None,
-        "source": row.source or None,
         "uri": row.uri,
-        "licence": row.licence or None,
         "licence_verdict": scene_license({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
-        "content_sha256": row.content_sha256 or None,
-        "status": result.status,
-        "stage": result.stage,
-        "reason": result.reason or None,
-        "error_kind": result.error_kind or None,
-        "detail": result.detail or None,
-        "attempts": result.attempts,
         **make_cost_columns(result.costs),
         "shard": number,
         "tar_offset": offset,

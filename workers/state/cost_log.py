@@ -20,15 +20,11 @@ FOLDER = ".spent"
 
 
 class CostLog:
-    """Cost log of one process.
-
-    Attributes:
-        grant: Name of the allowance that is being spent.
-    """
+    """Cost log of one process."""
 
     def __init__(self, out: StoragePath) -> None:
         """Nothing is created until something is spent."""
-        self.grant = ""
+        self.grant = ""  # name of the allowance that is being spent
         self._folder = out / FOLDER
         self._name = secrets.token_hex(8)
         self._count = 0

@@ -50,10 +50,6 @@ class Journal(ABC):
     """Journal of one shard, open for appending by one writer.
 
     Every method raises BuildError if the disk or the store refuses, or another process writes this journal.
-
-    Attributes:
-        results: The latest result of each scene.
-        reopened: Scenes that were taken back.
     """
 
     def __init__(self, state: JournalState) -> None:
@@ -91,10 +87,7 @@ class Journal(ABC):
 
 
 def scan_journal(stream: BinaryIO, start: int, base: int = 0) -> Iterator[JournalFrame]:
-    """Read the whole frames of a file or object, up to the first that is torn.
-
-    `base` is where the stream begins in the journal, its `JournalEntry.segment` [bytes].
-    """
+    """Read the whole frames of a file or object up to the first torn one; `base` is where it begins in the journal."""
     for span in scan_frames(stream, start):
         yield JournalFrame(span.label[:1], span.label[1:].decode(), JournalEntry(base + span.offset, span.size, base))
 

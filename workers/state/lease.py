@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from upath import UPath
@@ -26,7 +25,6 @@ LEASE_S = 30.0  # age at which a lease that was not renewed has expired [s]
 
 _HEARTBEAT_S = 5.0
 _SAFE_S = LEASE_S - 10.0  # how long a holder trusts its lease after it sent the last renewal that succeeded [s]
-
 _POLL_S = 1.0
 
 
@@ -70,9 +68,7 @@ class Lease:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Release the lease, unless it was lost."""
         self._ended.set()
         self._thread.join()

@@ -19,10 +19,6 @@ class Ledger:
     """Record of every scene of the plan, which is either pending, in its shard's journal, or committed.
 
     Needs the writer lock. A result is safe from kills when `record` returns.
-
-    Attributes:
-        bytes_committed: Of the shards that were written here.
-        damaged: A message for each journal that cannot be read in part.
     """
 
     def __init__(
@@ -39,8 +35,8 @@ class Ledger:
         has the tables that each post-export stage writes.
         """
         self._guard, self._post_export = guard, post_export or {}
-        self.bytes_committed = 0
-        self.damaged: list[str] = []
+        self.bytes_committed = 0  # of the shards that were written here
+        self.damaged: list[str] = []  # a message for each journal that cannot be read in part
         self._out, self._work = out, out / WORK
         self._plan, self._rows, self._members = plan, rows, plan.members()
         self._ranks = {scene_id: rank for rank, scene_id in enumerate(plan.scene_ids)}

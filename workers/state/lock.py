@@ -1,14 +1,17 @@
 """Lock for one writer per OUT: a kernel file lock on the disk, a lease in an object store."""
 
+import fcntl
+import os
 from collections.abc import Callable
-from types import TracebackType
+from pathlib import Path
 from typing import Protocol, Self
 
 from upath import UPath
 
-from tableverse_factory.core.storage.files import StoragePath
-from workers.state.file_lock import FileLock, describe_file_lock
+from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.storage.files import StoragePath, make_write_error
 from workers.state.lease import Lease, describe_lease
+from workers.state.lock_owner import describe_owner, encode_owner, identify_process
 
 LOCK = "lock"  # its name in the folder of the work
 
@@ -18,12 +21,56 @@ class WriterLock(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
     def check(self) -> None:
         """Check the lock before anything is written."""
+
+
+class FileLock:
+    """Lock on a file, held for as long as the process lives or the block lasts (see `WriterLock`)."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._descriptor = -1
+
+    def __enter__(self) -> Self:
+        try:
+            while not self._acquire():
+                pass
+        except OSError as error:
+            raise make_write_error(self._path, error) from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the folder of the work if it is empty; the file goes before the lock does."""
+        folder = self._path.parent
+        if folder.is_dir() and [path.name for path in folder.iterdir()] == [self._path.name]:
+            self._path.unlink()
+            folder.rmdir()
+        os.close(self._descriptor)
+
+    def check(self) -> None:
+        """Do nothing: a kernel lock cannot be lost."""
+
+    def _acquire(self) -> bool:
+        """Lock the file; False if its last holder removed it meanwhile, so that a new one must be created."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            same = self._path.exists() and os.path.samestat(os.fstat(descriptor), self._path.stat())
+        except BlockingIOError:
+            owner = os.read(descriptor, 1000)
+            os.close(descriptor)
+            raise BuildError(describe_owner(self._path.parent.parent, owner)) from None
+        if not same:
+            os.close(descriptor)
+            return False
+        os.truncate(descriptor, 0)
+        os.write(descriptor, encode_owner(identify_process()))
+        self._descriptor = descriptor
+        return True
 
 
 def create_writer_lock(path: StoragePath, note: Callable[[str], None] | None = None) -> WriterLock:
@@ -33,4 +80,18 @@ def create_writer_lock(path: StoragePath, note: Callable[[str], None] | None = N
 
 def describe_writer(path: StoragePath) -> str | None:
     """Describe who holds the lock at `path`; None if it is free."""
-    return describe_lease(path) if isinstance(path, UPath) else describe_file_lock(path)
+    return describe_lease(path) if isinstance(path, UPath) else _describe_file_lock(path)
+
+
+def _describe_file_lock(path: Path) -> str | None:
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return describe_owner(path.parent.parent, os.read(descriptor, 1000))
+    finally:
+        os.close(descriptor)
+    return None

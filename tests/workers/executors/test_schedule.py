@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from workers.executors.schedule import (
     MAX_BATCH,
     MIN_GAIN,
-    Assignment,
     PoolLimits,
     ReadyScene,
     ScheduleLimits,
@@ -49,20 +48,20 @@ def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
     alive = {pool: busy[pool] + idle[pool] for pool in POOLS}
     known = {scene.rank: scene for scene in ready}
     chosen = assign_scenes(ready, workers, alive, sizes, dict.fromkeys(POOLS, batch))
-    ranks = [rank for choice in chosen for rank in choice.ranks]
-    taken = [choice.worker for choice in chosen]
+    ranks = [rank for _, called in chosen for rank in called]
+    taken = [worker for worker, _ in chosen]
     assert len(set(ranks)) == len(ranks)
     assert len(set(taken)) == len(taken)
     gone = scale_down(workers, alive, sizes)
-    for choice in chosen:
-        assert 1 <= len(choice.ranks) <= batch
-        (pool,) = {known[rank].pool for rank in choice.ranks}
-        assert choice.worker in workers[pool]
-        assert len(choice.ranks) == 1 or not any(known[rank].alone for rank in choice.ranks)
+    for worker, called in chosen:
+        assert 1 <= len(called) <= batch
+        (pool,) = {known[rank].pool for rank in called}
+        assert worker in workers[pool]
+        assert len(called) == 1 or not any(known[rank].alone for rank in called)
     started = Counter(scale_up(ready, workers, alive, sizes))
     for pool in POOLS:
         assert started[pool] == 0 or alive[pool] + started[pool] <= sizes[pool]
-        working = busy[pool] + sum(choice.worker in workers[pool] for choice in chosen)
+        working = busy[pool] + sum(worker in workers[pool] for worker, _ in chosen)
         assert working <= max(busy[pool], sizes[pool])
         left = alive[pool] - sum(worker in workers[pool] for worker in gone)
         assert left == alive[pool] or left >= sizes[pool]
@@ -71,14 +70,14 @@ def test_limits_hold_and_nobody_works_twice(ready, idle, busy, sizes, batch):
 def test_what_is_near_the_end_goes_first_then_the_order_of_the_plan():
     ready = [ReadyScene(3, "a", 5), ReadyScene(9, "a", 1), ReadyScene(2, "a", 5), ReadyScene(1, "b", 2)]
     chosen = assign_scenes(ready, {"a": [7]}, {"a": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 1})
-    assert chosen == (Assignment(7, (9,)),)
+    assert chosen == ((7, (9,)),)
     assert scale_up(ready, {}, {"a": 1}, {"a": 2, "b": 1}) == ("a", "b")
 
 
 def test_a_batch_leaves_work_for_the_other_workers():
     ready = [ReadyScene(rank, "a", 1) for rank in range(10)]
     chosen = assign_scenes(ready, {"a": [1, 2]}, {"a": 2}, {"a": 2}, {"a": 64})
-    assert [choice.ranks for choice in chosen] == [tuple(range(5)), tuple(range(5, 10))]
+    assert [called for _, called in chosen] == [tuple(range(5)), tuple(range(5, 10))]
 
 
 @pytest.mark.heavy
@@ -159,10 +158,10 @@ def test_every_scene_ends_whatever_order_calls_return_in(n, stages, sizes, batch
         for pool in scale_up(ready, free, alive, sizes):
             starting.add(len(pool_of))
             pool_of[len(pool_of)] = pool
-        for choice in assign_scenes(ready, free, alive, sizes, batches):
-            idle.discard(choice.worker)
-            waiting -= set(choice.ranks)
-            running[choice.worker] = choice.ranks
+        for worker, called in assign_scenes(ready, free, alive, sizes, batches):
+            idle.discard(worker)
+            waiting -= set(called)
+            running[worker] = called
         assert running or starting, "nothing runs although scenes wait"
         for pool in POOLS:
             assert sum(pool_of[worker] == pool for worker in running) <= sizes[pool]

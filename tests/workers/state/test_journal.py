@@ -13,8 +13,7 @@ from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from workers.run import run_build
-from workers.state.file_journal import FileJournal
-from workers.state.journal import read_journal, read_result
+from workers.state.journal import FileJournal, read_journal, read_result
 
 
 def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneResult:
@@ -90,7 +89,7 @@ import resource, signal
 from pathlib import Path
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
-from workers.state.file_journal import FileJournal
+from workers.state.journal import FileJournal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 journal = FileJournal(Path({str(tmp_path / "j")!r}))
