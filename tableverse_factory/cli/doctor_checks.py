@@ -164,7 +164,7 @@ def _check_extras() -> Iterator[Check]:
         there = find_spec(module) is not None
         advice = "" if there else f"not needed; for pictures without depth (docs/models.md): pip install '{source}'"
         yield Check(f"depth model {name}", False, there, "installed" if there else "not installed", advice)
-    yield Check("weights", False, True, "none needed: every door has an embedded default (docs/models.md)")
+    yield Check("weights", False, True, "none needed: every model has an embedded default (docs/models.md)")
 
 
 def _find_version(package: str) -> str | None:

@@ -127,22 +127,25 @@ def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str,
     found = Counter(row["perception"] or "none" for row in _select_done(scenes, "perception"))
     rows = [("perception", name, count) for name, count in _sort_by_count(found)]
     rows += [("judge", name, count) for name, count in _sort_by_count(verdicts.judges)]
-    parts = [_format_table(("door", "answered by", "done scenes"), rows)]
+    parts = [_format_table(("role", "model", "done scenes"), rows)]
     if spent:
-        head = ("asked by the", "calls", "tokens read", "tokens written", "USD")
+        head = ("role", "calls", "input tokens", "output tokens", "USD")
         paid = [
             (asker, cost.calls, cost.input_tokens, cost.output_tokens, f"{cost.usd:.4g}" if cost.usd else "–")
             for asker, cost in spent.items()
         ]
-        parts += ["What their answers cost when they were first given:", _format_table(head, paid)]
+        parts += ["Cost of their answers when first given:", _format_table(head, paid)]
     if (agreement := verdicts.agreement) is not None:
         parts.append(
-            f"Beside the rules, over {agreement.scenes} scenes: same gate {agreement.usable_share:.0%}, "
+            f"Agreement with the rules, over {agreement.scenes} scenes: same gate {agreement.usable_share:.0%}, "
             f"score {agreement.score_difference:+.1f}, same nouns {agreement.names_share:.0%}, "
             f"masses × {agreement.mass_ratio:.2f}, tasks shared {agreement.tasks_share:.0%}."
         )
     if verdicts.remarks:
-        parts += ["Not taken as answered:", _format_table(("remark", "times"), _sort_by_count(verdicts.remarks))]
+        parts += [
+            "Corrected or rejected answers:",
+            _format_table(("remark", "times"), _sort_by_count(verdicts.remarks)),
+        ]
     return "\n\n".join(parts)
 
 

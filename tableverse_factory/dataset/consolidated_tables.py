@@ -21,7 +21,7 @@ from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.shards import SPARSE, shard_name, shard_stem
 
 MERGED = "merged"
-MANY_SHARDS = 16  # datasets of up to so many shards have no merged tables, which would gain nothing
+MANY_SHARDS = 16  # up to this number of shards a dataset has no merged tables, which would gain nothing
 MADE_FROM = b"tableverse.shards"  # metadata key of the digest of a merged table's shards (`digest_shards`)
 
 

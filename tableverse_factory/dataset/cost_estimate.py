@@ -105,7 +105,7 @@ class CostEstimate:
 def estimate_cost(
     measured: BuildSample, scenes: int, pools: Pools, cluster: ClusterSize | None, prices: Mapping[str, float]
 ) -> CostEstimate:
-    """Estimate the cost of a build of so many scenes like the measured ones; missing `PRICES` are 0."""
+    """Estimate the cost of a build of `scenes` scenes like the measured ones; missing `PRICES` are 0."""
     if measured.scenes < MIN_SCENES:
         raise BuildError(
             f"{measured.scenes} scenes with timings are too few to say what {scenes} will take: build at least "

@@ -137,7 +137,7 @@ def redact_uri(uri: str) -> str:
     try:
         parts = urlsplit(uri)
         on_the_web = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # nobody can say where the host ends and a password begins
+    except ValueError:  # it is undecidable where the host ends and a password begins
         return ""
     if on_the_web:
         return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))

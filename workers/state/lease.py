@@ -2,7 +2,7 @@
 
 It is created by a write that fails if the object exists, and renewed or taken over by writes that fail if it has
 changed. Its age is measured by the store's clock; the machines' clocks do not matter. A holder that cannot renew in
-time stops well before anybody else may take the lease, and its pending writes are aborted.
+time stops well before another process may take the lease, and its pending writes are aborted.
 """
 
 import secrets

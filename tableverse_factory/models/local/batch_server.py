@@ -101,7 +101,7 @@ class _ConnectionQueue:
         self._last_client_s = time.monotonic()
 
     def gather(self, most: int) -> dict[socket.socket, Arrays]:
-        """Receive the next questions, at most so many; none if no client has been connected for a while."""
+        """Receive the next questions, at most `most`; none if no client has been connected for a while."""
         batch: dict[socket.socket, Arrays] = {}
         until = float("inf")
         while len(batch) < most and (left := until - time.monotonic()) > 0:

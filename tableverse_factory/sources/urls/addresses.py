@@ -39,7 +39,7 @@ def redact_url(text: str) -> str:
     try:
         url = httpx.URL(text).copy_with(userinfo=b"", query=None, fragment=None)
     except (httpx.InvalidURL, ValueError, TypeError):
-        # Nobody can say where a password ends in what is no address.
+        # Where a password ends in an invalid address is undecidable.
         return sanitize_line(text.partition("?")[0].partition("#")[0].rpartition("@")[2], 200)
     return sanitize_line(str(url), MAX_URL_CHARS)
 
