@@ -52,7 +52,8 @@ class Stage:
 
     def select_values(self, config: Config) -> dict[str, Any]:
         """Select what it reads of a configuration, by dotted key, without the deadline, which changes no output."""
-        tree, found = config.model_dump(mode="json"), dict[str, Any]()
+        tree = config.model_dump(mode="json")
+        found: dict[str, Any] = {}
         for name in self.reads:
             section, _, key = name.partition(".")
             keys = [key] if key else [key for key in tree[section] if key != "deadline_s"]

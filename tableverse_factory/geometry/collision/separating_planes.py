@@ -24,7 +24,10 @@ MIN_RISE = 0.1
 
 
 class PosedPieces:
-    """The pieces of a body, rotated about the origin, then shifted; boxes of each (k, 3) and of all in between [m]."""
+    """The pieces of a body, rotated about the origin, then shifted [m].
+
+    `low` and `high` are the corners of each piece's box (k, 3), `least` and `most` those of the box of all.
+    """
 
     def __init__(self, solids: Solids, rotation: Matrix3, shift: Vector3) -> None:
         self.solids, self.rotation, self.shift = solids, rotation, shift

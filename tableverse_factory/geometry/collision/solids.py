@@ -65,7 +65,8 @@ def find_near_pieces(
 ) -> Iterator[tuple[float, coal.DistanceResult]]:
     """Find pairs of pieces that come within `reach_m` [m], with `a` moved by `offset` [m].
 
-    Yields the gap [m] and coal's result, whose object is reused. Overlaps are negative, or 0 for less work: `signed`.
+    Yields the gap [m] and coal's result, whose object is reused for the next pair. Gaps of pieces that overlap are
+    negative if `signed`, else 0, for less work.
     """
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = signed

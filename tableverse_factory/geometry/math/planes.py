@@ -169,7 +169,11 @@ def is_inside_outline(
 
 
 def fit_min_rectangle(points: Points2) -> Rectangle:
-    """Fit the rectangle of least area around all points (one of its sides lies on an edge of their hull)."""
+    """Fit the rectangle of least area around all points (one of its sides lies on an edge of their hull).
+
+    Raises:
+        GeometryError: if the points lie on a line.
+    """
     try:
         hull = points[ConvexHull(points).vertices]
     except (QhullError, ValueError) as error:

@@ -24,6 +24,9 @@ def make_closed_solid(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
 
     The least repair that works is taken: none (empty), `merged` (vertices that coincide), `oriented` (faces turned),
     `filled` (small holes capped), `remeshed` (voxels). Shells inside one another or overlapping count as one body.
+
+    Raises:
+        GeometryError: if the mesh has no finite triangles, or encloses nothing even then.
     """
     check_mesh(mesh, "mesh")
     low, high = aabb(mesh.vertices)

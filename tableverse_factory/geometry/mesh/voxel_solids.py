@@ -91,9 +91,9 @@ def simplify_solid(solid: manifold3d.Manifold, max_faces: int, tolerance: float)
     vertices, faces = o3d.utility.Vector3dVector(mesh.vertices.copy()), o3d.utility.Vector3iVector(mesh.faces.copy())
     # Quadric error decimation (Garland and Heckbert, SIGGRAPH 1997).
     raw = o3d.geometry.TriangleMesh(vertices, faces).simplify_quadric_decimation(max_faces)
-    left = np.asarray(raw.triangles, dtype=np.int32).copy()
+    decimated = TriangleMesh(np.asarray(raw.vertices).copy(), np.asarray(raw.triangles, dtype=np.int32).copy())
     try:
-        return to_manifold(TriangleMesh(np.asarray(raw.vertices).copy(), left))
+        return to_manifold(decimated)
     except GeometryError:
         for _ in range(12):
             tolerance *= 1.5

@@ -46,7 +46,12 @@ class Registration(Frozen):
 
 
 def register(mesh: TriangleMesh, view: PartialView) -> Registration:
-    """Estimate pose and size of a mesh, in its own frame with z up as it usually stands and any unit, from one view."""
+    """Estimate pose and size of a mesh from one view; its own frame has z up as it usually stands, and any unit.
+
+    Raises:
+        GeometryError: if there are too few points or they lie on a line, if the mesh has no surface, or if either is
+            not finite.
+    """
     _check_inputs(mesh, view.points)
     middle = box_center(mesh)
     ours = sample_mesh(mesh, middle)

@@ -62,7 +62,11 @@ def resolve_hub_name(weights: str, key: str) -> HubWeights | None:
 
 
 def resolve_source(weights: str, key: str) -> tuple[str, dict[str, str]]:
-    """Return the arguments of `from_pretrained`: a path, or a name on the hub and its revision."""
+    """Return the arguments of `from_pretrained`: a path, or a name on the hub and its revision.
+
+    Raises:
+        ModelAccessError: if there is no such path, or as `resolve_hub_name`.
+    """
     hub = resolve_hub_name(weights, key)
     if hub is not None:
         return hub.name, {"revision": hub.revision} if hub.revision else {}

@@ -87,10 +87,10 @@ class BoundedClient(httpx.AsyncClient):
         is_success = response.status_code < 300
         if is_success and response.headers.get("content-encoding", "identity") != "identity":
             raise TransientError("the answer is compressed, which was not asked for")
-        data = bytearray()
+        data, most = bytearray(), self._endpoint.max_body_bytes
         async for chunk in response.aiter_raw():
             data += chunk
-            if len(data) > (most := self._endpoint.max_body_bytes):
+            if len(data) > most:
                 raise ModelError(f"{format_host(self._endpoint.base_url)}: the answer is longer than {most} bytes")
         body = _parse_json(data)
         header = response.headers.get("retry-after")

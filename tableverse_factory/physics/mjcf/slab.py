@@ -34,7 +34,8 @@ def fit_slab(table: Table, meshes: Sequence[TriangleMesh], poses: Sequence[Pose]
     """Widen the table's rectangle until every object stands `OBJECT_MARGIN_M` inside its edges."""
     low, high = -table.half_size_xy, np.array(table.half_size_xy)
     for mesh, pose, scale in zip(meshes, poses, scales, strict=True):
-        corners = np.array([*product(*zip(*aabb(mesh.vertices), strict=True))])
+        sides = np.stack(aabb(mesh.vertices), axis=1)  # lowest and highest coordinate along each axis, (3, 2)
+        corners = np.array(list(product(*sides)))
         along = _rotate_to_slab(transform_points(pose, corners, scale)[:, :2] - table.center_xy, table.yaw)
         low = np.minimum(low, along.min(axis=0) - OBJECT_MARGIN_M)
         high = np.maximum(high, along.max(axis=0) + OBJECT_MARGIN_M)

@@ -67,8 +67,10 @@ class PreviewRenderer:
         colors: Float32[np.ndarray, "h w 3"] = plain[ids]
         triangles, uv = answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
         for index, mesh in enumerate(self._parts):
+            if mesh.texture is None and mesh.vertex_colors is None:
+                continue
             here = np.nonzero(ids == index)
-            if not len(here[0]) or (mesh.texture is None and mesh.vertex_colors is None):
+            if not len(here[0]):
                 continue
             faces, inside = triangles[here], uv[here]
             weights = np.stack([1.0 - inside.sum(axis=1), inside[:, 0], inside[:, 1]], axis=1)

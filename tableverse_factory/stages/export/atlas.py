@@ -18,7 +18,11 @@ FINE_TEXELS = 1.5  # a face of this size [texels] shows all its detail in the sm
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Atlas(Frozen):
-    """Places of the faces in a texture [texels]: side and first texel (column, row) of a square, and `second` half."""
+    """Places of the faces in a texture of `side` x `side` texels.
+
+    Each face has one half of a square of `square` texels a side, whose first texel is at `corner` (column, row): the
+    half away from that texel where `second` is true.
+    """
 
     side: int
     square: Int64[np.ndarray, " m"]

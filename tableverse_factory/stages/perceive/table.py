@@ -105,7 +105,8 @@ def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generat
 def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
     """Refit the table to a higher plane that fills more of the box in which a detector sees the table.
 
-    Unchanged where the found table fills enough of the box, whose rest objects hide, or no higher one fills more.
+    Unchanged where the found table fills enough of the box (objects hide the rest), or no higher plane fills more of
+    it: a floor may be taken for a table, never the reverse.
     """
     x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
     inside = np.zeros(view.valid.shape, dtype=bool)
@@ -227,7 +228,8 @@ def _build_view(
 def _level_plane(plane: Plane, others: list[Plane], points: Points, tolerance: Float64[np.ndarray, " n"]) -> Plane:
     """Turn the plane about its middle to the normal that it shares with the floor, shelves and other parallel planes.
 
-    Points are weighted by angle, not by metres: a depth model bends far ones by more.
+    A wide floor tells more about gravity than a small table. Points are weighted by angle, not by metres: a depth model
+    bends far ones by more.
     """
     step = max(1, len(points) // SAMPLES)
     points, tolerance = points[::step], tolerance[::step]

@@ -33,7 +33,11 @@ _JPEG_QUALITY = 92
 
 
 def detect_with_vlm(view: TableView, config: PerceiveConfig, services: Services) -> DetectionResult | Dropped:
-    """Detect boxes with the model, by the rules of the paper's appendix A; unusable answers drop the row."""
+    """Detect boxes with the model, by the rules of the paper's appendix A.
+
+    Drops: `detector_answer_invalid` (no usable answer, also after a round of repair), `detector_answer_refused` (the
+    model refuses this picture), `no_table_detected`.
+    """
     try:
         record = request_detections(view.observation.color, config, services)
     except AnswerInvalidError as error:

@@ -59,7 +59,12 @@ class ParsedAnswer:
 
 
 def parse_detections(text: str, order: BoxOrder, sent: ImageSize) -> ParsedAnswer:
-    """Parse a model's text; unreadable entries are left out with a remark, most of them make the answer invalid."""
+    """Parse a model's text; unreadable entries are left out one by one, with a remark.
+
+    Raises:
+        AnswerInvalidError: if there is no JSON object or none of the two lists, the unit of the boxes is unclear,
+            there are too many entries, or most are unreadable.
+    """
     answer = _extract_object(text)
     detections, composites = _read_list(answer, "detections"), _read_list(answer, "composites")
     if "detections" not in answer and "composites" not in answer:
