@@ -39,7 +39,7 @@ def test_a_scene_that_is_opened_asks_for_its_own_shard(dataset):
         assert shelf.find_dropped_row("s-1-0") is None
         scene = shelf.open("s-1-0")
         assert [row["label"] for row in scene.object_rows] == ["mug"]
-        assert scene.task_rows == tuple(open_dataset(dataset).scene("s-1-0").task_rows())
-        assert scene.motion_rows == ()
+        assert tuple(scene.scene.task_rows()) == tuple(open_dataset(dataset).scene("s-1-0").task_rows())
+        assert tuple(scene.scene.trajectory_rows()) == ()
         tables = {f"{table}/shard-00001.parquet": 1 for table in ("scenes", "objects", "tasks", "trajectories")}
         assert server.asked - Counter(["plan.parquet"]) == {**tables, "mjcf/shard-00001.tar": 1}

@@ -42,26 +42,17 @@ PLACES, GRASPS, RECHECK, ROLLOUT, CHANGED = "placements", "grasps", "recheck", "
 
 @dataclass(slots=True)
 class TaskCost:
-    """Cost and outcome of one task.
-
-    Attributes:
-        free: Whether no other object at its height stands within `FREE_M` of the object.
-        ended: Empty for a success, else the reason of the failure.
-        tried: Number of pairs of grasp and placement that were tried.
-        survives: Perturbations under which it succeeds too.
-        cpu_s: CPU time by part that was reached; of paths, inverse kinematics and timing the mean per problem [s].
-        path_lengths_rad: Length of the path of each problem of the planner [rad]; None if it was not solved.
-    """
+    """Cost and outcome of one task."""
 
     scene_id: str
     task_id: str
     relation: str
-    free: bool = False
-    ended: str = ""
-    tried: int = 0
-    survives: tuple[str, ...] = ()
-    cpu_s: dict[str, float] = field(default_factory=dict)
-    path_lengths_rad: list[float | None] = field(default_factory=list)
+    free: bool = False  # whether no other object at its height stands within `FREE_M` of the object
+    ended: str = ""  # empty for a success, else the reason of the failure
+    tried: int = 0  # pairs of grasp and placement that were tried
+    survives: tuple[str, ...] = ()  # perturbations under which it succeeds too
+    cpu_s: dict[str, float] = field(default_factory=dict)  # by part reached; of paths, IK and timing per problem [s]
+    path_lengths_rad: list[float | None] = field(default_factory=list)  # by problem of the planner; None if unsolved
 
 
 def bench_trajectories(
@@ -71,15 +62,7 @@ def bench_trajectories(
     most: int | None = None,
     on_task: Callable[[], None] | None = None,
 ) -> list[TaskCost]:
-    """Solve every accepted task as the stage does, in this process; then measure its parts one by one.
-
-    Args:
-        scenes: Exported scenes.
-        config: `run.seed` and the section `trajectories`.
-        services: Services of the grasp models.
-        most: Most tasks per scene.
-        on_task: Called after each task.
-    """
+    """Solve every accepted task, at most `most` per scene, as the stage does; then measure its parts one by one."""
     arm = load_arm(config.trajectories.robot)
     costs = []
     for scene in scenes:
@@ -202,21 +185,14 @@ def _find_last_index(motion: Motion, phase: Phase) -> int:
 
 @dataclass(frozen=True, slots=True)
 class OutcomeCounts:
-    """Outcomes of tasks.
-
-    Attributes:
-        free: Number of tasks whose object is free.
-        free_succeeded: Number of successes among these.
-        reasons: Number of failures by reason, most frequent first.
-        survived: Share of the successes that also succeed under each perturbation.
-    """
+    """Outcomes of tasks, by relation unless stated."""
 
     tasks: Mapping[str, int]
     succeeded: Mapping[str, int]
-    free: Mapping[str, int]
-    free_succeeded: Mapping[str, int]
-    reasons: Mapping[str, int]
-    survived: Mapping[str, float]
+    free: Mapping[str, int]  # tasks whose object is free
+    free_succeeded: Mapping[str, int]  # successes among these
+    reasons: Mapping[str, int]  # failures by reason, most frequent first
+    survived: Mapping[str, float]  # share of the successes that also succeed under each perturbation
 
 
 ALL = "all"
