@@ -66,6 +66,6 @@ def _defer_interrupt() -> Iterator[None]:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         if in_main_thread:
-            signal.signal(signal.SIGINT, handler)
+            signal.signal(signal.SIGINT, signal.SIG_DFL if handler is None else handler)  # None: not set by Python
     if interrupts:
         signal.raise_signal(signal.SIGINT)
