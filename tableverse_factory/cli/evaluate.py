@@ -54,8 +54,7 @@ def evaluate_collisions(
     Example: `tableverse evaluate collisions --method ours=out --method midi=midi/ --epsilon 0.001`
     """
     from tableverse_factory.evaluation.methods.collisions import measure_method
-    from tableverse_factory.evaluation.methods.methods import parse_methods
-    from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, find_scenes
+    from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, find_scenes, parse_methods
 
     cache = None if meshes_only else get_cache_dir()
     methods = parse_methods(paths or [], method or [])
@@ -123,8 +122,8 @@ def evaluate_gpt_score(
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.methods.comparison import check_shared_scenes, match_methods
     from tableverse_factory.evaluation.methods.grid_judges import make_grid_judge
-    from tableverse_factory.evaluation.methods.methods import parse_methods
     from tableverse_factory.evaluation.methods.score import ask_all, write_grids
+    from tableverse_factory.evaluation.methods.sources import parse_methods
     from tableverse_factory.models.services import Services
 
     comparison = match_methods(parse_methods(paths or [], method or []), reference, cell)
@@ -188,8 +187,7 @@ def evaluate_layout(
     """
     from tableverse_factory.evaluation.methods.comparison import index_by_shared_name
     from tableverse_factory.evaluation.methods.layout import compare_layouts, summarize_layouts
-    from tableverse_factory.evaluation.methods.methods import parse_methods
-    from tableverse_factory.evaluation.methods.sources import find_scenes
+    from tableverse_factory.evaluation.methods.sources import find_scenes, parse_methods
     from tableverse_factory.evaluation.methods.truth import find_truths
 
     truths = find_truths(truth)

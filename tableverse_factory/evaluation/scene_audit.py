@@ -19,10 +19,8 @@ from tableverse_factory.stages.export.meta import compute_file_digests
 
 MAX_SCENE_FILES = 20_000
 MAX_SCENE_BYTES = 2 * 1024**3
-LENGTH_TOLERANCE_M = 5e-5
-"""Tolerance for the arithmetic of other machines; on the building machine the figures are equal [m]."""
-
-ANGLE_TOLERANCE_RAD = 2e-3
+# For the arithmetic of other machines; on the building machine the figures are equal.
+LENGTH_TOLERANCE_M, ANGLE_TOLERANCE_RAD = 5e-5, 2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +46,15 @@ def audit_scene(scene_id: str, files: Mapping[str, bytes], row: Mapping[str, Any
     except InputError as error:
         return SceneAudit(scene_id, {}, (str(error),))
     certificate, measured = certify(model, meta.history, meta.certificate.epsilon_m)
+    values = _list_figures(certificate)
     problems = [
         *_check_files(files, meta),
         *_check_state(measured, certificate.epsilon_m),
-        *_compare_certificates(meta.certificate, certificate),
-        *_compare_row(certificate, row or {}),
+        *_compare_figures("certificate", _list_figures(meta.certificate), values),
+        *_compare_figures("scenes/", row or {}, values),
     ]
     if missing := sorted(set(meta.history.rectified) ^ set(measured.bodies)):
         problems.append(f"bodies and meta.json disagree on {', '.join(missing[:5])}")
-    values = {f.name: getattr(certificate, f.name) for f in fields(Certificate)}
     return SceneAudit(scene_id, values, tuple(problems))
 
 
@@ -126,21 +124,15 @@ def _check_state(measured: Measurement, epsilon_m: float) -> list[str]:
     return problems
 
 
-def _compare_certificates(stored: Certificate, now: Certificate) -> list[str]:
-    problems = []
-    for key in (f.name for f in fields(Certificate)):
-        old, new = getattr(stored, key), getattr(now, key)
-        if not _equal(key, old, new):
-            problems.append(f"{key}: certificate says {old!r:.80}, measured {new!r:.80}")
-    return problems
+def _list_figures(certificate: Certificate) -> dict[str, Any]:
+    return {f.name: getattr(certificate, f.name) for f in fields(Certificate)}
 
 
-def _compare_row(now: Certificate, row: Mapping[str, Any]) -> list[str]:
-    shared = [f.name for f in fields(Certificate) if f.name in row]
+def _compare_figures(where: str, stored: Mapping[str, Any], measured: Mapping[str, Any]) -> list[str]:
     return [
-        f"{key}: scenes/ says {row[key]!r:.80}, measured {getattr(now, key)!r:.80}"
-        for key in shared
-        if not _equal(key, row[key], getattr(now, key))
+        f"{key}: {where} says {stored[key]!r:.80}, measured {new!r:.80}"
+        for key, new in measured.items()
+        if key in stored and not _equal(key, stored[key], new)
     ]
 
 

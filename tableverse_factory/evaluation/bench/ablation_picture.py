@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.config import Config
-from schemas.geometry import Picture, TriangleMesh
+from schemas.geometry import Picture
 from tableverse_factory.evaluation.bench.free_simulation import ReleasedScene, simulate_freely
 from tableverse_factory.evaluation.bench.layouts import read_case
 from tableverse_factory.evaluation.bench.rectifiers import RECTIFICATION_METHODS
@@ -21,7 +21,7 @@ from tableverse_factory.physics.render.views import RenderQuality, make_front_ca
 LET_GO_S = 0.5  # simulated time of the lower row [s]
 WIDTH, HEIGHT = 400, 276
 QUALITY = RenderQuality(samples=2, sky_rays=6)
-PALETTE: tuple[Rgb, ...] = (
+PALETTE: tuple[Rgb, ...] = (  # sRGB of objects whose mesh has no colours, in turn; neighbours are easy to tell apart
     (201, 82, 66),
     (66, 119, 171),
     (222, 165, 62),
@@ -33,7 +33,6 @@ PALETTE: tuple[Rgb, ...] = (
     (226, 214, 188),
     (98, 104, 122),
 )
-"""sRGB of objects whose mesh has no colours, in turn; neighbours are easy to tell apart."""
 _AZIMUTH = float(np.deg2rad(28.0))
 _TABLE_MARGIN_M = 0.25
 _CAPTION = 24
@@ -89,12 +88,9 @@ def _build_scenery(scene: ReleasedScene, colors: Mapping[str, Rgb]) -> Scenery:
     wide = Slab(slab.center_xy, slab.half_size_xy + _TABLE_MARGIN_M, slab.yaw, slab.color)
     names = [body.object_id for body in scene.bodies]
     scenery = make_scenery(names, meshes, wide)
-    worn = (None if _has_colors(mesh) else colors[name] for mesh, name in zip(meshes, names, strict=True))
+    plain = [mesh.vertex_colors is None and mesh.texture is None for mesh in meshes]
+    worn = (colors[name] if its else None for name, its in zip(names, plain, strict=True))
     return replace(scenery, colors=(*worn, slab.color))
-
-
-def _has_colors(mesh: TriangleMesh) -> bool:
-    return mesh.vertex_colors is not None or mesh.texture is not None
 
 
 def _add_caption(picture: Picture, text: str) -> Picture:

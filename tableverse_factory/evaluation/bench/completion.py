@@ -33,8 +33,7 @@ SAMPLES = 10_000
 VOXEL_RANGE_M = (0.001, 0.004)
 VOXELS = 400_000  # approximate number of points at which a pair of meshes is compared; thin walls need a fine grid
 HEIGHT_CELL_M = 0.002
-HOLLOW_SHARE = 0.05
-"""A mesh is hollow if a cavity that opens upward and has a floor takes at least this part of the volume of its hull."""
+HOLLOW_SHARE = 0.05  # a mesh is hollow if `measure_cavity` finds at least this part of the volume of its hull
 OPEN_LAYERS = 40
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 DISTANCE_M = 0.7
@@ -57,14 +56,6 @@ class CompletionScore:
     cpu_s: float = 0.0  # CPU time of the place stage; 0 for the other methods [s]
 
 
-@dataclass(frozen=True, slots=True)
-class CavityScore:
-    """The cavity of a mesh that is open from above."""
-
-    share: float  # its volume over that of the hull
-    points: Points  # samples of the cavity, shape (n, 3) [m]
-
-
 def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
     """Complete every mesh in `folder` from two views by convex hull, height field and the place stage."""
     paths = sorted(folder.glob("*.obj"))
@@ -73,19 +64,16 @@ def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
     scores: list[CompletionScore] = []
     for index, path in enumerate(paths):
         truth = stand_on_table(read_mesh(path.read_bytes(), path.name))
-        cavity = measure_cavity(truth)
+        share, cavity = measure_cavity(truth)
+        hollow = share >= HOLLOW_SHARE
         for view, (azimuth, elevation) in enumerate(VIEWS):
             rng = np.random.default_rng([seed, index, view])
             scene = render_noisy_view([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng)
             for method, mesh, cpu_s in _complete_all(scene):
-                scores.append(_add_cavity(score_completion(path.stem, view, method, truth, mesh), cavity, mesh, cpu_s))
+                plain = score_completion(path.stem, view, method, truth, mesh)
+                kept = 1.0 - float(contains_points(mesh, cavity).mean()) if hollow else float("nan")
+                scores.append(replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s))
     return scores
-
-
-def _add_cavity(plain: CompletionScore, cavity: CavityScore, mesh: TriangleMesh, cpu_s: float) -> CompletionScore:
-    hollow = cavity.share >= HOLLOW_SHARE
-    kept = 1.0 - float(contains_points(mesh, cavity.points).mean()) if hollow else float("nan")
-    return replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s)
 
 
 def _complete_all(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, float]]:
@@ -109,14 +97,10 @@ def _complete_all(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, 
 def render_noisy_view(
     meshes: Sequence[TriangleMesh], azimuth: float, elevation: float, rng: np.random.Generator, noise_m: float = NOISE_M
 ) -> PerceivedObjects:
-    """Render meshes on a large table with a noisy depth camera; instance ids are 1, 2 and so on.
+    """Render meshes (table frame) on a large table with a noisy depth camera; instance ids are 1, 2 and so on.
 
-    Args:
-        meshes: Meshes in the table frame [m].
-        azimuth: Direction of the camera about z from the middle of the objects [rad].
-        elevation: Elevation of the camera above the horizon [rad].
-        rng: Random generator of the noise.
-        noise_m: Standard deviation of the depth [m].
+    `azimuth` is the direction of the camera about z from the middle of the objects, `elevation` that above the horizon
+    [rad]; `noise_m` is the standard deviation of the depth.
     """
     every = np.concatenate([mesh.vertices for mesh in meshes])
     target: Vector3 = (every.min(axis=0) + every.max(axis=0)) / 2
@@ -159,10 +143,8 @@ def build_height_field(points: Points) -> TriangleMesh:
     """Build the solid between the points and the table, the simplest completion that uses the table."""
     low, high = points.min(axis=0), points.max(axis=0)
     top = max(float(high[2]), 2 * HEIGHT_CELL_M)
-    corner = HEIGHT_CELL_M
-    grid = make_grid(
-        np.array([low[0], low[1], 0.0]) - corner, np.array([high[0], high[1], top]) + corner, HEIGHT_CELL_M
-    )
+    cell = HEIGHT_CELL_M
+    grid = make_grid(np.array([low[0], low[1], 0.0]) - cell, np.array([high[0], high[1], top]) + cell, cell)
     index = np.clip(np.rint((points[:, :2] - grid.origin[:2]) / grid.cell).astype(int), 0, np.array(grid.shape[:2]) - 1)
     heights = np.full(grid.shape[:2], -np.inf)
     np.maximum.at(heights, (index[:, 0], index[:, 1]), points[:, 2])
@@ -177,15 +159,18 @@ def build_height_field(points: Points) -> TriangleMesh:
     return extract_surface(np.minimum(np.minimum(heights[:, :, None] - z, z), footprint[:, :, None]), grid)
 
 
-def measure_cavity(mesh: TriangleMesh) -> CavityScore:
-    """Measure the space that water poured from above would fill: cells of the hull, walled in at their height."""
+def measure_cavity(mesh: TriangleMesh) -> tuple[float, Points]:
+    """Measure the space that water poured from above would fill: cells of the hull, walled in at their height.
+
+    Return its volume over that of the hull, and its samples, shape (n, 3) [m].
+    """
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     grid = make_grid(low, high, float((high - low).max()) / (2 * OPEN_LAYERS))
     points = grid.points()
     solid = contains_points(mesh, points).reshape(grid.shape)
     hull = contains_points(build_hull(mesh.vertices), points).reshape(grid.shape)
-    held = _find_cavity_cells(solid, grid)
-    return CavityScore(float((held & hull).sum() / max(int(hull.sum()), 1)), points[(held & hull).ravel()])
+    held = _find_cavity_cells(solid, grid) & hull
+    return float(held.sum() / max(int(hull.sum()), 1)), points[held.ravel()]
 
 
 def _find_cavity_cells(solid: Bool[np.ndarray, "nx ny nz"], grid: VoxelGrid) -> Bool[np.ndarray, "nx ny nz"]:
@@ -222,10 +207,7 @@ def score_completion(name: str, view: int, method: str, truth: TriangleMesh, our
 def contains_points(mesh: TriangleMesh, points: Points) -> Bool[np.ndarray, " n"]:
     """Test which points lie inside, by the majority of three rays, so that small holes do no harm."""
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-    vertices, faces = (
-        o3d.core.Tensor.from_numpy(mesh.vertices.astype(np.float32)),
-        o3d.core.Tensor.from_numpy(mesh.faces.astype(np.uint32)),
-    )
-    scene.add_triangles(vertices, faces)
-    inside = scene.compute_occupancy(o3d.core.Tensor.from_numpy(points.astype(np.float32)), nthreads=1, nsamples=3)
+    tensor = o3d.core.Tensor.from_numpy
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+    inside = scene.compute_occupancy(tensor(points.astype(np.float32)), nthreads=1, nsamples=3)
     return np.asarray(inside.numpy() > 0.5)

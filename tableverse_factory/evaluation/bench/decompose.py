@@ -55,13 +55,9 @@ DECOMPOSITIONS: dict[str, Callable[[TriangleMesh], list[Points]]] = {
 
 
 def bench_decompose(
-    files: Sequence[Path], methods: Sequence[str], on_mesh: Callable[[], None] | None = None
+    files: Sequence[Path], methods: Sequence[str], on_mesh: Callable[[], object] = lambda: None
 ) -> list[PieceScore]:
-    """Run methods (keys of `DECOMPOSITIONS`) on every mesh and compare the pieces with the repaired solid.
-
-    Raises:
-        GeometryError: if a mesh cannot be made a solid.
-    """
+    """Run methods (keys of `DECOMPOSITIONS`) on every mesh and compare the pieces with the repaired solid."""
     if unknown := [name for name in methods if name not in DECOMPOSITIONS]:
         raise InputError(f"unknown method {unknown[0]!r}: choose from {', '.join(DECOMPOSITIONS)}")
     if not files:
@@ -69,8 +65,7 @@ def bench_decompose(
     scores: list[PieceScore] = []
     for file in files:
         scores += _measure_mesh(file, methods)
-        if on_mesh is not None:
-            on_mesh()
+        on_mesh()
     return scores
 
 
@@ -101,6 +96,9 @@ def _measure_mesh(file: Path, methods: Sequence[str]) -> list[PieceScore]:
     return scores
 
 
+_AVERAGED = ("volume_ratio", "volume_error", "hausdorff", "cavity_kept")
+
+
 def summarize_pieces(scores: Sequence[PieceScore], methods: Sequence[str]) -> list[PieceScore]:
     """Summarize the scores of each method over all meshes."""
     groups = [[score for score in scores if score.method == name] for name in methods]
@@ -112,10 +110,7 @@ def summarize_pieces(scores: Sequence[PieceScore], methods: Sequence[str]) -> li
             cpu_s=cpu_s,
             faster=_over(seconds[0], cpu_s),
             pieces=sum(score.pieces for score in group),
-            volume_ratio=mean(score.volume_ratio for score in group),
-            volume_error=mean(score.volume_error for score in group),
-            hausdorff=mean(score.hausdorff for score in group),
-            cavity_kept=mean(score.cavity_kept for score in group),
+            **{name: mean(getattr(score, name) for score in group) for name in _AVERAGED},
         )
         for name, group, cpu_s in zip(methods, groups, seconds, strict=True)
     ]

@@ -7,6 +7,7 @@ from outside.
 import hashlib
 import importlib.util
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import numpy as np
 
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.evaluation.bench import noop_pipeline
-from tableverse_factory.evaluation.bench.process_meter import CommandMeasurement, make_python_command, measure_command
+from tableverse_factory.evaluation.bench.process_meter import CommandMeasurement, measure_command
 from tableverse_factory.sources.manifest import write_manifest
 
 NOOP, BURNING = f"{noop_pipeline.__name__}:NOOP_PIPELINES", f"{noop_pipeline.__name__}:BURNING_PIPELINES"
@@ -67,7 +68,7 @@ class FactoryComparison:
 def bench_factory(
     sizes: Sequence[int], workers: int, burning: int, show: Callable[[str], None] = lambda _: None
 ) -> Iterator[FactoryRun]:
-    """Measure one build after the other; `show` gets a description before each.
+    """Measure one build after the other.
 
     Args:
         sizes: Scenes of the builds on Ray and on Ray Data, ascending; the two smallest also run with one worker.
@@ -106,14 +107,12 @@ def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path) -> 
     manifest, out = folder / f"{scenes}.parquet", folder / "out"
     if not manifest.exists():
         write_manifest(manifest, (_make_row(number) for number in range(scenes)))
-    if what == "ray data":
-        command = make_python_command("workers.bench.ray_data_baseline", manifest, out, workers, line)
-    else:
-        command = make_python_command(
-            "workers.bench.run_build", manifest, out, "local" if what == "local" else "ray", workers, line
-        )
+    executor = () if what == "ray data" else ("local",) if what == "local" else ("ray",)
+    module = "workers.bench.run_build" if executor else "workers.bench.ray_data_baseline"
+    command = (sys.executable, "-m", module, manifest, out, *executor, workers, line)
     try:
-        return _summarize_run(what, workers, scenes, measure_command(command, _QUIET, _classify_process))
+        measured = measure_command([str(part) for part in command], _QUIET, _classify_process)
+        return _summarize_run(what, workers, scenes, measured)
     finally:
         shutil.rmtree(out, ignore_errors=True)
 
@@ -156,11 +155,9 @@ def _compute_marginal_rate(runs: Sequence[FactoryRun]) -> float:
 
 
 def _make_row(number: int) -> ImageRow:
-    digest = hashlib.sha256(str(number).encode()).hexdigest()
-    uri = f"/noop/{number}"
-    return ImageRow(
-        scene_id=f"noop-{digest[:12]}", kind=SceneKind.CAPTURE, uri=uri, content_sha256=digest, licence="CC0-1.0"
-    )
+    digest, kind = hashlib.sha256(str(number).encode()).hexdigest(), SceneKind.CAPTURE
+    uri, scene_id = f"/noop/{number}", f"noop-{digest[:12]}"
+    return ImageRow(scene_id=scene_id, kind=kind, uri=uri, content_sha256=digest, licence="CC0-1.0")
 
 
 def _classify_process(command: str) -> str:

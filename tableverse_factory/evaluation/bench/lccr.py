@@ -17,6 +17,7 @@ from tableverse_factory.evaluation.bench.free_simulation import BURST_SPEED, is_
 from tableverse_factory.evaluation.bench.layouts import LayoutCase, read_case
 from tableverse_factory.evaluation.bench.rectifiers import DEFAULT_METHODS, RECTIFICATION_METHODS, MethodResult
 from tableverse_factory.evaluation.bench.support_by_force import TrueSupport, find_support_by_force, find_true_support
+from tableverse_factory.evaluation.methods.layout import compute_percent
 from tableverse_factory.geometry.collision.penetration import measure_mesh_penetrations, measure_piece_penetrations
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center
@@ -50,7 +51,7 @@ def bench_lccr(
     config: Config,
     cache_dir: Path,
     methods: Sequence[str] = DEFAULT_METHODS,
-    on_layout: Callable[[LayoutCase, Mapping[str, MethodResult]], None] | None = None,
+    on_layout: Callable[[LayoutCase, Mapping[str, MethodResult]], object] = lambda *_: None,
 ) -> dict[str, LayoutScore]:
     """Score methods (keys of `RECTIFICATION_METHODS`) on layouts, one after the other, against `read_case`'s truth."""
     if unknown := [name for name in methods if name not in RECTIFICATION_METHODS]:
@@ -65,8 +66,7 @@ def bench_lccr(
             _add_result(scores[name], case, result, config.settle.timestep_s)
             if result.simulated:
                 _add_support(scores[name], case, result, support, config.settle.timestep_s)
-        if on_layout is not None:
-            on_layout(case, results)
+        on_layout(case, results)
     return scores
 
 
@@ -90,12 +90,12 @@ def summarize_scores(score: LayoutScore, epsilons_m: Sequence[float]) -> dict[st
         "from truth, median [mm]": _percentile(score.from_truth_m, 50.0, 1e3),
         "from truth, p90 [mm]": _percentile(score.from_truth_m, 90.0, 1e3),
         "true relations": score.kept.carried + score.kept.contained,
-        "support kept [%]": _percent(score.kept.carried_kept, score.kept.carried),
+        "support kept [%]": compute_percent(score.kept.carried_kept, score.kept.carried),
         "pairs by force": score.by_force,
         "pairs by force, left out": score.by_force_left_out,
         "scenes not known by force": score.by_force_unknown,
-        "support kept, by force [%]": _percent(score.by_force_kept, score.by_force),
-        "containment kept [%]": _percent(score.kept.contained_kept, score.kept.contained),
+        "support kept, by force [%]": compute_percent(score.by_force_kept, score.by_force),
+        "containment kept [%]": compute_percent(score.kept.contained_kept, score.kept.contained),
         "azimuth change, p90 [°]": _percentile(azimuths_known, 90.0, 180.0 / np.pi),
         "azimuth change, largest [°]": _percentile(azimuths_known, 100.0, 180.0 / np.pi),
         "first 0.1 s: speed, median [m/s]": _percentile(score.burst_speeds, 50.0, 1.0),
@@ -109,11 +109,7 @@ def summarize_scores(score: LayoutScore, epsilons_m: Sequence[float]) -> dict[st
 
 
 def _percent_true(values: Sequence[bool]) -> float | None:
-    return _percent(sum(values), len(values))
-
-
-def _percent(some: int, of: int) -> float | None:
-    return 100.0 * some / of if of else None
+    return compute_percent(sum(values), len(values))
 
 
 def _percentile(values: Sequence[float] | np.ndarray, percent: float, unit: float) -> float | None:

@@ -2,12 +2,12 @@
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int32
 from scipy.optimize import linear_sum_assignment
 
 from schemas.config import Config
@@ -87,7 +87,7 @@ def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
     The truth is `seg.png` or `masks.png`, and `truth.json` for containment. The largest id of a `seg.png` may be the
     table: it is left out if most of it lies on the plane that was found.
     """
-    names = sorted(p.name for p in folder.iterdir() if _find_truth(p) is not None and _has_image(p))
+    names = sorted(p.name for p in folder.iterdir() if _find_file(p, TRUTH_NAMES) and _find_file(p, COLOR_NAMES))
     if not names:
         raise InputError(f"{str(folder)!r} holds no capture with {' or '.join(TRUTH_NAMES)}")
     for name in names:
@@ -151,9 +151,9 @@ def compare_pairs(truth: IdImage, found: IdImage, true: dict[int, int], pairs_fo
 
 def match_ids(truth: IdImage, found: IdImage) -> dict[int, int]:
     """Map found ids to true ids by the one-to-one assignment of the overlap F."""
-    true_ids, found_ids = np.unique(truth[truth > 0]), np.unique(found[found > 0])
-    shared, true_sizes, found_sizes = _count_overlaps(truth, found, true_ids, found_ids)
-    rows, columns = linear_sum_assignment(-_compute_pairwise_f(shared, true_sizes, found_sizes))
+    true_ids, found_ids = _list_ids(truth), _list_ids(found)
+    shared, true_sizes, found_sizes = _count_overlaps(truth, found)
+    rows, columns = _assign_by_f(shared, true_sizes, found_sizes)
     pairs = zip(rows.tolist(), columns.tolist(), strict=True)
     return {int(found_ids[f]): int(true_ids[t]) for t, f in pairs if shared[t, f] > 0}
 
@@ -170,16 +170,15 @@ def remove_table(truth: IdImage, found: IdImage) -> IdImage:
 
 def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reason: str = "") -> MaskScore:
     """Compare two id images of the same shape; ids above 0 are objects."""
-    true_ids, found_ids = np.unique(truth[truth > 0]), np.unique(found[found > 0])
-    shared, true_sizes, found_sizes = _count_overlaps(truth, found, true_ids, found_ids)
+    shared, true_sizes, found_sizes = _count_overlaps(truth, found)
     union = true_sizes[:, None] + found_sizes[None] - shared
     ious = (shared / np.maximum(union, 1)).max(axis=1, initial=0.0)
-    rows, columns = linear_sum_assignment(-_compute_pairwise_f(shared, true_sizes, found_sizes))
-    known = found_sizes[shared.any(axis=0)] if len(found_ids) else found_sizes
+    rows, columns = _assign_by_f(shared, true_sizes, found_sizes)
+    known = found_sizes[shared.any(axis=0)] if len(found_sizes) else found_sizes
     return MaskScore(
         name,
-        len(true_ids),
-        len(found_ids),
+        len(true_sizes),
+        len(found_sizes),
         tuple(float(v) for v in ious),
         int(shared[rows, columns].sum()),
         int(known.sum()),
@@ -191,6 +190,7 @@ def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reaso
 
 def merge_scores(scores: list[MaskScore]) -> MaskScore:
     """Merge the scores of captures; means are over all true objects."""
+    known = [(c.true, c.found, c.correct) for c in (score.containment for score in scores) if c is not None]
     return MaskScore(
         "all",
         sum(s.truth for s in scores),
@@ -200,41 +200,37 @@ def merge_scores(scores: list[MaskScore]) -> MaskScore:
         sum(s.found_pixels for s in scores),
         sum(s.true_pixels for s in scores),
         float(np.median([s.cpu_s for s in scores])),
-        containment=_merge_containment([s.containment for s in scores if s.containment is not None]),
+        containment=Containment(*(sum(counts) for counts in zip(*known, strict=True))) if known else None,
     )
 
 
-def _merge_containment(known: list[Containment]) -> Containment | None:
-    if not known:
-        return None
-    return Containment(sum(c.true for c in known), sum(c.found for c in known), sum(c.correct for c in known))
+def _list_ids(image: IdImage) -> Int32[np.ndarray, " n"]:
+    return np.unique(image[image > 0])
 
 
 def _count_overlaps(
-    truth: IdImage, found: IdImage, true_ids: IdImage, found_ids: IdImage
+    truth: IdImage, found: IdImage
 ) -> tuple[Float64[np.ndarray, "t f"], Float64[np.ndarray, " t"], Float64[np.ndarray, " f"]]:
+    true_ids, found_ids = _list_ids(truth), _list_ids(found)
     shared = np.array([[((truth == t) & (found == f)).sum() for f in found_ids] for t in true_ids], dtype=np.float64)
     true_sizes = np.array([(truth == t).sum() for t in true_ids], dtype=np.float64)
     found_sizes = np.array([(found == f).sum() for f in found_ids], dtype=np.float64)
     return shared.reshape(len(true_ids), len(found_ids)), true_sizes, found_sizes
 
 
-def _compute_pairwise_f(
+def _assign_by_f(
     shared: Float64[np.ndarray, "t f"], true_sizes: Float64[np.ndarray, " t"], found_sizes: Float64[np.ndarray, " f"]
-) -> Float64[np.ndarray, "t f"]:
-    return 2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Assign true (rows) to found objects (columns), one to one, by the largest sum of their pairwise F."""
+    return linear_sum_assignment(-2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1))
 
 
-def _find_truth(capture: Path) -> Path | None:
-    return next((capture / name for name in TRUTH_NAMES if (capture / name).is_file()), None)
-
-
-def _has_image(capture: Path) -> bool:
-    return any((capture / name).is_file() for name in COLOR_NAMES)
+def _find_file(capture: Path, names: Iterable[str]) -> Path | None:
+    return next((capture / name for name in names if (capture / name).is_file()), None)
 
 
 def _read_truth(capture: Path, seen: Observation, config: Config) -> IdImage:
-    path = _find_truth(capture)
+    path = _find_file(capture, TRUTH_NAMES)
     if path is None:
         raise InputError(f"{capture.name} has no {' or '.join(TRUTH_NAMES)}")
     return read_id_image(str(path), config.observe, seen.camera)

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from schemas.config import Config
-from schemas.geometry import Matrix4, Points, Pose, TriangleMesh
+from schemas.geometry import Pose, TriangleMesh
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import FitUncertainty, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.observation import Observation
@@ -18,9 +17,10 @@ from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.methods.heading import compute_heading_error, find_symmetric_turns
+from tableverse_factory.evaluation.methods.sources import read_pose
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
     matrix_from_pose,
-    normalize_quaternion,
     pose_from_matrix,
     quaternion_about_z,
     rotation_matrix,
@@ -33,7 +33,6 @@ from tableverse_factory.stages.place.place import place
 
 MESHES = ("carved", "replay")
 MASKS = ("replay", "geometric")
-UNIT = 1.0  # longest side of a true mesh as `replay` receives it: a MeshModel does not know metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,25 +91,22 @@ def bench_placement(
 
 
 def _select_backends(config: Config, masks: str, meshes: str) -> Config:
-    return config.model_copy(
-        update={
-            "perceive": config.perceive.model_copy(update={"detector": masks}),
-            "place": config.place.model_copy(update={"mesh_model": meshes}),
-        }
-    )
+    detecting = config.perceive.model_copy(update={"detector": masks})
+    placing = config.place.model_copy(update={"mesh_model": meshes})
+    return config.model_copy(update={"perceive": detecting, "place": placing})
 
 
 def read_placement_truth(capture: Path) -> PlacementTruth:
     """Read the `truth.json` of a capture and its meshes."""
     truth = json.loads((capture / "truth.json").read_text())
     return PlacementTruth(
-        tuple(_read_true_object(capture, entry) for entry in truth["objects"]), _parse_pose(truth["camera_to_table"])
+        tuple(_read_true_object(capture, entry) for entry in truth["objects"]), read_pose(truth["camera_to_table"])
     )
 
 
 def _read_true_object(capture: Path, entry: dict[str, Any]) -> PlacedTruth:
     mesh = read_mesh((capture / entry["mesh"]).read_bytes(), entry["mesh"])
-    standing = place_mesh(mesh, _parse_pose(entry["pose"]))
+    standing = place_mesh(mesh, read_pose(entry["pose"]))
     turns = find_symmetric_turns(standing)
     seen = float(entry["visible_fraction"])
     return PlacedTruth(entry["instance_id"], entry["label"], seen, mesh, standing, 0 if turns is None else len(turns))
@@ -140,13 +136,13 @@ def place_capture(
 
 
 def _attach_true_meshes(seen: Observation, truth: PlacementTruth, config: Config) -> Observation:
-    """Record the true meshes in the observation, without their size and heading."""
+    """Record the true meshes without their heading, at longest side 1: a MeshModel does not know metres."""
     rng = make_rng(config.run.seed, seen.scene_id, "bench-turn")
     meshes = []
     for item in truth.objects:
         turn = rotation_matrix(quaternion_about_z(rng.uniform(-np.pi, np.pi)))
         vertices = (item.mesh.vertices - box_center(item.mesh)) @ turn.T
-        vertices *= UNIT / np.ptp(item.mesh.vertices, axis=0).max()
+        vertices *= 1.0 / np.ptp(item.mesh.vertices, axis=0).max()
         meshes.append((item.instance_id, TriangleMesh(vertices, item.mesh.faces)))
     return replace(seen, recorded_meshes=tuple(meshes))
 
@@ -157,9 +153,10 @@ def _compare_object(
     ours = None if found is None else _find_placed(found[0], found[1], item.instance_id)
     if found is None or ours is None:
         return PlacementError(scene, item.label, "", item.visible_fraction, item.symmetry)
-    to_truth = pose_from_matrix(_map_table_frames(found[0].camera_to_table, truth.camera_to_table))
-    standing = place_mesh(place_mesh(ours.mesh, ours.pose, ours.scale), to_truth)
-    our_box, true_box = _compute_box(standing.vertices), _compute_box(item.standing.vertices)
+    camera_to_table = matrix_from_pose(found[0].camera_to_table)  # estimated; both frames share the camera
+    to_truth = matrix_from_pose(truth.camera_to_table) @ np.linalg.inv(camera_to_table)
+    standing = place_mesh(place_mesh(ours.mesh, ours.pose, ours.scale), pose_from_matrix(to_truth))
+    our_box, true_box = np.stack(aabb(standing.vertices)), np.stack(aabb(item.standing.vertices))
     shift = our_box.mean(axis=0) - true_box.mean(axis=0)
     sizes = np.ptp(our_box, axis=0) / np.ptp(true_box, axis=0)
     heading = compute_heading_error(standing, item.standing) if item.symmetry else None
@@ -193,18 +190,3 @@ def _find_placed(perceived: PerceivedObjects, placed: PlacedObjects, instance_id
         if own > most and own == counts.max():
             best, most = item, own
     return best
-
-
-def _map_table_frames(ours: Pose, true: Pose) -> Matrix4:
-    """Compute the transform from the estimated table frame to the true one, through the common camera."""
-    return matrix_from_pose(true) @ np.linalg.inv(matrix_from_pose(ours))
-
-
-def _parse_pose(value: dict[str, Any]) -> Pose:
-    quaternion = normalize_quaternion(np.array(value["quaternion_wxyz"], dtype=np.float64))
-    return Pose(np.array(value["position"], dtype=np.float64), quaternion)
-
-
-def _compute_box(points: Points) -> Float64[np.ndarray, "2 3"]:
-    """Return the lowest and the highest corner."""
-    return np.stack([points.min(axis=0), points.max(axis=0)])

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -33,8 +32,8 @@ def measure_command(
     """Run a command to its end and sample its processes twice a second; usage after the last sample is lost.
 
     Args:
-        command: Command that writes lines `seconds count` to stdout, seconds of the monotonic clock.
-        environment: Environment variables added to those of this process.
+        command: It writes lines `seconds count` to stdout, seconds of the monotonic clock.
+        environment: Added to that of this process.
         kind_of: Returns the kind of a child process for its command line.
 
     Raises:
@@ -63,11 +62,6 @@ def measure_command(
     for kind, seconds in cpu.values():
         total[kind] += seconds  # type: ignore[assignment]
     return CommandMeasurement(lines, tuple(memory), dict(total))
-
-
-def make_python_command(module: str, *arguments: object) -> list[str]:
-    """Build the command that runs a Python module."""
-    return [sys.executable, "-m", module, *map(str, arguments)]
 
 
 def _sample(

@@ -109,4 +109,3 @@ RECTIFICATION_METHODS: dict[str, Method] = {
 """`MuJoCo alone` simulates the layout as it is; `settle alone` runs the settle stage, which damps the first motion."""
 
 DEFAULT_METHODS = tuple(name for name in RECTIFICATION_METHODS if name != "settle alone")
-"""Methods that are compared by default."""

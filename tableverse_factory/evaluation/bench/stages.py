@@ -26,8 +26,7 @@ from tableverse_factory.evaluation.bench.measurement import Stopwatch
 from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
 
-RECORDS, COMMIT = "records", "commit"
-"""Parts beside the stages: encoding and decoding the records between them, and writing a shard of one scene."""
+RECORDS, COMMIT = "records", "commit"  # coding of the records between the stages, and writing a shard of one scene
 
 CacheState = Literal["cold", "warm"]
 
@@ -49,7 +48,7 @@ class SceneCost:
 
 
 def bench_stages(
-    rows: Sequence[ImageRow], config: Config, on_scene: Callable[[], None] | None = None
+    rows: Sequence[ImageRow], config: Config, on_scene: Callable[[], object] = lambda: None
 ) -> list[SceneCost]:
     """Run every scene with an empty cache of its own, then every scene again with the cache that this left.
 
@@ -60,8 +59,7 @@ def bench_stages(
         for cache in ("cold", "warm"):
             for index, row in enumerate(rows):
                 costs.append(_measure_scene(row, config, Path(folder) / f"{index}", cache))
-                if on_scene is not None:
-                    on_scene()
+                on_scene()
     return costs
 
 

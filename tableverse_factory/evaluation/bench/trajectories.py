@@ -60,7 +60,7 @@ def bench_trajectories(
     config: Config,
     services: Services,
     most: int | None = None,
-    on_task: Callable[[], None] | None = None,
+    on_task: Callable[[], object] = lambda: None,
 ) -> list[TaskCost]:
     """Solve every accepted task, at most `most` per scene, as the stage does; then measure its parts one by one."""
     arm = load_arm(config.trajectories.robot)
@@ -71,8 +71,7 @@ def bench_trajectories(
         tasks = [row for row in scene.task_rows if row["accepted"]][: config.trajectories.max_tasks]
         for task, rng in list(zip(tasks, for_tasks.spawn(len(tasks)), strict=True))[:most]:
             costs.append(_measure_task(cell, task, config, rng))
-            if on_task is not None:
-                on_task()
+            on_task()
     return costs
 
 

@@ -6,14 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import pyarrow.compute as pc
-
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.dataset.dataset import Dataset, open_dataset
+from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.evaluation.methods.scenes import MethodObject, MethodScene, SceneSource
-from tableverse_factory.evaluation.methods.sources import read_model_scene, read_pose
+from tableverse_factory.evaluation.methods.sources import find_exported, read_model_scene, read_pose
 
 CONFIGURATIONS = {"Direct": "placed", "Direct + LCCR": "rectified", "Direct + LCCR + Simulation": "settled"}
 """Rows of the paper's table, and the names of their poses in `meta.json`."""
@@ -35,14 +33,10 @@ def find_ablation_scenes(folder: Path, poses: str) -> list[SceneSource]:
     Dropped scenes are missing, so the figures before settling are those of the survivors; `tableverse bench lccr`
     measures all layouts of a folder.
     """
-    dataset = open_dataset(folder)
-    done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"]).column(0).to_pylist()
-    return [
-        SceneSource(scene_id, "dataset", partial(_read_scene, dataset, scene_id, poses)) for scene_id in sorted(done)
-    ]
+    return find_exported(folder, partial(_read_scene, poses))
 
 
-def _read_scene(dataset: Dataset, scene_id: str, poses: str) -> MethodScene:
+def _read_scene(poses: str, dataset: Dataset, scene_id: str) -> MethodScene:
     exported = dataset.scene(scene_id)
     scene, entries = read_model_scene(exported.model()), exported.meta.get("objects", [])
     known = {str(entry["object_id"]): entry.get("poses") for entry in entries}

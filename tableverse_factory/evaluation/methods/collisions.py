@@ -4,7 +4,7 @@ A scene collides if two of its objects overlap by more than epsilon. The depth i
 paper, and on the convex pieces, which a simulator uses (`geometry.collision.penetration`).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,17 +110,14 @@ class MethodCollisions:
 def measure_method(
     method: str, sources: Iterable[SceneSource], epsilon_m: float, cache_dir: Path | None, dropped: int | None = None
 ) -> MethodCollisions:
-    """Measure every scene of a method; with a `cache_dir` for convex pieces also on those."""
-    return MethodCollisions(method, epsilon_m, tuple(measure_scenes(sources, cache_dir)), dropped)
-
-
-def measure_scenes(sources: Iterable[SceneSource], cache_dir: Path | None) -> Iterator[SceneCollisions]:
-    """Measure scene by scene; a scene that cannot be read becomes a result with its error."""
+    """Measure every scene of a method, with a `cache_dir` also on convex pieces; unreadable ones state their error."""
+    scenes = []
     for source in sources:
         try:
-            yield measure_scene(source.name, source.read(), cache_dir)
+            scenes.append(measure_scene(source.name, source.read(), cache_dir))
         except TableverseError as error:
-            yield SceneCollisions(source.name, error=str(error))
+            scenes.append(SceneCollisions(source.name, error=str(error)))
+    return MethodCollisions(method, epsilon_m, tuple(scenes), dropped)
 
 
 def measure_scene(name: str, scene: MethodScene, cache_dir: Path | None) -> SceneCollisions:

@@ -3,14 +3,15 @@
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from schemas.config import CurateConfig
 from tableverse_factory.core.errors import AnswerInvalidError, ConfigError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.evaluation.methods.grid import make_letters
-from tableverse_factory.evaluation.methods.methods import MAX_METHODS
+from tableverse_factory.evaluation.methods.sources import MAX_METHODS
 from tableverse_factory.evaluation.methods.vlm_vote import (
     Question,
     Vote,
@@ -27,51 +28,31 @@ from tableverse_factory.models.services import Services
 MAX_RECORD_BYTES = 1_000_000
 
 
-class GridJudge(Protocol):
-    """Interface of a judge that compares methods."""
-
-    def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:
-        """Mark every method; `grid` draws the picture as a PNG file if the judge needs it.
-
-        Raises:
-            ModelError: if there is no valid answer.
-        """
-        ...
+# Marks every method, from the question and what draws its picture as a PNG file; `ModelError` without a valid answer.
+GridJudge = Callable[[Question, Callable[[], bytes]], Vote]
 
 
-class ModelGridJudge:
-    """A model that gets the grid and the prompt, and after an invalid answer the reason."""
-
-    def __init__(self, client: ModelClient) -> None:
-        self._client = client
-
-    def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:
-        """See `GridJudge`."""
-        count = len(question.columns)
-        reply = self._client.ask_for(
-            lambda text: parse_vote(text, count), build_vote_prompt(count), [grid()], build_vote_schema(count)
-        )
-        return make_vote(question, reply.value)
+def ask_model(client: ModelClient, question: Question, grid: Callable[[], bytes]) -> Vote:
+    """Show a model the grid and the prompt, and after an invalid answer the reason."""
+    count = len(question.columns)
+    reply = client.ask_for(
+        lambda text: parse_vote(text, count), build_vote_prompt(count), [grid()], build_vote_schema(count)
+    )
+    return make_vote(question, reply.value)
 
 
-class ReplayedGridJudge:
-    """Votes that `record_vote` wrote: `<scene>-<round>.json` in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def vote(self, question: Question, grid: Callable[[], bytes]) -> Vote:  # noqa: ARG002
-        """See `GridJudge`; the marks belong to the columns of the recorded answer."""
-        value = _read_record(self._folder / f"{question.name}.json")
-        columns = value.get("columns")
-        if not isinstance(columns, list) or sorted(map(str, columns)) != sorted(question.columns):
-            raise AnswerInvalidError(f"columns {columns!r:.200} are not the methods {', '.join(question.columns)}")
-        shown = Question(question.scene, question.round, tuple(map(str, columns)))
-        return make_vote(shown, validate_vote(value.get("answer"), len(columns)))
+def replay_vote(folder: Path, question: Question, grid: Callable[[], bytes]) -> Vote:  # noqa: ARG001
+    """Read a vote of `record_vote`, `<scene>-<round>.json`; the marks belong to the columns of the recorded answer."""
+    value = _read_record(folder / f"{question.name}.json")
+    columns = value.get("columns")
+    if not isinstance(columns, list) or sorted(map(str, columns)) != sorted(question.columns):
+        raise AnswerInvalidError(f"columns {columns!r:.200} are not the methods {', '.join(question.columns)}")
+    shown = Question(question.scene, question.round, tuple(map(str, columns)))
+    return make_vote(shown, validate_vote(value.get("answer"), len(columns)))
 
 
 def record_vote(vote: Vote, folder: Path) -> None:
-    """Write a vote for `ReplayedGridJudge`."""
+    """Write a vote for `replay_vote`."""
     question = Question(vote.scene, vote.round, vote.columns)
     marks = [vote.marks[method].model_dump() for method in vote.columns]
     columns = dict(zip(make_letters(len(marks)), marks, strict=True))
@@ -82,7 +63,7 @@ def record_vote(vote: Vote, folder: Path) -> None:
 def summarize_recorded(folder: Path, most: int) -> tuple[int, frozenset[str]]:
     """Count the rounds of answers in a folder, up to `most`, and collect the methods that they name.
 
-    Other files are ignored here; `ReplayedGridJudge` refuses them when they are requested.
+    Other files are ignored here; `replay_vote` refuses them when they are requested.
     """
     rounds, named = 0, set[str]()
     for path in sorted(folder.glob("*-[0-9]*.json")):
@@ -120,9 +101,9 @@ def make_grid_judge(config: CurateConfig, services: Services) -> GridJudge:
             raise ConfigError(
                 f"curate.replay_dir: {folder} {what}; give the folder answers/ that `evaluate gpt-score` wrote"
             )
-        return ReplayedGridJudge(folder)
+        return partial(replay_vote, folder)
     if config.judge not in ("openai", "gemini"):
         raise ConfigError(
             f"curate.judge is {config.judge!r}, which cannot look at pictures: set it to openai, gemini or replay"
         )
-    return ModelGridJudge(ModelClient(read_endpoint(config), services))
+    return partial(ask_model, ModelClient(read_endpoint(config), services))

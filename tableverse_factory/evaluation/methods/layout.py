@@ -84,13 +84,14 @@ def _make_missing(name: str, read_truth: ReadTruth, error: str) -> SceneLayout:
         truth = read_truth(MethodScene(()))
     except TableverseError as worse:
         return SceneLayout(name, error=f"{error}; {worse}" if str(worse) != error else error)
-    names = [*(item.name for item in truth.objects), *truth.missing]
-    return SceneLayout(name, tuple(ObjectMatch(missing) for missing in names), error=error)
+    names = (*(item.name for item in truth.objects), *truth.missing)
+    return SceneLayout(name, tuple(map(ObjectMatch, names)), error=error)
 
 
 def compare_scene(name: str, result: MethodScene, truth: SceneTruth, cache_dir: Path) -> SceneLayout:
     """Compare one scene with its truth; raise a `GeometryError` if a mesh cannot be cut into convex pieces."""
-    pairs = _match_by_name(result, truth) if truth.named else _match_by_position(result, truth)
+    named: dict[str, MethodObject | None] = {item.name: item for item in result.objects}
+    pairs = [named.get(true.name) for true in truth.objects] if truth.named else _match_by_position(result, truth)
     used = {item.name for item in pairs if item is not None}
     matches = [
         ObjectMatch(true.name) if found is None else _measure_match(true, found, truth.same_meshes)
@@ -120,7 +121,7 @@ def summarize_layouts(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
         "scenes": len(sound),
         "scenes missing": len(scenes) - len(sound),
         "true objects": len(matches),
-        "found [%]": _compute_percent(len(found), len(matches)),
+        "found [%]": compute_percent(len(found), len(matches)),
         "extra objects": sum(len(scene.extra) for scene in sound),
         "position, median [mm]": _compute_percentile(position, 50.0),
         "position, p90 [mm]": _compute_percentile(position, 90.0),
@@ -130,15 +131,10 @@ def summarize_layouts(scenes: Sequence[SceneLayout]) -> dict[str, float | None]:
         "heading, median [°]": _compute_percentile(turned, 50.0),
         "heading, p90 [°]": _compute_percentile(turned, 90.0),
         "support relations": relations.carried,
-        "support kept [%]": _compute_percent(relations.carried_kept, relations.carried),
+        "support kept [%]": compute_percent(relations.carried_kept, relations.carried),
         "containment relations": relations.contained,
-        "containment kept [%]": _compute_percent(relations.contained_kept, relations.contained),
+        "containment kept [%]": compute_percent(relations.contained_kept, relations.contained),
     }
-
-
-def _match_by_name(result: MethodScene, truth: SceneTruth) -> list[MethodObject | None]:
-    named = {item.name: item for item in result.objects}
-    return [named.get(true.name) for true in truth.objects]
 
 
 def _match_by_position(result: MethodScene, truth: SceneTruth) -> list[MethodObject | None]:
@@ -203,5 +199,6 @@ def _compute_percentile(values: Sequence[float], percent: float) -> float | None
     return float(np.percentile(sound, percent)) if sound else None
 
 
-def _compute_percent(some: int, of: int) -> float | None:
+def compute_percent(some: int, of: int) -> float | None:
+    """Compute a share [%]; None of nothing."""
     return 100.0 * some / of if of else None

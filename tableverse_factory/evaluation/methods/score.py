@@ -1,7 +1,7 @@
 """GPT-Score (paper, section 4 and table 1): means of a judge's marks over scenes with bootstrap intervals."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -69,7 +69,7 @@ def ask_all(
     refused: list[RefusedQuestion] = []
     for question in watch(_list_questions(comparison, rounds, seed)):
         try:
-            answered.append(judge.vote(question, partial(_draw_grid, comparison, question, out)))
+            answered.append(judge(question, partial(_draw_grid, comparison, question, out)))
         except ModelAccessError:
             raise
         except TableverseError as error:
@@ -154,16 +154,15 @@ def format_interval(value: Interval) -> str:
 
 def results_to_json(votes: VoteResults, seed: int) -> dict[str, object]:
     """Return plain values for JSON."""
-    means: Mapping[str, Mapping[str, Interval]] = compute_results(votes, seed)
     return {
         "methods": {
-            method: {metric: {"mean": its.mean, "low": its.low, "high": its.high} for metric, its in by_metric.items()}
-            for method, by_metric in means.items()
+            method: {metric: asdict(its) for metric, its in by_metric.items()}
+            for method, by_metric in compute_results(votes, seed).items()
         },
         "scenes": len({vote.scene for vote in votes.votes}),
         "ballots": len(votes.votes),
         "rank_by_column": compute_rank_by_column(votes),
-        "refused": [{"scene": r.scene, "round": r.round, "reason": r.reason} for r in votes.refused],
+        "refused": [asdict(refused) for refused in votes.refused],
         "seed": seed,
         "resamples": RESAMPLES,
     }

@@ -1,6 +1,6 @@
-"""Discovery of the scenes of a method: datasets, layout files, GLB files, MJCF files, and folders of them."""
+"""Discovery of methods and their scenes: datasets, layout files, GLB files, MJCF files, and folders of them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,28 @@ from tableverse_factory.physics.mjcf.file_check import load_mjcf
 from tableverse_factory.sources.discovery import is_source_file
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
 
+MAX_METHODS = 12
 WORLD = "world"  # name of the world body in MuJoCo
+
+
+def parse_methods(paths: Sequence[Path], named: Sequence[str]) -> dict[str, Path]:
+    """Parse methods by name: paths first, named after their last part, then `NAME=PATH`; raise `bad_method`."""
+    methods: dict[str, Path] = {}
+    entries = [(path.resolve().stem, path) for path in paths]
+    for text in named:
+        name, equals, path_text = text.partition("=")
+        if not (name.strip() and equals and path_text):
+            raise InputError(f"method {text!r:.100}: give NAME=PATH", "bad_method")
+        entries.append((name.strip(), Path(path_text)))
+    for name, path in entries:
+        if name in methods:
+            raise InputError(f"two methods are called {name!r:.100}: name them with --method NAME=PATH", "bad_method")
+        methods[name] = path
+    if not 1 <= len(methods) <= MAX_METHODS:
+        raise InputError(
+            f"{len(methods)} methods: give 1 to {MAX_METHODS}, as PATH or --method NAME=PATH", "bad_method"
+        )
+    return methods
 
 
 def find_scenes(path: Path) -> list[SceneSource]:
@@ -58,7 +79,7 @@ def _find_in_file(path: Path, root: Path) -> list[SceneSource]:
 
 def _find_in_folder(folder: Path) -> list[SceneSource]:
     if (folder / "run.json").is_file():
-        return _find_in_dataset(folder)
+        return find_exported(folder, _read_exported)
     if (scene := find_scene_file(folder)) is not None:
         return [_make_named_source(scene, folder.name, folder)]
     entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
@@ -84,10 +105,11 @@ def _looks_like_layout(path: Path) -> bool:
     return isinstance(value, dict) and isinstance(value.get("objects"), list)
 
 
-def _find_in_dataset(folder: Path) -> list[SceneSource]:
+def find_exported(folder: Path, read: Callable[[Dataset, str], MethodScene]) -> list[SceneSource]:
+    """Find the finished scenes of a dataset, sorted by id; `read` takes the dataset and the id."""
     dataset = open_dataset(folder)
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"]).column(0).to_pylist()
-    return [SceneSource(scene_id, "dataset", partial(_read_exported, dataset, scene_id)) for scene_id in done]
+    return [SceneSource(scene_id, "dataset", partial(read, dataset, scene_id)) for scene_id in sorted(done)]
 
 
 def count_dropped_scenes(path: Path) -> int | None:

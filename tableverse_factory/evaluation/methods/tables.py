@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,16 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.methods.ablation import find_ablation_scenes, list_configurations
 from tableverse_factory.evaluation.methods.collisions import MethodCollisions, measure_method
 from tableverse_factory.evaluation.methods.comparison import index_by_shared_name, match_methods
-from tableverse_factory.evaluation.methods.grid_judges import ReplayedGridJudge, summarize_recorded
-from tableverse_factory.evaluation.methods.methods import MAX_METHODS
+from tableverse_factory.evaluation.methods.grid_judges import replay_vote, summarize_recorded
 from tableverse_factory.evaluation.methods.scenes import SceneSource
 from tableverse_factory.evaluation.methods.score import (
-    Interval,
     RefusedQuestion,
     VoteResults,
     ask_all,
     compute_results,
     format_interval,
 )
-from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, find_scenes
+from tableverse_factory.evaluation.methods.sources import MAX_METHODS, count_dropped_scenes, find_scenes
 from tableverse_factory.evaluation.methods.vlm_vote import METRICS
 
 ANSWERS = "answers"
@@ -60,7 +59,8 @@ def make_tables(folder: Path, epsilon_m: float, seed: int, answers: Path | None,
         answers: Folder of recorded answers, if elsewhere.
         cache_dir: Cache of convex pieces; None measures only the meshes, as the paper does.
     """
-    methods = {entry.name: entry for entry in sorted(folder.iterdir()) if _is_method_folder(entry)}
+    entries = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    methods = {entry.name: entry for entry in entries if entry.name not in OTHERS}
     if not methods:
         raise InputError(f"{folder}: no methods: give a folder with a subfolder for each", "no_methods")
     collisions = tuple(
@@ -120,15 +120,17 @@ def format_table_2(tables: Tables) -> str:
 
 def tables_to_json(tables: Tables) -> dict[str, Any]:
     """Return both tables as plain values for JSON."""
-    marks: Mapping[str, Mapping[str, Interval]] = (
-        {} if tables.votes is None else compute_results(tables.votes, tables.seed)
-    )
+    marks = {} if tables.votes is None else compute_results(tables.votes, tables.seed)
+    shown = {
+        method: {metric: asdict(interval) for metric, interval in by_metric.items()}
+        for method, by_metric in marks.items()
+    }
     return {
         "epsilon_m": tables.collisions[0].epsilon_m,
         "table1": [
             _list_rates(each)
             | {"own_scenes": len(own.scenes), "own_measured": len(own.measured), "own_collision_rate": own.rate()}
-            | {metric: _interval_to_json(marks.get(each.method, {}).get(metric)) for metric in METRICS}
+            | shown.get(each.method, dict.fromkeys(METRICS))
             for own, each in zip(tables.collisions, tables.shared, strict=True)
         ],
         "table2": [
@@ -139,10 +141,6 @@ def tables_to_json(tables: Tables) -> dict[str, Any]:
         "ballots": 0 if tables.votes is None else len(tables.votes.votes),
         "refused": [] if tables.votes is None else [refused.reason for refused in tables.votes.refused],
     }
-
-
-def _is_method_folder(entry: Path) -> bool:
-    return entry.is_dir() and entry.name not in OTHERS and not entry.name.startswith(".")
 
 
 def _find_scenes_by_shared_name(path: Path) -> list[SceneSource]:
@@ -166,15 +164,11 @@ def _load_recorded_votes(methods: Mapping[str, Path], folder: Path, seed: int) -
         return VoteResults(tuple(judged), (), (RefusedQuestion("all scenes", 0, reason),))
     if not judged:
         return VoteResults((), (), (RefusedQuestion("all scenes", 0, "the answers name no method"),))
-    return ask_all(match_methods(judged), ReplayedGridJudge(folder), min(rounds, len(judged)), seed)
+    return ask_all(match_methods(judged), partial(replay_vote, folder), min(rounds, len(judged)), seed)
 
 
 def _list_rates(each: MethodCollisions) -> dict[str, Any]:
     return {key: value for key, value in each.as_json().items() if key != "per_scene"}
-
-
-def _interval_to_json(value: Interval | None) -> dict[str, float | None] | None:
-    return None if value is None else {"mean": value.mean, "low": value.low, "high": value.high}
 
 
 def _format_rate(each: MethodCollisions) -> str:

@@ -103,12 +103,10 @@ def _load_pose_truth(poses: Mapping[str, tuple[Pose, float]], result: MethodScen
 def _load_capture_truth(path: Path, result: MethodScene) -> SceneTruth:
     """Load the true meshes of a synthetic capture in the table frame of the result."""
     truth = _read_capture_truth(path)
-    to_result: Callable[[Pose], Pose] = _return_pose
+    to_result: Pose | None = None  # the same frame
     if result.camera_to_scene is not None:
-        to_result = partial(
-            compose_poses,
-            compose_poses(result.camera_to_scene, invert_pose(read_pose(truth.camera_to_table.model_dump()))),
-        )
+        table_to_camera = invert_pose(read_pose(truth.camera_to_table.model_dump()))
+        to_result = compose_poses(result.camera_to_scene, table_to_camera)
     objects = []
     for entry in truth.objects:
         try:
@@ -116,17 +114,14 @@ def _load_capture_truth(path: Path, result: MethodScene) -> SceneTruth:
             mesh = read_mesh(data, entry.mesh)
         except GeometryError as error:
             raise InputError(f"{path}: {error}", "bad_truth") from error
-        pose = to_result(read_pose(entry.pose.model_dump()))
+        pose = read_pose(entry.pose.model_dump())
+        pose = pose if to_result is None else compose_poses(to_result, pose)
         objects.append(MethodObject(f"{entry.instance_id}: {entry.label}", mesh, (VisualMesh(mesh, GREY),), pose))
     return SceneTruth(tuple(objects), (), named=False, same_meshes=False)
 
 
 def _load_scene_truth(read: Callable[[], MethodScene], result: MethodScene) -> SceneTruth:  # noqa: ARG001
     return SceneTruth(read().objects, (), named=True, same_meshes=False)
-
-
-def _return_pose(pose: Pose) -> Pose:
-    return pose
 
 
 def _resolve_below(folder: Path, mesh: str) -> Path:

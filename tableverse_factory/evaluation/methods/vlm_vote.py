@@ -13,8 +13,7 @@ from tableverse_factory.evaluation.methods.grid import make_letters
 from tableverse_factory.models.remote.json_schema import INTEGER, STRING, Schema, object_of
 from tableverse_factory.models.remote.json_text import parse_json_object, validate_answer
 
-METRICS = ("layout_fidelity", "visual_quality", "geometry_quality", "rank")
-"""Marks of a method in each vote: three scores from 1 to 10, and its rank, 1 being the best."""
+METRICS = ("layout_fidelity", "visual_quality", "geometry_quality", "rank")  # from 1 to 10, and 1 for the best
 
 Points = Annotated[StrictInt, Field(ge=1, le=10)]
 
@@ -42,9 +41,8 @@ class GridAnswer(BaseModel):
     def _complete(self) -> "GridAnswer":
         count = len(self.columns)
         if sorted(self.columns) != list(make_letters(count)):
-            raise ValueError(
-                f"columns {sorted(self.columns)!r:.100}: give each of {', '.join(make_letters(count))} once"
-            )
+            letters = ", ".join(make_letters(count))
+            raise ValueError(f"columns {sorted(self.columns)!r:.100}: give each of {letters} once")
         ranks = sorted(marks.rank for marks in self.columns.values())
         if ranks != list(range(1, count + 1)):
             raise ValueError(f"ranks {ranks!r:.100}: give each of 1 to {count} once")
@@ -122,11 +120,7 @@ def build_vote_schema(count: int) -> Schema:
 
 
 def parse_vote(text: str, count: int) -> GridAnswer:
-    """Parse the answer of a model about `count` columns.
-
-    Raises:
-        AnswerInvalidError: if it is not JSON, marks are out of bounds, columns are missing or ranks shared.
-    """
+    """Parse the answer of a model about `count` columns; raise an `AnswerInvalidError` if it is not as asked for."""
     return validate_vote(parse_json_object(text), count)
 
 

@@ -59,41 +59,18 @@ def list_layers() -> tuple[ConvLayer, ...]:
     )
 
 
-def count_multiply_adds(height: int, width: int) -> int:
-    """Count the multiply-adds of one forward pass over an input of this size [px]."""
-    scale, total = {"input": 1}, 0
-    for layer in list_layers():
-        scale[layer.name] = scale[layer.source] * layer.stride
-        pixels = (height // scale[layer.name]) * (width // scale[layer.name])
-        total += pixels * layer.inputs * layer.outputs * layer.kernel**2
-    return total
-
-
 def make_network(seed: int) -> Any:
     """Make the network with weights from a seed, on the CPU: a `torch.nn.ModuleDict` for `forward`."""
     torch = import_torch()
     nn = torch.nn
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return nn.ModuleDict(
-            {
-                layer.name: nn.ModuleList(
-                    [
-                        nn.Conv2d(
-                            layer.inputs,
-                            layer.outputs,
-                            layer.kernel,
-                            layer.stride,
-                            layer.padding,
-                            layer.dilation,
-                            bias=layer.plain,
-                        ),
-                        *([] if layer.plain else [nn.BatchNorm2d(layer.outputs)]),
-                    ]
-                )
-                for layer in list_layers()
-            }
-        )
+        network = nn.ModuleDict()
+        for each in list_layers():
+            shape = (each.inputs, each.outputs, each.kernel, each.stride, each.padding, each.dilation)
+            norm = [] if each.plain else [nn.BatchNorm2d(each.outputs)]
+            network[each.name] = nn.ModuleList([nn.Conv2d(*shape, bias=each.plain), *norm])
+        return network
 
 
 def forward(network: Any, inputs: Tensor) -> Tensor:

@@ -57,16 +57,11 @@ def train_network(
     checkpoint_every: int = 100,
     jobs: int = 0,
 ) -> Any:
-    """Train the network, from a checkpoint of the same settings if there is one; return it on the CPU.
+    """Train the network on views, from a checkpoint of the same settings if there is one; return it on the CPU.
 
-    Args:
-        paths: Views of `make_views`.
-        folder: Folder of the checkpoint.
-        settings: Settings that determine the weights.
-        device: Device; weights differ in the last digits between a CPU and a GPU.
-        on_step: Called after each step.
-        checkpoint_every: Steps between two checkpoints; the last step writes one too.
-        jobs: Processes that augment views; with 0 this process does.
+    Weights differ in the last digits between a CPU and a GPU. A checkpoint is written into the folder after so many
+    steps and after the last one. `jobs` processes augment views; with 0 this process does. A checkpoint of another
+    training or network, a damaged view, and the death of a process are `InputError`s.
     """
     torch = import_torch()
     network = make_network(settings.seed).to(device.torch_device).train()

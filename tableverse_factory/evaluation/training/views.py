@@ -1,7 +1,7 @@
 """Training views: depth images of synthetic scenes with their object ids, several per scene, on the disk."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -52,14 +52,7 @@ class TrainingView(Frozen):
         """Write the view atomically."""
         partial = path.with_suffix(".partial")
         with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                depth=self.depth,
-                ids=self.ids,
-                focal=self.focal,
-                camera_to_table=self.camera_to_table,
-                depth_scale=self.depth_scale,
-            )
+            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
         partial.rename(path)
 
     @classmethod
@@ -126,12 +119,8 @@ def _render_view(
     camera = Camera(fx, fy, cx, cy, full.width // COARSER, full.height // COARSER)
     depth, facing, shiny, ids = _cast_view(caster, camera, pose, np.array([item.model.shiny for item in placed]))
     sensor = make_sensor(rng)
-    sensor = replace(
-        sensor,
-        disparity_sigma=sensor.disparity_sigma / COARSER,
-        disparity_step=sensor.disparity_step / COARSER,
-        wobble=sensor.wobble / COARSER,
-    )
+    in_pixels = ("disparity_sigma", "disparity_step", "wobble")
+    sensor = replace(sensor, **{name: getattr(sensor, name) / COARSER for name in in_pixels})
     sensed = sense_depth(rng, sensor, camera, depth, facing, shiny)
     return TrainingView(sensed, ids, focal, matrix_from_pose(pose), sensor.depth_scale)
 

@@ -197,13 +197,10 @@ def make_charts(records: Records) -> tuple[Chart, ...]:
     objects = [item for scene in records.done for item in scene.objects]
     tasks = [task for scene in records.done for task in scene.tasks if task["accepted"]]
     names = Counter(name for scene in records.done for name in scene.labels)
+    scores = [scene.row["quality_score"] for scene in records.done]
     return (
         Chart("Objects per scene", _count_integers([scene.row["n_objects"] for scene in records.done]), upright=True),
-        Chart(
-            "Quality score",
-            _count_integers([scene.row["quality_score"] for scene in records.done], 1, 10),
-            upright=True,
-        ),
+        Chart("Quality score", _count_integers(scores, 1, 10), upright=True),
         Chart("Mass of an object, up to", _count_masses([item["mass_kg"] for item in objects]), upright=True),
         Chart("Most frequent objects", make_bars(names, 10), upright=False),
         Chart("Relations asked for", make_bars(Counter(str(task["relation"]) for task in tasks), 10), upright=False),

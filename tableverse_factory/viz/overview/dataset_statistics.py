@@ -158,9 +158,8 @@ def _count_motion_losses(trajectories: ds.Dataset) -> tuple[MotionLoss, ...]:
 def _choose_labels(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Array]:
     """Choose the judge's name of each object, else the detector's, in lower case."""
     for batch in batches:
-        name = pc.if_else(
-            pc.equal(pc.utf8_trim_whitespace(pc.fill_null(batch.column(0), "")), ""), *batch.columns[::-1]
-        )
+        judged = pc.utf8_trim_whitespace(pc.fill_null(batch.column(0), ""))
+        name = pc.if_else(pc.equal(judged, ""), *batch.columns[::-1])
         yield pc.utf8_trim_whitespace(pc.utf8_lower(pc.fill_null(name, "")))
 
 

@@ -117,7 +117,6 @@ def _draw_funnel(axes: Axes, entered: int, steps: Sequence[FunnelStep]) -> None:
 
 
 def _draw_histogram(axes: Axes, title: str, histogram: Histogram, color: str) -> None:
-    """Draw bars of integers."""
     axes.set_title(title)
     if _mark_empty(axes, sum(histogram.counts)):
         return

@@ -138,9 +138,8 @@ class Canvas:
             self._contacts.remove()
             self._contacts = None
         if contacts is not None and len(contacts):
-            self._contacts = self._client.scene.add_arrows(
-                "/contacts", contacts.compute_arrows(), CONTACT_COLOR, **_ARROW
-            )
+            arrows = contacts.compute_arrows()
+            self._contacts = self._client.scene.add_arrows("/contacts", arrows, CONTACT_COLOR, **_ARROW)
 
     def show_arm(self, motion: MotionPlayback | None) -> None:
         """Show the arm of a motion, or none."""

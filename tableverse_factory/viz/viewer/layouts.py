@@ -17,8 +17,7 @@ Poses = Mapping[str, Pose]
 def read_layouts(meta: Mapping[str, Any], settled: Poses) -> dict[str, Poses]:
     """Read the layouts of a scene; the settled one, of the exported model, always exists.
 
-    Copies that were added by `count` (`copy_of`) are in no observed layout; scenes of other origin have no poses in
-    `meta.json`. An invalid pose raises `bad_meta`.
+    Copies added by `count` (`copy_of`) are in no observed layout; scenes of other origin have no poses in `meta.json`.
     """
     found: dict[str, Poses] = {}
     for layout, key in _KEYS.items():

@@ -15,7 +15,7 @@ from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.training.network import count_multiply_adds, forward, make_network
+from tableverse_factory.evaluation.training.network import forward, make_network
 from tableverse_factory.evaluation.training.onnx_file import write_onnx
 from tableverse_factory.evaluation.training.samples import make_batch
 from tableverse_factory.evaluation.training.train import CHECKPOINT, TrainProgress, TrainSettings, train_network
@@ -214,7 +214,6 @@ def test_the_onnx_file_says_what_the_net_says_at_any_size(tmp_path: Path) -> Non
             said = forward(network, torch.tensor(inputs[None]))[0].numpy()
         assert np.allclose(net(inputs), said, atol=1e-3 * np.abs(said).max())
     assert sum(p.numel() for p in network.parameters()) < 2_500_000
-    assert 2e9 < count_multiply_adds(240, 320) < 2.5e9
 
 
 @pytest.mark.heavy
