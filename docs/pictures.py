@@ -176,7 +176,7 @@ def moved(scene: ExportedScene) -> Picture:
     at = [int(np.flatnonzero(phase == 1)[-1]), int(np.median(np.flatnonzero(phase == 3))), len(phase) - 1]
     eye = _from_aside(recording)
     drawn = list(render_frames(opened, str(success.row["x_id"]), recording, figure, eye, at))
-    captions = (str(success.row["instruction"]), "on the way", "done, and proven in simulation")
+    captions = (str(success.row["instruction"]), "on the way", "done, and validated in simulation")
     return _row(dict(zip(captions, drawn, strict=True)))
 
 

@@ -60,7 +60,7 @@ def build(
     `tableverse failures`), or a model did not answer for some; 4: the budget of --max-usd or --max-calls is spent; 1:
     the build cannot go on; 130 or 143: stopped by Ctrl-C or SIGTERM.
 
-    `--stages +trajectories` ends the line with proven motions; on a dataset that has none yet only these are computed.
+    `--stages +trajectories` adds validated motions; on a dataset that has none yet only these are computed.
 
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
@@ -125,7 +125,7 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
     print(f"{state.done} done, {state.dropped} dropped, {state.failed} failed of {planned}, in {out}")
     if state.done and state.committed:
         print(f"look at them: tableverse view {out}, or a gallery of files: tableverse report {out}")
-    if state.failed:
+    if state.failed or (state.dropped and not state.done):
         print(f"see why: tableverse failures {out}")
     if tally.postponed:
         later = pluralize(tally.postponed, "scene")

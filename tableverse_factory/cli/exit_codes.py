@@ -49,8 +49,8 @@ def run_command(command: Callable[[], object]) -> int:
             raise
         if message:
             print(f"error: {message}", file=sys.stderr)
-        if isinstance(error, TableverseError):
-            print(f"help: {TROUBLESHOOTING}#{error.topic}", file=sys.stderr)
+        if topic := "bad_table" if _is_parquet_error(error) else getattr(error, "topic", ""):
+            print(f"help: {TROUBLESHOOTING}#{topic}", file=sys.stderr)
         code = USAGE_ERROR if isinstance(error, TyperException) else FAILED
     return code if isinstance(code, int) else 0
 
@@ -85,12 +85,18 @@ def _describe_error(error: Exception) -> str | None:
         remedy = _REMEDIES.get(error.errno or 0)
         what = f"{error.filename or type(error).__name__}: {error.strerror or error}"
         return f"{what}: {remedy}" if remedy else what
-    package = type(error).__module__.partition(".")[0]
-    if isinstance(error, ValueError) and package == "pyarrow":
-        return f"a Parquet file is damaged: {' '.join(str(error).split())[:400]}"
-    if package in ("aiohttp", "botocore"):
+    if _is_parquet_error(error):
+        return (
+            f"a Parquet file is damaged: {' '.join(str(error).split())[:400]}; "
+            "of a dataset, delete the file of that name in scenes/, and the same build makes the shard again"
+        )
+    if type(error).__module__.partition(".")[0] in ("aiohttp", "botocore"):
         return f"the object store broke off an answer ({type(error).__name__}): run the same command again"
     return None
+
+
+def _is_parquet_error(error: Exception) -> bool:
+    return isinstance(error, ValueError) and type(error).__module__.partition(".")[0] == "pyarrow"
 
 
 def _describe_usage_error(error: Any) -> str:

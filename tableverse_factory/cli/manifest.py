@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _SHOWN_REJECTIONS = 20
 _fetching = partial(typer.Option, rich_help_panel="Fetching, with a list of addresses")
-_filtering = partial(typer.Option, rich_help_panel="Sifting bare pictures")
+_filtering = partial(typer.Option, rich_help_panel="Filter of bare pictures")
 
 
 def manifest(
@@ -176,4 +176,6 @@ def _print_manifest(made: "Manifest", out: str) -> None:
         print("left alone: " + ", ".join(f"{count} × {what}" for what, count in made.ignored.items()))
     print(f"{pluralize(len(made.rows), 'row')} in {out}")
     if unlicensed := sum(not row.licence for row in made.rows if not row.rejected):
-        print(f"without a licence: {unlicensed}; if these are to be passed on, say it in source.json or in the list")
+        print(
+            f"without a licence: {unlicensed}; to pass these on, state it in source.json, or in the list of addresses"
+        )

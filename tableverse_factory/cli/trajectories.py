@@ -1,4 +1,4 @@
-"""`tableverse trajectories`: proven trajectories for the tasks of a finished dataset."""
+"""`tableverse trajectories`: validated trajectories for the tasks of a finished dataset."""
 
 from typing import Annotated
 
@@ -22,7 +22,7 @@ def trajectories(
     shards: options.Shards = None,
     metrics: options.Metrics = None,
 ) -> None:
-    """Add motions, proven in simulation, to a finished dataset.
+    """Add motions, validated in simulation, to a finished dataset.
 
     `--set` changes keys of the section trajectories; all else is as it was built.
 

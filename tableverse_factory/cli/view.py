@@ -13,7 +13,10 @@ from tableverse_factory.core.errors import InputError
 
 def view(
     out: Annotated[
-        str, typer.Argument(help="The dataset: OUT of `tableverse build`; or the scene.xml of one exported scene.")
+        str,
+        typer.Argument(
+            metavar="OUT", help="The dataset: OUT of `tableverse build`; or the scene.xml of one exported scene."
+        ),
     ],
     scene_id: Annotated[str | None, typer.Argument(help="The scene to show first.", metavar="SCENE")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 allows every machine that can reach it.")] = (

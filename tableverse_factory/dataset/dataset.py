@@ -44,7 +44,8 @@ def open_dataset(path: str | Path) -> "Dataset":
     except (OSError, ValueError, ImportError) as error:
         raise InputError(f"{path}: cannot be reached: {sanitize_line(str(error), 300)}") from None
     if not exists:
-        raise InputError(f"{path}: no such folder; give the OUT of `tableverse build`")
+        kind = "a file" if filesystem.exists(root) else "no such folder"
+        raise InputError(f"{path}: {kind}; give the OUT of `tableverse build`")
     if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
         raise InputError(f"{path}: neither run.json nor scenes/ in it; {_suggest_folder(str(path))}")
     return Dataset(str(path), filesystem, root)
@@ -251,7 +252,8 @@ class Dataset:
         ids = list(self._shard_by_scene)
         if scene_id in self._shard_by_scene:
             return f"scene {scene_id} is planned, and its shard is not committed yet"
-        nearest = difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
+        started = [known for known in ids if scene_id and known.startswith(scene_id)]
+        nearest = started[:3] or difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
         many = f"{pluralize(len(ids), 'scene')} committed so far, `tableverse query {self.path}` shows them"
         hint = f"nearest: {', '.join(nearest)}" if nearest else many
         return f"no scene {sanitize_line(scene_id, 100)!r}; {hint}"

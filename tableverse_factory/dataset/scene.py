@@ -1,7 +1,7 @@
 """Scene of a dataset in memory: its files, rows and model."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +21,8 @@ class Scene:
 
     scene_id: str
     row: Mapping[str, Any]
-    _files: Mapping[str, bytes]
-    _rows: Callable[[str], list[dict[str, Any]]] = lambda _table: []
+    _files: Mapping[str, bytes] = field(repr=False)
+    _rows: Callable[[str], list[dict[str, Any]]] = field(default=lambda _table: [], repr=False)
 
     def files(self) -> dict[str, bytes]:
         """Return every file by name: `scene.xml`, `assets/…`, `meta.json`, `observation/…`, `trajectories/…`."""

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.config import TrajectoriesConfig
@@ -12,6 +13,7 @@ from schemas.tables import TABLES
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
+from tableverse_factory.dataset.shards import SPARSE
 from tableverse_factory.dataset.trajectory_files import find_changes, find_misfits
 from tableverse_factory.evaluation.scene_audit import SceneAudit, audit_scene
 from tableverse_factory.rebuild import config_from_run
@@ -52,8 +54,10 @@ def verify_scenes(path: str, jobs: int, trajectories: bool = False, robot: str |
     dataset = open_dataset(path)
     for table in TABLES:  # a missing table damages the shard even if its scenes are whole
         try:
-            dataset.table(table)
-        except InputError as error:
+            fragments = dataset.table(table).get_fragments()
+            for fragment in () if table in SPARSE else fragments:  # damaged trajectories cost only their scenes
+                fragment.ensure_complete_metadata()
+        except (InputError, OSError, pa.ArrowException) as error:
             raise InputError(
                 f"{error}: delete the file of that name in scenes/, and the same build makes the shard again"
             ) from None

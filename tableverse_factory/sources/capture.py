@@ -98,9 +98,11 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
 
 
 def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> float:
-    number = parse_finite(value.get(key))
+    if key not in value:
+        raise InputError(f"{CAMERA_NAME} lacks {key}", "bad_intrinsics")
+    number = parse_finite(value[key])
     if number is None or not low <= number <= high:
-        given = f"{key} is {str(value.get(key))[:80]!r}"
+        given = f"{key} is {str(value[key])[:80]!r}"
         raise InputError(f"{CAMERA_NAME}: {given}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
     return number
 

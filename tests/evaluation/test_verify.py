@@ -61,6 +61,16 @@ def test_a_damaged_table_of_trajectories_costs_its_scenes_alone(dataset, tmp_pat
     assert measured == [True, True, False, False, True]
 
 
+@pytest.mark.parametrize("table", ["objects", "tasks", "scenes"])
+def test_a_table_that_cannot_be_read_fails_the_dataset(dataset, tmp_path, run, table) -> None:
+    out = shutil.copytree(dataset, tmp_path / "out")
+    (out / table / "shard-00000.parquet").write_bytes(b"no parquet at all")
+    code, _, err = run("verify", out)
+    assert code == 1
+    assert "shard-00000.parquet" in err
+    assert "delete the file of that name in scenes/" in err
+
+
 def test_a_stop_is_said_by_the_parent_alone(dataset) -> None:
     command = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()", "verify", str(dataset)]
     process = subprocess.Popen([*command, "--jobs", "2"], stderr=subprocess.PIPE, text=True, start_new_session=True)

@@ -1,4 +1,4 @@
-"""Certificate of a scene: penetration, drift and rest, measured on its files alone (design section 5)."""
+"""Certificate of a scene: penetration, drift and rest, measured on its files alone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

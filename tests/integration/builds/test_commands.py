@@ -94,7 +94,7 @@ def test_build_ends_with_its_own_code_where_scenes_failed(run, tmp_path):
     found = json.loads(run("status", tmp_path / "out", "--json")[1])
     assert found["remaining"] == 0
     assert code == (3 if found["failed"] else 0)
-    assert ("tableverse failures" in text) == bool(found["failed"])
+    assert "tableverse failures" in text
 
 
 @pytest.mark.parametrize(
