@@ -139,8 +139,10 @@ def read_run(path: StoragePath) -> dict[str, Any]:
 def diff_run_records(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Find what differs between two records, by dotted key: the value before and the one now."""
     old, new = _flatten(before), _flatten(now)
-    derived = ("fingerprint", "stages.", "seed")  # `seed` repeats config.run.seed
+    derived = ("fingerprint", "stages.")
     keys = sorted(key for key in {*old, *new} if old.get(key) != new.get(key) and not key.startswith(derived))
+    if "config.run.seed" in keys and "seed" in keys:
+        keys.remove("seed")  # it repeats the key of the configuration
     return {key: (old.get(key), new.get(key)) for key in keys}
 
 
