@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from schemas.manifest import ImageRow
 from schemas.outcome import NO_COST, UNLIMITED, Allowance, Dropped, Failed, ModelCost
 
 Status = Literal["done", "dropped", "failed"]
@@ -22,29 +23,30 @@ class SandboxSetup:
 
 @dataclass(frozen=True, slots=True)
 class StageCall:
-    """Call of one stage on one scene; the input travels beside it as encoded bytes."""
+    """Call of one stage on one scene."""
 
-    scene_id: str
-    kind: str  # of the manifest row; it names the pipeline
-    position: int  # index of the stage in that pipeline
     deadline_s: float  # wall time of one attempt [s]
+    key: str  # of the checkpoint of its output; empty for the last stage, whose output is the finished scene
     tried: int = 0  # failed attempts before, in chains that the budget interrupted
 
 
 @dataclass(frozen=True, slots=True)
 class StageChain:
-    """Consecutive stages of one pool on one scene; the input travels beside it, or is a checkpoint."""
+    """Consecutive stages of one pool on one scene."""
 
+    row: ImageRow
+    shard: int
+    position: int  # of the first of them in the pipeline of the row's kind
     calls: tuple[StageCall, ...]
-    input_record: str  # name or location of the checkpoint that is the input; empty if the input travels beside
-    output_records: tuple[str, ...]  # name of the checkpoint of each stage's output; empty if it has none
+    input: str = ""  # location of the checkpoint that is the input; empty for the row itself
     allowance: Allowance = UNLIMITED  # of all of them together
     losses: int = 0  # how often a child was killed from outside before, in chains that the budget interrupted
+    failure: Failed | Dropped | None = None  # of a stage that adds to finished scenes: its rows are written instead
 
 
 @dataclass(frozen=True, slots=True)
 class StageReport:
-    """Report of a call; the next record travels beside it as encoded bytes."""
+    """Report of a call."""
 
     outcome: Dropped | Failed | None  # None if the stage is done
     attempts: int  # the item's own, 1 or more; losses of the infrastructure do not count
@@ -56,10 +58,21 @@ class StageReport:
 
 
 @dataclass(frozen=True, slots=True)
+class ScenePart:
+    """Place of a finished scene until its shard is committed (see `dataset.parts`)."""
+
+    file: str  # in the shard's folder of parts
+    offset: int  # of the frame of its rows; that of its files follows [bytes]
+    rows_size: int  # of the encoded rows [bytes]
+    files_size: int  # of its files as members of a tar [bytes]
+
+
+@dataclass(frozen=True, slots=True)
 class StageChainReport:
     """Report of a chain: a report of each stage that ran; only the last may be other than done."""
 
     stages: tuple[StageReport, ...]
+    output: ScenePart | str = ""  # of the last that is done: the finished scene, or the location of its checkpoint
     input_lost: bool = False  # nothing ran, because the checkpoint of the input is gone or damaged
     losses: int = 0  # how often a child was killed from outside, those of the chain before included
     counted: bool = True  # the reports hold all costs: those of a process that died are only in its cost log
@@ -78,13 +91,38 @@ class StageTiming:
 class SceneResult:
     """Result of a scene, as the journal keeps it until its shard is committed."""
 
-    scene_id: str
+    row: ImageRow
     status: Status
     stage: str  # the last that ran; `manifest` if the row was rejected
-    reason: str  # code of a drop, else empty
-    error_kind: str  # of a failure, else empty
-    detail: str  # one line for people, of a drop or a failure
-    attempts: int  # the most of any stage; 0 if none ran
-    timings: tuple[StageTiming, ...]
-    exported: bytes | None  # an encoded `ExportedScene`; None unless done
+    reason: str = ""  # code of a drop
+    error_kind: str = ""  # of a failure
+    detail: str = ""  # one line for people, of a drop or a failure
+    attempts: int = 0  # the most of any stage; 0 if none ran
+    timings: tuple[StageTiming, ...] = ()
+    part: ScenePart | None = None  # None unless done
     costs: tuple[tuple[str, ModelCost], ...] = ()  # of the answers, by stage that asked one
+
+    @property
+    def scene_id(self) -> str:
+        """Id of the scene."""
+        return self.row.scene_id
+
+
+@dataclass(frozen=True, slots=True)
+class CommitCall:
+    """Call that assembles a shard, whose scenes all have results, for its commit."""
+
+    shard: int
+    scene_ids: tuple[str, ...]  # of the shard, in the plan's order
+    post_export: tuple[str, ...]  # names of the stages that add to finished scenes
+    token: str  # names the staging folder, which is this call's own
+
+
+@dataclass(frozen=True, slots=True)
+class StagedShard:
+    """A shard that a worker assembled, to be published by the driver."""
+
+    token: str
+    size: int  # of its scenes and tables [bytes]
+    empty: tuple[str, ...]  # tables without rows, which have no file
+    damaged: tuple[str, ...] = ()  # scenes whose parts do not read; nothing is staged then

@@ -19,6 +19,7 @@ from tableverse_factory.stages.perceive.recorded import record_detector, record_
 from tableverse_factory.stages.place.place import place
 from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.settle import settle
+from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
 
 _OBSERVE = Stage(
     "observe", "perception", observe, reads=("observe", "place.mesh_model", "models"), recorded={"depth": record_depth}
@@ -66,7 +67,7 @@ _TRAJECTORIES = Stage(
     run_trajectories,
     reads=("trajectories",),
     recorded={"robot": record_robot},
-    post_export_tables=("trajectories",),
+    record_failure=with_failed_trajectories,
 )
 WITH_TRAJECTORIES: Pipelines = {kind: (*line, _TRAJECTORIES) for kind, line in PIPELINES.items()}
 """The same pipelines, with trajectories for the tasks of exported scenes: `--stages +trajectories`."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.config import Config
 from schemas.manifest import SceneKind
-from schemas.outcome import Outcome
+from schemas.outcome import Dropped, Failed, Outcome
 from tableverse_factory.models.services import Services
 
 Pool = Literal["perception", "geometry", "physics", "curation", "trajectories"]
@@ -29,8 +29,9 @@ class Stage:
         reads: The sections or `section.key`s that it reads, its own first. Other changes leave its output valid.
         recorded: What it reads besides (prompts, weights, robot files), by part of run.json: a change of these makes
             another build.
-        post_export_tables: Tables that it adds to an exported scene; empty for every stage up to the export. If such a
-            stage fails, the scene stays done as it came in, and rows of these tables say what failed.
+        record_failure: Of a stage that adds to exported scenes: `record_failure(item, config, failure)` returns its
+            input with rows that say why the stage failed. The scene stays done then. None for every stage up to the
+            export.
     """
 
     name: str
@@ -38,7 +39,7 @@ class Stage:
     run: StageFunction
     reads: tuple[str, ...]
     recorded: Mapping[str, RecordFunction] = field(default_factory=dict)
-    post_export_tables: tuple[str, ...] = ()
+    record_failure: Callable[[Any, Config, Dropped | Failed], Any] | None = None
 
     @property
     def section(self) -> str:
@@ -48,7 +49,7 @@ class Stage:
     @property
     def is_post_export(self) -> bool:
         """Whether it takes an exported scene and returns it with more in it."""
-        return bool(self.post_export_tables)
+        return self.record_failure is not None
 
     def select_values(self, config: Config) -> dict[str, Any]:
         """Select what it reads of a configuration, by dotted key, without the deadline, which changes no output."""
@@ -64,7 +65,6 @@ class Stage:
 Pipelines = Mapping[SceneKind, Sequence[Stage]]  # the stages that a manifest row of each kind runs through, in order
 
 
-def post_export_tables(pipelines: Pipelines) -> dict[str, tuple[str, ...]]:
-    """Map each post-export stage to the tables that it writes."""
-    stages = (stage for line in pipelines.values() for stage in line)
-    return {stage.name: stage.post_export_tables for stage in stages if stage.is_post_export}
+def post_export_stages(pipelines: Pipelines) -> list[str]:
+    """List the names of the stages that add to exported scenes."""
+    return list(dict.fromkeys(stage.name for line in pipelines.values() for stage in line if stage.is_post_export))

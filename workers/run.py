@@ -17,12 +17,13 @@ from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, read_whole, remove_folder, write_atomic
 from tableverse_factory.dataset.card import make_dataset_card
 from tableverse_factory.dataset.consolidated_tables import remove_merged_tables, write_merged_tables
+from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
 from tableverse_factory.dataset.shard_plan import Plan, check_shards, read_plan
 from tableverse_factory.models.local.recorded_weights import pin_commits
 from tableverse_factory.rebuild import MANIFEST_STAGE, manifest_from_dataset
 from tableverse_factory.run_record import collect_external_inputs, read_run
-from tableverse_factory.stage import Pipelines, post_export_tables
+from tableverse_factory.stage import Pipelines, post_export_stages
 from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
 from workers.driver.driver import Driver
 from workers.driver.in_flight import BuildSpec
@@ -38,7 +39,7 @@ from workers.sandbox.child import load_pipelines
 from workers.state.checkpoint_store import CHECKPOINTS
 from workers.state.commit import publish_ready
 from workers.state.cost_log import sum_costs_by_grant
-from workers.state.ledger import WORK, Ledger
+from workers.state.ledger import Ledger
 from workers.state.lock import LOCK, create_writer_lock
 
 PIPELINE = "tableverse_factory.pipeline:PIPELINES"
@@ -107,13 +108,12 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
         plan = start_or_resume(
             request.out, rows, pipelines, request.config, recorded, request.from_stage, lock.check, base
         )
-        ledger = stack.enter_context(
-            closing(Ledger(request.out, plan, rows, lock.check, post_export_tables(pipelines)))
-        )
+        ledger = stack.enter_context(closing(Ledger(request.out, plan, lock.check, post_export_stages(pipelines))))
         for line in ledger.damaged:
             display.note(line)
-        spec = _make_spec(request, rows, pipelines, recorded, _select_ranks(request, plan, ledger.todo()))
-        tally = _make_tally(plan, pipelines, len(ledger.todo()), len(spec.todo))
+        todo = ledger.todo()
+        spec = _make_spec(request, rows, plan, pipelines, recorded, _select_ranks(request, plan, todo))
+        tally = _make_tally(plan, pipelines, len(todo), len(spec.todo))
         budget = resume_budget(request.limits, sum_costs_by_grant(request.out))
         over = False
         try:
@@ -126,7 +126,7 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
             tally.committed, tally.bytes_committed = ledger.committed, ledger.bytes_committed
             tally.queued, tally.running = Counter(), Counter()
             display.show(tally)
-        if not ledger.todo():
+        if ledger.committed == plan.n_shards:
             ledger.close()
             _finish_dataset(request.out, plan)
     return BuildSummary(request.out, tally, 0, budget.spent if over else None)
@@ -148,7 +148,7 @@ def _restore_from_dataset(
     Shards that a kill left unpublished are published first: one that is half in place does not count as committed.
     """
     out, base = request.out, read_run(request.out / "run.json")
-    publish_ready(out, out / WORK, guard)
+    publish_ready(out, guard)
     plan = read_plan(out / "plan.parquet")
     check_shards(request.shards, plan.n_shards, 1)
     recorded = collect_external_inputs(request.config, base=base)
@@ -163,12 +163,14 @@ def _select_ranks(request: BuildRequest, plan: Plan, todo: Sequence[int]) -> Seq
 def _make_spec(
     request: BuildRequest,
     rows: Sequence[ImageRow],
+    plan: Plan,
     pipelines: Pipelines,
     recorded: Mapping[str, Any],
     todo: Sequence[int],
 ) -> BuildSpec:
     return BuildSpec(
         rows=rows,
+        shards=plan.shards,
         pipelines=pipelines,
         config=pin_commits(request.config, recorded),
         fingerprints={

@@ -64,8 +64,8 @@ def export_dataset(
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
     from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.dataset.journals import WORK
     from tableverse_factory.delivery.license_filter import write_filtered_dataset
-    from workers.state.ledger import WORK
     from workers.state.lock import LOCK, create_writer_lock
 
     place = parse_path(dest)

@@ -69,9 +69,9 @@ def _follow(out: "StoragePath", every_s: float) -> None:
 
     from rich.console import Console
 
+    from tableverse_factory.dataset.journals import WORK
     from workers.progress.console import ProgressDisplay
     from workers.progress.follow import BuildFollower
-    from workers.state.ledger import WORK
     from workers.state.lock import LOCK, describe_writer
 
     with ProgressDisplay(Console()) as progress:
@@ -126,9 +126,9 @@ def _to_dict(state: "BuildState", verdicts: "JudgeSummary", motions: "Trajectory
 def _print_state(state: "BuildState", out: "StoragePath") -> None:
     from rich.console import Console
 
+    from tableverse_factory.dataset.journals import WORK
     from tableverse_factory.viz.gallery.formatting import explain_reasons
     from workers.plan.rerun import read_rerun_stage
-    from workers.state.ledger import WORK
     from workers.state.lock import LOCK, describe_writer
 
     console = Console(markup=False)

@@ -20,7 +20,7 @@ _MAGIC = b"TVF1"
 _OLDER_MAGICS = (b"TVJ1", b"TVR1")
 _PREFIX = struct.Struct("<4sI")  # magic, checksum
 _LENGTHS = struct.Struct("<HQ")  # of the label and of the payload
-_HEADER_BYTES = _PREFIX.size + _LENGTHS.size
+HEADER_BYTES = _PREFIX.size + _LENGTHS.size  # of a frame, before its label
 
 
 class FrameError(Exception):
@@ -38,7 +38,7 @@ class FrameSpan:
     @property
     def offset(self) -> int:
         """Position of the payload."""
-        return self.start + _HEADER_BYTES + len(self.label)
+        return self.start + HEADER_BYTES + len(self.label)
 
     @property
     def end(self) -> int:
@@ -59,7 +59,7 @@ def read_frame(read: Callable[[int], bytes], max_bytes: int = MAX_PAYLOAD_BYTES)
         FrameError: if the bytes are torn or damaged, or the payload is longer than `max_bytes`.
         BuildError: if an older version wrote them.
     """
-    checksum, label_size, size = _decode_header(read(_HEADER_BYTES))
+    checksum, label_size, size = _decode_header(read(HEADER_BYTES))
     if size > max_bytes:
         raise FrameError(f"a frame of {size} bytes; at most {max_bytes} are accepted")
     label, payload = read(label_size), read(size)
@@ -80,7 +80,7 @@ def scan_frames(file: BinaryIO, start: int = 0, *, verify: bool = True) -> Itera
     while True:
         file.seek(start)
         try:
-            _, label_size, size = _decode_header(file.read(_HEADER_BYTES))
+            _, label_size, size = _decode_header(file.read(HEADER_BYTES))
             span = FrameSpan(file.read(label_size), start, size)
             if len(span.label) < label_size or span.end > file_end:
                 return
@@ -99,7 +99,7 @@ def _decode_header(header: bytes) -> tuple[int, int, int]:
             "an older version of TableVerse Factory began this build, and its intermediate files have another format: "
             "finish the build with that version, or remove .work and .stages in OUT and run the same command"
         )
-    if len(header) < _HEADER_BYTES:
+    if len(header) < HEADER_BYTES:
         raise FrameError("a torn frame")
     magic, checksum = _PREFIX.unpack_from(header)
     if magic != _MAGIC:

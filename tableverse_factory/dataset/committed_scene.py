@@ -1,6 +1,6 @@
-"""Scene of a committed shard as the record that it was written from, so that nothing committed is recomputed."""
+"""Scenes of a dataset as the records that they were written from, so that nothing finished is recomputed."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -9,14 +9,16 @@ import pyarrow.compute as pc
 from upath import UPath
 
 from schemas.scene import ExportedScene
+from schemas.work import ScenePart
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import StoragePath, open_stream
 from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.model_costs import COST_COLUMNS
+from tableverse_factory.dataset.parts import read_part_files, read_part_rows
 from tableverse_factory.dataset.scene_meta import read_meta
 from tableverse_factory.dataset.shards import advise_repair, shard_path
 from tableverse_factory.dataset.tar_members import read_scene_files
-from tableverse_factory.dataset.trajectory_files import strip_motions
+from tableverse_factory.dataset.trajectory_files import Row, strip_motions
 
 # Columns of scenes/ that the commit adds to those of the scene itself
 ADDED_BY_COMMIT = frozenset(
@@ -39,12 +41,32 @@ def load_exported_scene(out: StoragePath, shard: int, scene_id: str) -> Exported
         files = _read_files(out, shard, scene_id, scenes[0])
     except FileNotFoundError:
         return None
-    row = {name: None if name in ADDED_BY_COMMIT else value for name, value in scenes[0].items()}
     try:
-        certificate = read_meta(dict(files).get("meta.json", b"null")).certificate
+        return _make_scene(scene_id, files, scenes[0], objects, tasks)
     except InputError as error:
         raise _damage_error(out, shard, f"{scene_id}: {error}") from error
-    return ExportedScene(scene_id, strip_motions(files), certificate, row, tuple(objects), tuple(tasks))
+
+
+def load_part(out: StoragePath, shard: int, scene_id: str, part: ScenePart) -> ExportedScene:
+    """Load a finished scene that is not committed yet as it left `export`.
+
+    Raises:
+        FrameError: if its part is damaged.
+        FileNotFoundError: if its part is gone.
+    """
+    rows = read_part_rows(out, shard, part)
+    files = tuple(read_scene_files(scene_id, read_part_files(out, shard, part)).items())
+    return _make_scene(scene_id, files, rows["scenes"][0], rows["objects"], rows["tasks"])
+
+
+def _make_scene(
+    scene_id: str, files: Sequence[tuple[str, bytes]], scene: Row, objects: Sequence[Row], tasks: Sequence[Row]
+) -> ExportedScene:
+    row = {name: None if name in ADDED_BY_COMMIT else value for name, value in scene.items()}
+    certificate = read_meta(dict(files).get("meta.json", b"null")).certificate
+    return ExportedScene(
+        scene_id, strip_motions(files), certificate, row, tuple(map(dict, objects)), tuple(map(dict, tasks))
+    )
 
 
 @lru_cache(maxsize=1)

@@ -40,6 +40,13 @@ class TarShard:
             self._tar.addfile(_make_member(scene.scene_id, name, len(data)), io.BytesIO(data))
         return start, self._tar.offset - start
 
+    def append(self, members: bytes) -> tuple[int, int]:
+        """Append a scene's members as `add` wrote them elsewhere; return their offset and size here [bytes]."""
+        start = self._tar.offset
+        self._file.write(members)
+        self._tar.offset += len(members)
+        return start, len(members)
+
     def copy(self, source: BinaryIO, offset: int, size: int) -> tuple[int, int]:
         """Append a scene's members as they are in another shard; return their offset and size here [bytes]."""
         start = self._tar.offset

@@ -2,9 +2,12 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 from schemas.identity import check_id
+from schemas.scene import ExportedScene
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 
@@ -21,6 +24,19 @@ def arrays_name(task_id: str) -> str:
 def strip_motions(files: Sequence[tuple[str, bytes]]) -> tuple[tuple[str, bytes], ...]:
     """Remove the files that came after the export."""
     return tuple((name, data) for name, data in files if not name.startswith(FOLDER))
+
+
+def add_trajectories(
+    scene: ExportedScene, rows: Sequence[Row], files: Mapping[str, bytes] = MappingProxyType({})
+) -> ExportedScene:
+    """Return the scene with these rows of trajectories/, and the files that they name."""
+    counts = {"n_trajectories": len(rows), "n_successes": sum(bool(row["success"]) for row in rows)}
+    return replace(
+        scene,
+        files=tuple(sorted({**dict(scene.files), **files}.items())),
+        scene_row={**scene.scene_row, **counts},
+        trajectory_rows=tuple(add_digests(rows, tuple(files.items()))),
+    )
 
 
 def add_digests(rows: Sequence[Row], files: Sequence[tuple[str, bytes]]) -> list[dict[str, Any]]:

@@ -16,6 +16,7 @@ from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.card import make_dataset_card
 from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.judge_summary import summarize_judgements
 from tableverse_factory.dataset.licences import LicenceVerdict
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
@@ -24,7 +25,6 @@ from tableverse_factory.delivery.hub.upload_set import collect_upload_set
 from tableverse_factory.delivery.license_filter import redact_config, redact_uri, write_filtered_dataset
 from tableverse_factory.run_record import FORMAT, read_run, write_run
 from workers.progress.build_state import read_build_state
-from workers.state.ledger import WORK
 from workers.state.lock import create_writer_lock
 
 LICENCES = [

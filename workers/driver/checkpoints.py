@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 
-from schemas.codec import decode
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.journals import WORK
 from workers.driver.in_flight import BuildSpec, InFlightScene
 from workers.state.checkpoint_store import (
     CHECKPOINTS,
@@ -12,25 +12,23 @@ from workers.state.checkpoint_store import (
     name_checkpoints,
     name_cost_checkpoint,
 )
-from workers.state.ledger import WORK, Ledger
 
 
 class CheckpointIndex:
     """Checkpoints of a build, indexed by scene for its driver."""
 
-    def __init__(self, spec: BuildSpec, ledger: Ledger) -> None:
-        self._spec, self._ledger = spec, ledger
+    def __init__(self, spec: BuildSpec) -> None:
+        self._spec = spec
         self._store = CheckpointStore(spec.records_dir)
         self._index: tuple[int, Mapping[str, CheckpointRef]] = (-1, {})
 
     def start(self, rank: int) -> InFlightScene:
         """Create the scene of a row behind its last stage with a checkpoint."""
-        row = self._spec.rows[rank]
-        shard = self._ledger.shard_of(row.scene_id)
+        row, shard = self._spec.rows[rank], int(self._spec.shards[rank])
         if self._index[0] != shard:  # read when the shard's first scene enters: scenes come in the plan's order
             self._index = shard, self._store.index(shard)
         names = name_checkpoints(shard, row, self._spec.fingerprints[row.kind])
-        scene = InFlightScene(rank, row, self._spec.pipelines[row.kind], names)
+        scene = InFlightScene(rank, row, shard, self._spec.pipelines[row.kind], names)
         scene.start(self._index[1])
         self._restore_costs(scene, self._index[1])
         return scene
@@ -39,19 +37,14 @@ class CheckpointIndex:
         """Move scenes behind their last readable checkpoint, if that is further or their inputs are lost."""
         indexes: dict[int, Mapping[str, CheckpointRef]] = {}
         for scene in scenes:
-            shard = self._ledger.shard_of(scene.row.scene_id)
-            if shard not in indexes:
-                indexes[shard] = self._store.index(shard)
-            scene.resume(self._find_readable(scene, indexes[shard]), inputs_lost)
-            self._restore_costs(scene, indexes[shard])
+            if scene.shard not in indexes:
+                indexes[scene.shard] = self._store.index(scene.shard)
+            scene.resume(self._find_readable(scene, indexes[scene.shard]), inputs_lost)
+            self._restore_costs(scene, indexes[scene.shard])
 
-    def read_input(self, scene: InFlightScene) -> bytes | None:
-        """Read the input of the scene's stage, which is not its first; None if it is lost."""
-        return self._store.read(scene.records[scene.position - 1])
-
-    def delete(self, scene_id: str) -> None:
-        """Delete the checkpoints of the scene's shard."""
-        self._store.delete(self._ledger.shard_of(scene_id))
+    def delete(self, shard: int) -> None:
+        """Delete the checkpoints of a shard."""
+        self._store.delete(shard)
 
     def _restore_costs(self, scene: InFlightScene, index: Mapping[str, CheckpointRef]) -> None:
         """Restore the costs of finished stages and check that the scene may continue here."""
@@ -59,7 +52,7 @@ class CheckpointIndex:
             checkpoint = index.get(name_cost_checkpoint(name))
             cost = None if checkpoint is None else self._store.read(checkpoint.location)
             if cost is not None:
-                scene.costs[stage.name] = decode(cost)
+                scene.costs[stage.name] = cost.record
         if self._spec.added_only and not scene.stage.is_post_export:
             raise BuildError(
                 f"{scene.row.scene_id}: {scene.stage.name} would have to run again, because {CHECKPOINTS}/ was deleted "

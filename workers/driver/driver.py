@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from schemas.outcome import NO_COST, UNLIMITED, Failed
-from schemas.work import StageCall, StageChain, StageTiming
+from schemas.work import CommitCall, ScenePart, StageCall, StageChain, StagedShard, StageTiming
 from tableverse_factory.core.errors import BudgetSpentError, BuildError
 from tableverse_factory.stage import Stage
 from workers.driver.budget import Budget, calls_model
@@ -18,12 +18,12 @@ from workers.executors.protocol import (
     Executor,
     Job,
     JobResult,
-    Payload,
-    PayloadLostError,
+    ShardStaged,
     WorkerLost,
 )
 from workers.executors.schedule import ReadyScene
 from workers.progress.tally import Actors, Display, Tally
+from workers.state.checkpoint_store import parse_key
 from workers.state.cost_log import sum_costs_by_grant
 from workers.state.ledger import Ledger
 
@@ -41,8 +41,9 @@ class Driver:
     ) -> None:
         self._spec, self._ledger, self._executor = spec, ledger, executor
         self._budget, self._tally, self._display = budget, tally, display
-        self._checkpoints = CheckpointIndex(spec, ledger)
-        self._outcomes = OutcomeRecorder(spec, ledger, self._checkpoints, tally, display)
+        self._checkpoints = CheckpointIndex(spec)
+        self._outcomes = OutcomeRecorder(ledger, tally, display)
+        self._commits_in_flight = 0
         self._todo = [*spec.todo][::-1]
         self._waiting: dict[int, InFlightScene] = {}
         self._running: dict[int, InFlightScene] = {}
@@ -59,13 +60,13 @@ class Driver:
         When the budget is spent, scenes that need no more questions are finished first. `check` is called several times
         a second and ends the loop by raising.
         """
-        while self._todo or self._waiting or self._running:
+        while self._todo or self._waiting or self._running or self._outcomes.commits or self._commits_in_flight:
             check()
             if not self.out_of_budget:
                 self._admit()
             self._assign()
             self._update_tally()
-            if self.out_of_budget and not self._running and not self._list_ready():
+            if self.out_of_budget and not (self._running or self._commits_in_flight or self._list_ready()):
                 return
             for event in self._executor.wait(_WAIT_S):
                 self._on_event(event)
@@ -77,12 +78,15 @@ class Driver:
             rank = self._todo.pop()
             row = self._spec.rows[rank]
             if row.rejected:
-                self._outcomes.record_rejected(row)
+                self._outcomes.record_rejected(rank, row)
                 continue
             self._waiting[rank] = self._checkpoints.start(rank)
             room -= 1
 
     def _assign(self) -> None:
+        waiting = len(self._outcomes.commits)
+        self._workers.dispatch_commits(self._outcomes.commits)
+        self._commits_in_flight += waiting - len(self._outcomes.commits)
         for rank in self._workers.dispatch(self._list_ready(), self._make_job):
             self._running[rank] = self._waiting.pop(rank)
 
@@ -116,18 +120,14 @@ class Driver:
         allowance = self._budget.grant(rank) if self._calls_model(scene) else UNLIMITED
         calls = tuple(
             StageCall(
-                scene.row.scene_id,
-                scene.row.kind.value,
-                position,
                 self._spec.config.get_deadline(scene.stages[position].section),
+                parse_key(scene.records[position]),
                 scene.tried[position],
             )
             for position in range(scene.position, stop)
         )
-        chain = StageChain(
-            calls, scene.input_record, scene.records[scene.position : stop], allowance, scene.child_losses
-        )
-        return Job(rank, chain, scene.payload)
+        where = (scene.row, scene.shard, scene.position)
+        return Job(rank, StageChain(*where, calls, scene.input, allowance, scene.child_losses, scene.failure))
 
     def _get_pool(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
@@ -135,15 +135,30 @@ class Driver:
     def _on_event(self, event: Event) -> None:
         self._workers.on_event(event)
         match event:
-            case WorkerLost(ranks=ranks, why=why, inputs_lost=inputs_lost):
+            case WorkerLost(work=CommitCall() as call, why=why):
                 self._count_loss(why)
+                self._commits_in_flight -= 1
+                self._outcomes.commits.append(self._ledger.retry(call))
+            case WorkerLost(work=tuple(jobs), why=why):
+                self._count_loss(why)
+                ranks = [job.rank for job in jobs]
                 self._settle_from_log(ranks)
-                self._requeue([self._running.pop(rank) for rank in ranks], inputs_lost)
+                self._requeue([self._running.pop(rank) for rank in ranks], inputs_lost=False)
+            case ShardStaged(call=call, staged=staged):
+                self._losses_in_a_row = 0
+                self._commits_in_flight -= 1
+                self._publish(call, staged)
             case CallFinished(answers=answers):
                 self._losses_in_a_row = 0
                 self._settle_answers(answers)
                 for answer in answers:
                     self._advance(self._running.pop(answer.rank), answer)
+
+    def _publish(self, call: CommitCall, staged: StagedShard) -> None:
+        for rank in self._ledger.publish(call, staged):
+            self._todo.append(rank)
+        if not staged.damaged and not self._spec.keep:
+            self._checkpoints.delete(call.shard)
 
     def _settle_answers(self, answers: Sequence[JobResult]) -> None:
         """Settle the spending of finished jobs."""
@@ -167,42 +182,32 @@ class Driver:
             self._requeue([scene], inputs_lost=True)
             return
         first_position = scene.position
+        output = answer.report.output
         for report in answer.report.stages:
             stage = scene.stage
+            if scene.position > first_position:
+                scene.input = str(output)
             if isinstance(report.outcome, Failed) and report.outcome.error_kind == _BUDGET_SPENT:
                 scene.tried[scene.position], scene.child_losses = report.attempts - 1, answer.report.losses
-                self._hold_for_budget(scene, moved=scene.position > first_position)
+                self.out_of_budget = self._budget.is_spent
+                self._waiting[scene.rank] = scene
                 return
             if report.cost:
                 scene.costs[stage.name] = report.cost
             scene.attempts = max(scene.attempts, report.attempts)
-            scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
+            if scene.failure is None:
+                scene.timings.append(StageTiming(stage.name, report.cpu_s, report.wall_s))
             self._tally.record_call(stage.name, report.cpu_s, report.wall_s)
             if report.outcome is not None:
-                self._outcomes.record_unfinished(scene, report)
+                if not self._outcomes.record_unfinished(scene, report):
+                    self._waiting[scene.rank] = scene
                 return
-            if scene.position + 1 == len(scene.stages):
-                self._finish_scene(scene, answer.payload)
+            if scene.position + 1 == len(scene.stages) and isinstance(output, ScenePart):
+                self._outcomes.record_done(scene, output)
                 return
             self._tally.passed[stage.name] += 1
             scene.position += 1
-        scene.payload, scene.input_record = answer.payload, ""
-        self._waiting[scene.rank] = scene
-
-    def _finish_scene(self, scene: InFlightScene, payload: Payload) -> None:
-        try:
-            exported = self._executor.fetch(payload)
-        except PayloadLostError as error:
-            self._count_loss(str(error))
-            self._requeue([scene], inputs_lost=True)
-            return
-        self._outcomes.record_done(scene, exported)
-
-    def _hold_for_budget(self, scene: InFlightScene, moved: bool) -> None:
-        """Keep a scene waiting before a stage that may ask no more; end the run if nothing is left to spend."""
-        self.out_of_budget = self._budget.is_spent
-        if moved:
-            self._checkpoints.resume([scene], inputs_lost=True)
+        scene.input = str(output)
         self._waiting[scene.rank] = scene
 
     def _count_loss(self, why: str) -> None:
@@ -220,9 +225,7 @@ class Driver:
         requeued = []
         for scene in scenes:
             scene.losses += 1
-            if scene.losses >= MAX_LOSSES_PER_SCENE:
-                self._outcomes.record_lost(scene)
-            else:
+            if scene.losses < MAX_LOSSES_PER_SCENE or not self._outcomes.record_lost(scene):
                 requeued.append(scene)
         self._checkpoints.resume(requeued, inputs_lost)
         self._waiting |= {scene.rank: scene for scene in requeued}

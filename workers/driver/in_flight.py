@@ -4,14 +4,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from schemas.codec import encode
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
-from schemas.outcome import ModelCost
+from schemas.outcome import Dropped, Failed, ModelCost
 from schemas.work import StageTiming
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.stage import Pipelines, Stage
-from workers.executors.protocol import Payload
 from workers.state.checkpoint_store import CheckpointRef
 
 
@@ -20,6 +18,7 @@ class BuildSpec:
     """The work of one run of a build."""
 
     rows: Sequence[ImageRow]  # the whole manifest
+    shards: Sequence[int]  # of each row
     pipelines: Pipelines  # stages of each kind of row
     config: Config
     fingerprints: Mapping[SceneKind, Mapping[str, str]]  # of the stages of each kind of row (see `fingerprint_stages`)
@@ -35,10 +34,10 @@ class InFlightScene:
 
     rank: int
     row: ImageRow
+    shard: int
     stages: Sequence[Stage]  # of its pipeline
     records: tuple[str, ...]  # names of the checkpoints of its stages; empty for an output that is not kept
-    input_record: str = ""  # place of the checkpoint that is the input of its next stage; empty if the payload is
-    payload: Payload = b""  # input of its next stage; empty if it is a checkpoint
+    input: str = ""  # location of the checkpoint that is the input of its next stage; empty for the row
     position: int = 0  # its next stage, or the first of those that run
     attempts: int = 0  # most attempts that any stage needed
     losses: int = 0  # how often its worker was lost
@@ -46,6 +45,7 @@ class InFlightScene:
     child_losses: int = 0  # how often a child was killed from outside in such calls
     timings: list[StageTiming] = field(default_factory=list)
     costs: dict[str, ModelCost] = field(default_factory=dict)  # costs of the model calls of its stages
+    failure: Failed | Dropped | None = None  # of its stage, whose rows of failure are to be written
 
     @property
     def stage(self) -> Stage:
@@ -55,13 +55,13 @@ class InFlightScene:
     def start(self, checkpoints: Mapping[str, CheckpointRef]) -> None:
         """Move behind the last stage with a checkpoint, or to the first stage."""
         self.position = 1 + self._find_last(checkpoints)
-        self.payload = b"" if self.position else encode(self.row)
-        self.input_record = checkpoints[self.records[self.position - 1]].location if self.position else ""
+        self.input = checkpoints[self.records[self.position - 1]].location if self.position else ""
 
     def resume(self, checkpoints: Mapping[str, CheckpointRef], input_lost: bool) -> None:
         """Move behind the last stage with a checkpoint if that is further, or if the input is lost."""
         if input_lost or self._find_last(checkpoints) >= self.position:
             self.start(checkpoints)
+            self.failure = None
             passed = {stage.name for stage in self.stages[: self.position]}
             self.timings = [timing for timing in self.timings if timing.stage in passed]
             self.costs = {stage: cost for stage, cost in self.costs.items() if stage in passed}

@@ -1,15 +1,14 @@
 """Outcomes of scenes: done, dropped, failed, or postponed to a later run."""
 
-from schemas.codec import decode, encode
+from typing import Any
+
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
-from schemas.work import SceneResult, StageReport, Status
+from schemas.work import CommitCall, ScenePart, SceneResult, StageReport, Status
 from tableverse_factory.core.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
 from tableverse_factory.rebuild import MANIFEST_STAGE
 from tableverse_factory.stage import Stage
-from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
-from workers.driver.checkpoints import CheckpointIndex
-from workers.driver.in_flight import BuildSpec, InFlightScene
+from workers.driver.in_flight import InFlightScene
 from workers.progress.tally import Display, Tally
 from workers.state.ledger import Ledger
 
@@ -23,46 +22,45 @@ _MAX_TRACES = 3  # failures of a stage that are shown with their traceback
 class OutcomeRecorder:
     """Writer of outcomes into the ledger, with their counts and notes for the user."""
 
-    def __init__(
-        self, spec: BuildSpec, ledger: Ledger, checkpoints: CheckpointIndex, tally: Tally, display: Display
-    ) -> None:
-        self._spec, self._ledger, self._checkpoints = spec, ledger, checkpoints
-        self._tally, self._display = tally, display
+    def __init__(self, ledger: Ledger, tally: Tally, display: Display) -> None:
+        self._ledger, self._tally, self._display = ledger, tally, display
         self._silent_in_a_row = 0
+        self.commits: list[CommitCall] = []  # of the shards that became whole
 
-    def record_done(self, scene: InFlightScene, exported: bytes) -> None:
-        """Record a scene with the output of its last stage."""
+    def record_done(self, scene: InFlightScene, part: ScenePart) -> None:
+        """Record a scene whose part a worker has written."""
         self._silent_in_a_row = 0
-        self._record(scene, "done", exported=exported)
+        self._record(scene, "done", part=part)
 
-    def record_unfinished(self, scene: InFlightScene, report: StageReport) -> None:
-        """Record a scene that a stage dropped or failed, or postpone it to a later run."""
-        match report.outcome:
-            case Dropped(reason=reason, detail=detail):
-                self._record(scene, "dropped", reason=reason, detail=detail)
-            case Failed(error_kind=kind, message=message) if kind in _FATAL_KINDS or (
-                scene.stage.is_post_export and kind == _CONFIG_ERROR
-            ):
-                advice = _advise_correction(scene.stage, kind)
-                raise BuildError(f"{message}. Finished scenes are kept: run the same command to go on{advice}")
-            case Failed(error_kind=kind, message=message) if scene.stage.is_post_export and kind == _MODEL_SILENT:
-                self._postpone(scene, message)
-            case Failed(error_kind=kind, message=message):
-                self._record(scene, "failed", error_kind=kind, detail=message)
-                shows_trace = report.trace and self._tally.ended[scene.stage.name, "failed"] <= _MAX_TRACES
-                trace = f"\n{report.trace}" if shows_trace else ""
-                self._display.note(f"{scene.row.scene_id}: {scene.stage.name} failed: {kind}: {message}{trace}")
+    def record_unfinished(self, scene: InFlightScene, report: StageReport) -> bool:
+        """Record a scene that a stage dropped or failed, or postpone it to a later run.
 
-    def record_lost(self, scene: InFlightScene) -> None:
-        """Record a scene whose worker was lost too often as failed."""
-        self._record(scene, "failed", error_kind="lost", detail=f"its worker was lost {scene.losses} times")
+        False if the scene goes on: a stage that adds to finished scenes has failed, and rows will say so.
+        """
+        adds, outcome = scene.stage.is_post_export, report.outcome
+        if isinstance(outcome, Failed):
+            if outcome.error_kind in _FATAL_KINDS or (adds and outcome.error_kind == _CONFIG_ERROR):
+                advice = _advise_correction(scene.stage, outcome.error_kind)
+                raise BuildError(f"{outcome.message}. Finished scenes are kept: run the same command to go on{advice}")
+            if adds and outcome.error_kind == _MODEL_SILENT:
+                self._postpone(scene, outcome.message)
+                return True
+            self._note_failure(scene, outcome, report.trace)
+        return self._record_loss(scene, outcome)
 
-    def record_rejected(self, row: ImageRow) -> None:
+    def record_lost(self, scene: InFlightScene) -> bool:
+        """Record a scene whose worker was lost too often as failed; False if it goes on."""
+        return self._record_loss(scene, Failed("lost", f"its worker was lost {scene.losses} times"))
+
+    def record_rejected(self, rank: int, row: ImageRow) -> None:
         """Record a rejected row of the manifest as dropped."""
         self._tally.ended[MANIFEST_STAGE, "dropped"] += 1
-        self._write(
-            SceneResult(row.scene_id, "dropped", MANIFEST_STAGE, row.rejected, "", row.rejected_detail, 0, (), None)
-        )
+        self._write(rank, SceneResult(row, "dropped", MANIFEST_STAGE, row.rejected, detail=row.rejected_detail))
+
+    def _note_failure(self, scene: InFlightScene, failure: Failed, trace: str) -> None:
+        shows_trace = trace and self._tally.ended[scene.stage.name, "failed"] < _MAX_TRACES
+        text = f"{scene.row.scene_id}: {scene.stage.name} failed: {failure}"
+        self._display.note(f"{text}\n{trace}" if shows_trace else text)
 
     def _postpone(self, scene: InFlightScene, why: str) -> None:
         """Leave a finished scene unchanged, without the rows of the stage that adds; a later run tries again."""
@@ -72,36 +70,26 @@ class OutcomeRecorder:
         if self._silent_in_a_row >= _MAX_SILENT_IN_A_ROW:
             raise BuildError(f"{why}; {_MAX_SILENT_IN_A_ROW} scenes in a row were left. Run the same command to go on")
 
-    def _record(
-        self,
-        scene: InFlightScene,
-        status: Status,
-        reason: str = "",
-        error_kind: str = "",
-        detail: str = "",
-        exported: bytes | None = None,
-    ) -> None:
-        if (
-            status != "done"
-            and scene.stage.is_post_export
-            and (encoded := self._encode_failed_rows(scene, reason or error_kind, detail))
-        ):
-            status, reason, error_kind, detail, exported = "done", "", "", "", encoded
+    def _record_loss(self, scene: InFlightScene, outcome: Dropped | Failed | None) -> bool:
+        if scene.stage.record_failure is not None and scene.failure is None:
+            scene.failure, scene.losses = outcome, 0
+            return False
+        match outcome:
+            case Dropped(reason=reason, detail=detail):
+                self._record(scene, "dropped", reason=reason, detail=detail)
+            case Failed(error_kind=kind, message=message):
+                self._record(scene, "failed", error_kind=kind, detail=message)
+        return True
+
+    def _record(self, scene: InFlightScene, status: Status, **more: Any) -> None:
         self._tally.ended[scene.stage.name, status] += 1
-        ended = (scene.row.scene_id, status, scene.stage.name, reason, error_kind, detail, scene.attempts)
-        self._write(SceneResult(*ended, tuple(scene.timings), exported, tuple(scene.costs.items())))
+        more |= {"attempts": scene.attempts, "timings": tuple(scene.timings), "costs": tuple(scene.costs.items())}
+        self._write(scene.rank, SceneResult(scene.row, status, scene.stage.name, **more))
 
-    def _encode_failed_rows(self, scene: InFlightScene, why: str, detail: str) -> bytes | None:
-        """Encode the input of a stage that adds, with rows of failure; None if the input is lost."""
-        stage_input = self._checkpoints.read_input(scene)
-        if stage_input is None:
-            return None
-        return encode(with_failed_trajectories(decode(stage_input), self._spec.config.trajectories, why, detail))
-
-    def _write(self, result: SceneResult) -> None:
-        whole = self._ledger.record(result)
-        if whole and not self._spec.keep:
-            self._checkpoints.delete(result.scene_id)
+    def _write(self, rank: int, result: SceneResult) -> None:
+        call = self._ledger.record(rank, result)
+        if call is not None:
+            self.commits.append(call)
 
 
 def _advise_correction(stage: Stage, kind: str) -> str:

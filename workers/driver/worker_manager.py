@@ -5,7 +5,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from workers.executors.protocol import CallFinished, Event, Executor, Job, WorkerLost, WorkerReady
+from schemas.work import CommitCall
+from workers.executors.protocol import CallFinished, Event, Executor, Job, ShardStaged, WorkerLost, WorkerReady
 from workers.executors.schedule import (
     ReadyScene,
     ScheduleLimits,
@@ -77,6 +78,15 @@ class WorkerManager:
             self._executor.submit(worker, tuple(make_job(rank) for rank in ranks))
         return tuple(rank for _, ranks in chosen for rank in ranks)
 
+    def dispatch_commits(self, calls: list[CommitCall]) -> None:
+        """Let idle workers assemble shards, and take these calls off the list; if there is no worker, start one."""
+        if calls and not self._pool:
+            self._start(self._names[0])
+        while calls and self._idle:
+            worker = min(self._idle)
+            self._idle.discard(worker)
+            self._executor.stage_shard(worker, calls.pop(0))
+
     def on_event(self, event: Event) -> None:
         """Update the pools after an event of the executor."""
         match event:
@@ -87,6 +97,8 @@ class WorkerManager:
                 self._departed[self._pool[worker]] += 1
                 self._forget(worker)
                 self._until_resize = 0
+            case ShardStaged(worker=worker):
+                self._idle.add(worker)
             case CallFinished():
                 self._record_call(event)
 

@@ -1,12 +1,10 @@
 """Interface between the driver and executors; `local` and `ray` behave the same."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
-from schemas.work import StageChain, StageChainReport
+from schemas.work import CommitCall, StageChain, StageChainReport, StagedShard
 from workers.executors.schedule import ScheduleLimits
-
-Payload = Any  # an encoded record: bytes in this process, or a reference into Ray's object store
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,16 +13,14 @@ class Job:
 
     rank: int  # the scene's rank in the plan
     chain: StageChain
-    payload: Payload  # their input; empty if the chain names a checkpoint
 
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """Report of a job, and the next record if all of its stages are done."""
+    """Report of a job."""
 
     rank: int
     report: StageChainReport
-    payload: Payload
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +39,24 @@ class CallFinished:
 
 
 @dataclass(frozen=True, slots=True)
+class ShardStaged:
+    """A worker has staged a shard for its commit."""
+
+    worker: int
+    call: CommitCall
+    staged: StagedShard
+
+
+@dataclass(frozen=True, slots=True)
 class WorkerLost:
     """A worker is gone for good; the scenes of its call are not to blame."""
 
     worker: int
-    ranks: tuple[int, ...]  # the scenes of its call; none if it never started
+    work: tuple[Job, ...] | CommitCall  # of its call; no jobs if it never started
     why: str  # description of the loss
-    inputs_lost: bool = False  # whether inputs of the call are gone, too
 
 
-Event = WorkerReady | CallFinished | WorkerLost
-
-
-class PayloadLostError(Exception):
-    """A record was on a lost machine."""
+Event = WorkerReady | CallFinished | ShardStaged | WorkerLost
 
 
 class Executor(Protocol):
@@ -75,14 +75,14 @@ class Executor(Protocol):
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
         """Send a call to an idle worker."""
 
+    def stage_shard(self, worker: int, call: CommitCall) -> None:
+        """Let an idle worker assemble a shard."""
+
     def wait(self, timeout_s: float) -> list[Event]:
         """Return the new events; wait for the first one at most `timeout_s`."""
 
     def retire(self, worker: int) -> None:
         """Stop an idle worker."""
-
-    def fetch(self, payload: Payload) -> bytes:
-        """Return the bytes of a payload; PayloadLostError if they are gone."""
 
     def close(self) -> None:
         """Stop all workers at once."""

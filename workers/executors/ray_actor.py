@@ -4,9 +4,11 @@ import ray
 import ray.util
 
 from schemas.codec import decode, encode
-from schemas.work import SandboxSetup, StageChain, StageChainReport
+from schemas.work import SandboxSetup, StageChain
+from tableverse_factory.core.storage.files import parse_path
 from workers.executors.preflight import NodeExpectation, find_local_problem
 from workers.sandbox.parent import Sandbox
+from workers.state.commit import stage_shard
 
 
 class StageActor:
@@ -15,7 +17,7 @@ class StageActor:
     def __init__(self, setup: bytes) -> None:
         """Decode a `SandboxSetup`."""
         decoded: SandboxSetup = decode(setup)
-        self._sandbox = Sandbox(decoded)
+        self._sandbox, self._out = Sandbox(decoded), parse_path(decoded.records_dir).parent
 
     def check(self, expected: NodeExpectation | None) -> str:
         """Check that this node would give the same bytes as the others; returns the problem, or nothing."""
@@ -23,13 +25,11 @@ class StageActor:
             return ""
         return find_local_problem(ray.util.get_node_ip_address(), ray.get_runtime_context().get_node_id(), expected)
 
-    def run(self, chains: bytes, *items: bytes) -> tuple[bytes, ...]:
-        """Run encoded chains on their inputs; returns the encoded reports, then the output of each chain."""
+    def run(self, chains: bytes) -> bytes:
+        """Run encoded chains; returns their encoded reports."""
         decoded: tuple[StageChain, ...] = decode(chains)
-        reports: list[StageChainReport] = []
-        values: list[bytes] = []
-        for chain, item in zip(decoded, items, strict=True):
-            report, value = self._sandbox.run(chain, item)
-            reports.append(report)
-            values.append(value)
-        return encode(tuple(reports)), *values
+        return encode(tuple(self._sandbox.run(chain) for chain in decoded))
+
+    def stage_shard(self, call: bytes) -> bytes:
+        """Assemble a shard for its commit; takes an encoded `CommitCall`, returns an encoded `StagedShard`."""
+        return encode(stage_shard(self._out, decode(call)))

@@ -1,6 +1,7 @@
 """Executor on Ray: pools of one generic actor class, one call in flight per actor, without Ray's own retries."""
 
 import itertools
+import math
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import ray.exceptions
 
 from schemas.codec import decode, encode
 from schemas.pools import Pools, PoolSpec
-from schemas.work import SandboxSetup, StageChainReport
+from schemas.work import CommitCall, SandboxSetup
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.files import StoragePath
 from workers.executors.pool_capacity import check_pools, count_actors
@@ -21,8 +22,7 @@ from workers.executors.protocol import (
     Event,
     Job,
     JobResult,
-    Payload,
-    PayloadLostError,
+    ShardStaged,
     WorkerLost,
     WorkerReady,
 )
@@ -41,13 +41,8 @@ class _Call:
     """A call in flight with its deadline `until` [s]."""
 
     worker: int
-    jobs: tuple[Job, ...]
-    values: list[Any]
+    work: tuple[Job, ...] | CommitCall
     until: float
-
-    @property
-    def ranks(self) -> tuple[int, ...]:
-        return tuple(job.rank for job in self.jobs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +106,12 @@ class RayExecutor:
 
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
         """Call the actor."""
-        method = self._actors[worker].run.options(num_returns=1 + len(jobs))
-        report, *values = method.remote(encode(tuple(job.chain for job in jobs)), *(job.payload for job in jobs))
-        self._running[report] = _Call(worker, jobs, values, time.monotonic() + self._compute_deadline_s(jobs))
+        reference = self._actors[worker].run.remote(encode(tuple(job.chain for job in jobs)))
+        self._running[reference] = _Call(worker, jobs, time.monotonic() + self._compute_deadline_s(jobs))
+
+    def stage_shard(self, worker: int, call: CommitCall) -> None:
+        """Call the actor; a store may be slow, so only its loss ends the call."""
+        self._running[self._actors[worker].stage_shard.remote(encode(call))] = _Call(worker, call, math.inf)
 
     def wait(self, timeout_s: float) -> list[Event]:
         """Return started actors and finished calls; an actor that died or exceeds its deadline is killed."""
@@ -132,14 +130,6 @@ class RayExecutor:
     def retire(self, worker: int) -> None:
         """Kill the actor; its child dies with it."""
         ray.kill(self._actors.pop(worker))
-
-    def fetch(self, payload: Payload) -> bytes:
-        """Fetch a record into this process; PayloadLostError if the machine that held it is gone."""
-        try:
-            data: bytes = ray.get(payload)
-        except ray.exceptions.RayError as error:
-            raise PayloadLostError(describe_loss(error)) from error
-        return data
 
     def close(self) -> None:
         """Kill the actors, whose children die with them, and disconnect from Ray."""
@@ -177,22 +167,22 @@ class RayExecutor:
 
     def _on_call_finished(self, reference: Any) -> Event:
         try:
-            reports: tuple[StageChainReport, ...] = decode(ray.get(reference))
+            answer: Any = decode(ray.get(reference))
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
-        except ray.exceptions.ObjectLostError as error:
-            return self._drop_worker(reference, describe_loss(error), inputs_lost=True)
         except ray.exceptions.RayError as error:
             return self._drop_worker(reference, describe_loss(error))
         running = self._running.pop(reference)
-        results = zip(running.ranks, reports, running.values, strict=True)
-        return CallFinished(running.worker, tuple(JobResult(rank, report, value) for rank, report, value in results))
+        if isinstance(running.work, CommitCall):
+            return ShardStaged(running.worker, running.work, answer)
+        results = zip(running.work, answer, strict=True)
+        return CallFinished(running.worker, tuple(JobResult(job.rank, report) for job, report in results))
 
-    def _drop_worker(self, reference: Any, why: str, inputs_lost: bool = False) -> WorkerLost:
+    def _drop_worker(self, reference: Any, why: str) -> WorkerLost:
         """Drop a worker after killing it: otherwise it could share a CPU and a scene with its successor."""
         running = self._running.pop(reference)
         ray.kill(self._actors.pop(running.worker))
-        return WorkerLost(running.worker, running.ranks, why, inputs_lost)
+        return WorkerLost(running.worker, running.work, why)
 
 
 def _group_pools(pools: Pools, used: Collection[str]) -> dict[str, str]:

@@ -2,21 +2,20 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from contextlib import suppress
 from functools import partial
 
 from upath import UPath
 
-from schemas.codec import decode, encode
 from schemas.manifest import ImageRow
 from schemas.scene import ExportedScene
+from tableverse_factory.core.framing import FrameError
 from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.dataset.committed_scene import load_part
+from tableverse_factory.dataset.journals import WORK, find_journals, journal_path, read_results
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards
-from tableverse_factory.dataset.trajectory_files import strip_motions
-from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, CheckpointStore, name_checkpoints
-from workers.state.journal import find_journals, read_journal, read_result
-from workers.state.ledger import WORK, journal_path
+from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore, name_checkpoints
 
 _N_THREADS = 8  # threads for writes into a store, which mostly wait for answers
 
@@ -38,8 +37,8 @@ def checkpoint_exported_scenes(
             chosen = [rows[rank] for rank in members if plan.scene_ids[rank] in wanted]
             names = {row.scene_id: name_checkpoints(shard, row, fingerprints[row.kind.value])[-2] for row in chosen}
             newer = set()
-            for scene in _read_journal(out, shard, names) if shard in journals else ():
-                records.write(names[scene.scene_id], encode(scene))
+            for scene in _read_parts(out, shard, names) if shard in journals else ():
+                records.write(names[scene.scene_id], scene)
                 newer.add(scene.scene_id)
             known = records.index(shard) if chosen else {}
             named = [i for i, name in names.items() if shard in committed and i not in newer and name not in known]
@@ -48,14 +47,12 @@ def checkpoint_exported_scenes(
 
 
 def _write_tombstone(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:
-    records.write(names[scene_id], TOMBSTONE_PREFIX + scene_id.encode())
+    records.write(names[scene_id], scene_id)
 
 
-def _read_journal(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
-    """Read done scenes whose latest result is not in a shard yet."""
-    journal = journal_path(out, shard)
-    for scene_id, entry in read_journal(journal).results.items():
-        exported = read_result(journal, entry).exported if scene_id in scene_ids else None
-        if exported is not None:
-            scene: ExportedScene = decode(exported)
-            yield replace(scene, files=strip_motions(scene.files), trajectory_rows=())
+def _read_parts(out: StoragePath, shard: int, scene_ids: Collection[str]) -> Iterator[ExportedScene]:
+    """Read done scenes whose latest result is not in a shard yet; one that does not read is computed again."""
+    for scene_id, result in read_results(journal_path(out, shard)).items():
+        if scene_id in scene_ids and result.part is not None:
+            with suppress(FileNotFoundError, FrameError):
+                yield load_part(out, shard, scene_id, result.part)

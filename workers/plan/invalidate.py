@@ -6,17 +6,17 @@ from collections.abc import Collection
 from upath import UPath
 
 from tableverse_factory.core.storage.files import StoragePath, make_write_error, sync_folder
+from tableverse_factory.dataset.journals import WORK, journal_path
 from tableverse_factory.dataset.shard_plan import Plan, read_plan
 from workers.state.commit import publish_ready
 from workers.state.journal import open_journal
-from workers.state.ledger import WORK, journal_path
 from workers.state.lock import LOCK, create_writer_lock
 
 
 def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
     """Reopen scenes, which stay committed until the next build has theirs; returns how many shards it will write."""
     with create_writer_lock(out / WORK / LOCK) as lock:
-        publish_ready(out, out / WORK, lock.check)
+        publish_ready(out, lock.check)
         return invalidate_scenes(out, read_plan(out / "plan.parquet"), scene_ids)
 
 

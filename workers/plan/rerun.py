@@ -7,12 +7,12 @@ from typing import Any
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, read_whole, remove, write_atomic
+from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.run_record import AFTERWARDS, CODE, map_parts_to_stages
 from tableverse_factory.stage import Pipelines, Stage
 from workers.progress.build_state import SceneStatus
 from workers.state.checkpoint_store import CheckpointStore
-from workers.state.ledger import WORK
 
 MARKER = "again.json"  # names the stage and the build, from the invalidation until the build is complete
 _STAGE_PLACEHOLDER = "STAGE"

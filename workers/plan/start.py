@@ -7,6 +7,7 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.shard_plan import Plan, digest_manifest, make_plan, read_plan, write_plan
 from tableverse_factory.run_record import (
     diff_run_records,
@@ -34,7 +35,6 @@ from workers.plan.rerun import (
 from workers.progress.build_state import read_build_state
 from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore, fingerprint_stages
 from workers.state.commit import publish_ready
-from workers.state.ledger import WORK
 
 AGAIN_OPTION = "--again"  # option of `tableverse trajectories` that recomputes its stage
 
@@ -159,7 +159,7 @@ def _invalidate_from(
     """
     guard()
     clear_rerun_marker(out)
-    publish_ready(out, out / WORK, guard)
+    publish_ready(out, guard)
     scenes = read_build_state(out).scenes
     if is_append_only(pipelines, points):
         checkpoint_exported_scenes(

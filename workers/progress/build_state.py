@@ -15,13 +15,18 @@ from schemas.work import SceneResult, Status
 from tableverse_factory.core.storage.files import StoragePath, list_names
 from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.integrity import check_files
+from tableverse_factory.dataset.journals import (
+    EMPTY_JOURNAL,
+    WORK,
+    find_journals,
+    journal_path,
+    read_journal,
+    read_result,
+)
 from tableverse_factory.dataset.model_costs import COST_COLUMNS, make_cost_columns, sum_model_costs
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed
 from tableverse_factory.run_record import read_run
-from workers.state.journal import find_journals, read_journal, read_result
-from workers.state.journal_frames import EMPTY_JOURNAL
-from workers.state.ledger import WORK, journal_path
 
 _SCENES = (
     *("scene_id", "status", "stage", "reason", "error_kind", "detail", "attempts", "shard", "tar_size"),

@@ -5,14 +5,20 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 
 from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.dataset.journals import (
+    WORK,
+    find_journal_end,
+    find_journals,
+    journal_path,
+    read_journal,
+    read_result,
+)
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards, is_committed
 from tableverse_factory.rebuild import MANIFEST_STAGE
 from tableverse_factory.run_record import read_run
 from workers.progress.build_state import SceneStatus, make_scene_status, read_committed_scenes
 from workers.progress.tally import Tally
-from workers.state.journal import find_journal_end, find_journals, read_journal, read_result
-from workers.state.ledger import WORK, journal_path
 
 
 @dataclass(slots=True)

@@ -17,24 +17,24 @@ from typing import Any
 import pyarrow as pa
 from threadpoolctl import threadpool_limits
 
-from schemas.codec import decode, encode
+from schemas.codec import decode, encode, normalize
 from schemas.config import Config
-from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
-from schemas.work import SandboxSetup, StageCall, StageChain, StageReport
+from schemas.work import SandboxSetup, ScenePart, StageChain, StageReport
 from tableverse_factory.core.errors import BuildError, TableverseError
 from tableverse_factory.core.open3d_import import stub_plotly
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import parse_path
+from tableverse_factory.dataset.parts import PartWriter
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.models.services import Services
-from tableverse_factory.stage import Pipelines
+from tableverse_factory.stage import Pipelines, Stage
 from workers.sandbox.channel import Channel, ChannelClosedError
 from workers.sandbox.error_text import bound_drop, bound_failure, make_failure
 from workers.sandbox.messages import InputMissing, StageDone, encode_message
-from workers.state.checkpoint_store import CheckpointStore, name_cost_checkpoint
+from workers.state.checkpoint_store import CheckpointStore, name_checkpoint, name_cost_checkpoint
 from workers.state.cost_log import CostLog
 
 _PR_SET_PDEATHSIG = 1
@@ -69,47 +69,56 @@ class StageRunner:
         self._spending = CostLog(folder.parent)
         self._meter = Meter(self._spending.add)
         self._services = Services(Path(setup.cache_dir), self._config.asking, self._meter)
-        self._records = CheckpointStore(folder)
+        self._records, self._parts = CheckpointStore(folder), PartWriter(folder.parent)
 
-    def run_chain(self, chain: StageChain, item: bytes, send: Callable[..., None]) -> None:
-        """Run stages until one is not done, and report each after its checkpoint is written."""
-        if chain.input_record:
-            checkpoint = self._records.read(chain.input_record)
-            if checkpoint is None:
+    def run_chain(self, chain: StageChain, send: Callable[[bytes], None]) -> None:
+        """Run stages until one is not done, and report each after its output is written.
+
+        A stage gets what the one before it gave, in the form in which it would be read back.
+        """
+        stored, item = None, chain.row
+        if chain.input:
+            stored = self._records.read(chain.input)
+            if stored is None:
                 send(encode_message(InputMissing()))
                 return
-            item = checkpoint
+            item = stored.record
         self._meter.allow(chain.allowance)
         self._spending.grant = chain.allowance.name
-        for call, record in zip(chain.calls, chain.output_records, strict=True):
-            report, item = self.run(call, item)
-            if record and report.outcome is None:
-                if report.cost:  # first: a checkpoint never lacks its cost
-                    self._records.write(name_cost_checkpoint(record), encode(report.cost))
-                self._records.write(record, item)
+        stages = self._pipelines[chain.row.kind]
+        for position, call in enumerate(chain.calls, chain.position):
+            report, item = self._run_stage(chain, stages[position], item, is_last=not call.key)
             if report.outcome is not None:
                 send(encode_message(report))
                 return
-            done = encode_message(StageDone(report, _measure_cpu_s()))
-            send(done, item) if call is chain.calls[-1] else send(done)
+            output: ScenePart | str
+            if call.key:
+                name = name_checkpoint(chain.shard, chain.row.scene_id, stages[position].name, call.key)
+                if report.cost:  # first: a checkpoint never lacks its cost
+                    self._records.write(name_cost_checkpoint(name), report.cost)
+                stored = self._records.write(name, item, stored)
+                output = stored.name
+            else:
+                output = self._parts.write(chain.shard, item)
+            send(encode_message(StageDone(report, _measure_cpu_s(), output)))
 
-    def run(self, call: StageCall, item: bytes) -> tuple[StageReport, bytes]:
+    def _run_stage(self, chain: StageChain, stage: Stage, item: Any, is_last: bool) -> tuple[StageReport, Any]:
         """Run one stage; every exception becomes its outcome."""
         started, cpu = time.monotonic(), _measure_cpu_s()
         self._meter.reset()
-        stages = self._pipelines[SceneKind(call.kind)]
-        stage = stages[call.position]
-        value, trace = b"", ""
+        scene_id, trace, value = chain.row.scene_id, "", None
         outcome: Dropped | Failed | None = None
         try:
-            answer = stage.run(
-                decode(item), self._config, make_rng(self._config.run.seed, call.scene_id, stage.name), self._services
-            )
-            if call.position == len(stages) - 1 and isinstance(answer, Done):
-                _check_last_output(answer.value, call.scene_id)
-            outcome, value = _encode_outcome(answer, stage.name)
+            if chain.failure is not None and stage.record_failure is not None:
+                answer: Any = Done(stage.record_failure(item, self._config, chain.failure))
+            else:
+                rng = make_rng(self._config.run.seed, scene_id, stage.name)
+                answer = stage.run(item, self._config, rng, self._services)
+            outcome, value = _take_outcome(answer, stage.name)
+            if is_last and outcome is None:
+                _check_last_output(value, scene_id)
         except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001 every error is a row
-            outcome, value = make_failure(error), b""
+            outcome = make_failure(error)
             trace = "" if isinstance(error, TableverseError) else "".join(traceback.format_exception(error))[-4000:]
         wall_s, spent = time.monotonic() - started, (self._meter.cost, self._meter.paid)
         return StageReport(outcome, 1, _measure_cpu_s() - cpu, wall_s, trace, *spent), value
@@ -131,14 +140,14 @@ def _measure_cpu_s() -> float:
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
-def _encode_outcome(answer: Any, stage: str) -> tuple[Dropped | Failed | None, bytes]:
+def _take_outcome(answer: Any, stage: str) -> tuple[Dropped | Failed | None, Any]:
     match answer:
         case Done(value=value):
-            return None, encode(value)
+            return None, normalize(value)
         case Dropped():
-            return bound_drop(answer), b""
+            return bound_drop(answer), None
         case Failed():
-            return bound_failure(answer), b""
+            return bound_failure(answer), None
     raise TypeError(f"stage {stage} answered a {type(answer).__name__}, not an Outcome")
 
 
@@ -151,8 +160,7 @@ def _check_last_output(value: Any, scene_id: str) -> None:
 def _serve(channel: Channel, runner: StageRunner) -> None:
     while True:
         try:
-            chain, item = decode(channel.receive()), channel.receive()
-            runner.run_chain(chain, item, channel.send)
+            runner.run_chain(decode(channel.receive()), channel.send)
         except ChannelClosedError:
             return
         except BuildError as error:

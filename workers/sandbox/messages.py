@@ -8,7 +8,7 @@ from dataclasses import astuple, dataclass
 
 from schemas.codec import decode, encode
 from schemas.outcome import NO_COST, Failed, ModelCost
-from schemas.work import StageReport
+from schemas.work import ScenePart, StageReport
 
 _DONE, _REPORT, _BROKEN, _NO_INPUT = b"d", b"r", b"b", b"n"
 _N_NUMBERS = 3 + 2 * len(astuple(NO_COST))
@@ -20,6 +20,7 @@ class StageDone:
 
     report: StageReport
     cpu_s: float  # CPU time of the process so far [s]
+    output: ScenePart | str  # the finished scene, or the location of the stage's checkpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +35,10 @@ SandboxMessage = StageDone | StageReport | Failed | InputMissing
 def encode_message(message: SandboxMessage) -> bytes:
     """Encode a message as bytes."""
     match message:
-        case StageDone(report=report, cpu_s=cpu_s):
+        case StageDone(report=report, cpu_s=cpu_s, output=output):
             numbers = (report.cpu_s, report.wall_s, cpu_s, *astuple(report.cost), *astuple(report.paid))
-            return _DONE + json.dumps(numbers).encode()
+            place = output if isinstance(output, str) else astuple(output)
+            return _DONE + json.dumps((numbers, place)).encode()
         case StageReport():
             return _REPORT + encode(message)
         case Failed():
@@ -51,10 +53,11 @@ def decode_message(data: bytes) -> SandboxMessage:
     if kind == _NO_INPUT:
         return InputMissing()
     if kind == _DONE:
-        numbers = json.loads(rest)
-        if isinstance(numbers, list) and len(numbers) == _N_NUMBERS and {type(n) for n in numbers} <= {int, float}:
+        numbers, place = json.loads(rest)
+        if len(numbers) == _N_NUMBERS and {type(n) for n in numbers} <= {int, float}:
             cost, paid = ModelCost(*numbers[3:7]), ModelCost(*numbers[7:])
-            return StageDone(StageReport(None, 1, numbers[0], numbers[1], "", cost, paid), numbers[2])
+            report = StageReport(None, 1, numbers[0], numbers[1], "", cost, paid)
+            return StageDone(report, numbers[2], place if isinstance(place, str) else ScenePart(*place))
     elif kind in (_REPORT, _BROKEN):
         message = decode(rest)
         if isinstance(message, StageReport if kind == _REPORT else Failed):

@@ -40,22 +40,17 @@ class Sandbox:
         self._setup = setup
         self._child: _Child | None = None
 
-    def run(
-        self, chain: StageChain, item: bytes, watch: Callable[[], None] = lambda: None
-    ) -> tuple[StageChainReport, bytes]:
-        """Run a chain of stages on one scene until one of them is not done; returns the reports and the last output.
+    def run(self, chain: StageChain, watch: Callable[[], None] = lambda: None) -> StageChainReport:
+        """Run a chain of stages on one scene until one of them is not done.
 
         A stage that crashes, hangs or takes too much memory is repeated in a new child as often as the setup allows,
-        from the checkpoint of the stage before it. `item` is the encoded input, ignored if the chain names a
-        checkpoint; the output is empty unless all is done. `watch` is called every few milliseconds; an exception of it
-        ends the call and the child.
+        from the checkpoint of the stage before it. `watch` is called every few milliseconds; an exception of it ends
+        the call and the child.
         """
         run = ChainRun(chain, self._setup.attempts)
-        while True:
-            result = self._run_once(run.rest, item, watch)
-            report = run.add_result(result)
-            if report is not None:
-                return report, result.value
+        while (report := run.add_result(self._run_once(run.rest, watch))) is None:
+            pass
+        return report
 
     def close(self) -> None:
         """Kill the child at once."""
@@ -63,7 +58,7 @@ class Sandbox:
             self._child.kill()
             self._child = None
 
-    def _run_once(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
+    def _run_once(self, chain: StageChain, watch: Callable[[], None]) -> ChildResult:
         """Run a chain in the child; close the child after a failure that a new one may not have."""
         keep_child = False
         try:
@@ -71,7 +66,7 @@ class Sandbox:
                 self.close()  # it died while idle: no scene is to blame
             if self._child is None:
                 self._child = _Child(self._setup, watch)
-            result = self._child.call(chain, item, watch)
+            result = self._child.call(chain, watch)
             keep_child = not (result.killed or any(map(may_retry, result.reports))) and self._child.is_lean()
         except _KilledError:
             return ChildResult(killed=True)
@@ -106,13 +101,13 @@ class _Child:
             self.kill()
             raise
 
-    def call(self, chain: StageChain, item: bytes, watch: Callable[[], None]) -> ChildResult:
+    def call(self, chain: StageChain, watch: Callable[[], None]) -> ChildResult:
         """Run a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
         result = ChildResult()
         started = time.monotonic()
         try:
-            self._channel.send(encode(chain), item)
+            self._channel.send(encode(chain))
             for call in chain.calls:
                 started = time.monotonic()
                 failure = self._wait(call.deadline_s, watch)
@@ -120,11 +115,10 @@ class _Child:
                     result.reports.append(self._make_report(failure, started))
                     return result
                 match decode_message(self._channel.receive()):
-                    case StageDone(report=report, cpu_s=cpu_s):
-                        if call is chain.calls[-1]:  # a stage is done when its output has arrived
-                            result.value = self._channel.receive()
+                    case StageDone(report=report, cpu_s=cpu_s, output=output):
                         self._cpu_s = cpu_s
                         result.reports.append(report)
+                        result.outputs.append(output)
                     case StageReport() as report:
                         self._cpu_s += report.cpu_s
                         result.reports.append(report)

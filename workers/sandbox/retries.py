@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 from schemas.outcome import Allowance, Failed
-from schemas.work import StageChain, StageChainReport, StageReport
+from schemas.work import ScenePart, StageChain, StageChainReport, StageReport
 
 MAX_KILLS = 3  # times that a child may be killed from outside during one chain before the chain fails
 
@@ -14,7 +14,7 @@ class ChildResult:
     """Result of a child for a chain, or for the rest of one."""
 
     reports: list[StageReport] = field(default_factory=list)  # of the stages that ended
-    value: bytes = b""  # the output of the last one, if all are done
+    outputs: list[ScenePart | str] = field(default_factory=list)  # of those that are done (see `StageDone`)
     killed: bool = False  # whether the child was killed from outside
     input_lost: bool = False  # whether the checkpoint that is the input was missing
 
@@ -25,6 +25,7 @@ class ChainRun:
     def __init__(self, chain: StageChain, attempts: int) -> None:
         self._chain, self._attempts = chain, attempts
         self._done: list[StageReport] = []
+        self._outputs: list[ScenePart | str] = []
         self._tries = Counter({number: call.tried for number, call in enumerate(chain.calls)})
         self._losses = chain.losses
         self._counted = True
@@ -32,6 +33,7 @@ class ChainRun:
 
     def add_result(self, result: ChildResult) -> StageChainReport | None:
         """Add the result of a child; returns the whole report once there is nothing left to try."""
+        self._outputs += result.outputs
         for report in result.reports:
             self._tries[len(self._done)] += 1
             report = replace(report, attempts=self._tries[len(self._done)])
@@ -50,25 +52,27 @@ class ChainRun:
             return replace(self._make_report(), input_lost=True)
         if result.input_lost:  # the output of a finished stage is lost: run it again
             self._done.pop()
+            self._outputs.pop()
         self._advance()
         return None
 
     def _make_report(self, *last: StageReport) -> StageChainReport:
-        return StageChainReport(
-            (*self._done, *last), losses=self._losses, counted=self._counted and not any(map(may_retry, last))
-        )
+        output, counted = self._outputs[-1] if self._outputs else "", self._counted and not any(map(may_retry, last))
+        return StageChainReport((*self._done, *last), output, losses=self._losses, counted=counted)
 
     def _advance(self) -> None:
-        """Set the rest of the chain to begin behind the last finished stage with a checkpoint."""
+        """Set the rest of the chain to begin behind the last finished stage, whose checkpoint is the input."""
         self._counted = False
-        while self._done and not self._chain.output_records[len(self._done) - 1]:
-            self._done.pop()
         count = len(self._done)
-        record = self._chain.output_records[count - 1] if count else self._chain.input_record
         # What a dead process spent is unknown here: the driver reads the cost log before it grants more.
         granted = self._chain.allowance
-        allowance = Allowance(0, 0.0, granted.name) if granted.is_limited else granted
-        self.rest = StageChain(self._chain.calls[count:], record, self._chain.output_records[count:], allowance)
+        self.rest = replace(
+            self._chain,
+            position=self._chain.position + count,
+            calls=self._chain.calls[count:],
+            input=str(self._outputs[-1]) if count else self._chain.input,
+            allowance=Allowance(0, 0.0, granted.name) if granted.is_limited else granted,
+        )
 
 
 def may_retry(report: StageReport) -> bool:

@@ -1,12 +1,7 @@
-"""Checkpoint packs: files of frames, one per checkpoint, each appended to by one process and read by all.
-
-One file per checkpoint would cost more than many a stage takes. A killed process never appends again, so only the end
-of a pack can be torn.
-"""
+"""Checkpoint packs: files of frames, one per checkpoint, each appended to by one process (see `AppendFiles`)."""
 
 import io
-import os
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 import pyarrow as pa
@@ -36,20 +31,9 @@ def encode_checkpoint(name: str, record: bytes) -> bytes:
     return encode_header(packed, name.encode()) + packed
 
 
-def decode_checkpoint(framed: bytes) -> bytes | None:
-    """Decode the record of a frame; None if it is damaged."""
-    try:
-        _, packed = read_frame(io.BytesIO(framed).read)
-    except FrameError:
-        return None
-    return _decompress(packed)
-
-
-def append_checkpoint(descriptor: int, framed: bytes) -> None:
-    """Append a frame to a pack."""
-    left = memoryview(framed)
-    while left:
-        left = left[os.write(descriptor, left) :]
+def decode_checkpoint(framed: bytes) -> tuple[str, bytes] | None:
+    """Decode the name and the record of a frame; None if it is damaged."""
+    return _read_checkpoint(io.BytesIO(framed).read)
 
 
 def scan_pack(pack: Path) -> Iterator[tuple[str, FrameSpan]]:
@@ -64,14 +48,11 @@ def scan_pack(pack: Path) -> Iterator[tuple[str, FrameSpan]]:
         return
 
 
-def read_packed_checkpoint(pack: Path, start: int) -> bytes | None:
-    """Read the record in the frame at `start`; None if it is damaged, FileNotFoundError if there is no such pack."""
+def read_packed_checkpoint(pack: Path, start: int) -> tuple[str, bytes] | None:
+    """Read the name and the record of the frame at `start`; None if it is damaged."""
     with pack.open("rb") as file:
         file.seek(start)
-        try:
-            return _decompress(read_frame(file.read)[1])
-        except FrameError:
-            return None
+        return _read_checkpoint(file.read)
 
 
 def compact(pack: Path, stages: Collection[str]) -> None:
@@ -89,8 +70,13 @@ def compact(pack: Path, stages: Collection[str]) -> None:
         remove(pack)
 
 
-def _decompress(packed: bytes) -> bytes | None:
+def _read_checkpoint(read: Callable[[int], bytes]) -> tuple[str, bytes] | None:
+    try:
+        label, packed = read_frame(read)
+    except FrameError:
+        return None
     size = int.from_bytes(packed[:_SIZE_BYTES], "little")
     if size > MAX_PAYLOAD_BYTES:
         return None
-    return pa.decompress(memoryview(packed)[_SIZE_BYTES:], decompressed_size=size, codec="zstd", asbytes=True)
+    record = pa.decompress(memoryview(packed)[_SIZE_BYTES:], decompressed_size=size, codec="zstd", asbytes=True)
+    return label.decode(errors="replace"), record

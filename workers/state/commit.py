@@ -1,20 +1,22 @@
-"""Commit of one shard: staged beside the dataset, then moved into place file by file, the scenes file last.
+"""Commit of one shard in two phases: a worker stages its files beside the dataset, and the driver publishes them.
 
-A shard is staged in `.work/shard-00000.staging/`; the file `.work/shard-00000.ready` decides. A kill before it leaves
-the dataset as it was; a kill after it is repaired by `publish_ready` on the next start. On the disk staged files are
+A worker writes the tar and the tables into `.work/shard-00000.TOKEN.staging/`, a folder of its own: one that was given
+up for lost can still run beside its successor. The driver's file `.work/shard-00000.ready` names the folder and
+decides; then the files are moved into place one by one, the scenes file last. A kill before the decision leaves the
+dataset as it was; a kill after it is repaired by `publish_ready` on the next start. On the disk staged files are
 renamed; in an object store the store copies them, and they are removed at the end.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
-from typing import Any, BinaryIO
+from functools import cache
+from typing import BinaryIO
 
-from schemas.codec import decode
-from schemas.manifest import ImageRow
-from schemas.scene import ExportedScene
 from schemas.tables import STORED_TABLES
-from schemas.work import SceneResult
+from schemas.work import CommitCall, SceneResult, StagedShard
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.core.framing import FrameError
 from tableverse_factory.core.storage.files import (
     StoragePath,
     abort_uploads,
@@ -29,8 +31,10 @@ from tableverse_factory.core.storage.files import (
 )
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.committed_rows import read_shard
-from tableverse_factory.dataset.licences import scene_license
-from tableverse_factory.dataset.model_costs import COST_COLUMNS, make_cost_columns
+from tableverse_factory.dataset.journals import WORK, journal_path, read_results
+from tableverse_factory.dataset.model_costs import COST_COLUMNS
+from tableverse_factory.dataset.parts import SceneRows, read_part_files, read_part_rows
+from tableverse_factory.dataset.scene_rows import complete_rows
 from tableverse_factory.dataset.shards import (
     FOLDERS,
     SPARSE,
@@ -41,12 +45,10 @@ from tableverse_factory.dataset.shards import (
     shard_stem,
     tar_sort_key,
 )
-from tableverse_factory.dataset.trajectory_files import add_digests
 
 STAGING, READY = ".staging", ".ready"
 _WITHOUT = "without "  # in the ready file before a folder for which the shard has no rows: an older file goes
-
-SceneRows = dict[str, list[dict[str, Any]]]  # the rows of one scene in each table
+_STAGED = re.compile(rf"(shard-\d{{5,9}})\.([0-9a-f]+){re.escape(STAGING)}")
 
 
 class CommittedShard:
@@ -68,7 +70,7 @@ class CommittedShard:
             for row in rows:
                 by_scene.setdefault(row["scene_id"], []).append(row)
 
-    def merge_earlier_stages(self, scene_id: str, rows: SceneRows, post_export: Mapping[str, object]) -> SceneRows:
+    def merge_earlier_stages(self, scene_id: str, rows: SceneRows, post_export: Collection[str]) -> SceneRows:
         """Add to the rows of a scene what the stages before its post-export stages took and cost."""
         (old,), timings = self._rows["scenes"][scene_id], self._rows["timings"].get(scene_id, [])
         (scene,) = rows["scenes"]
@@ -97,161 +99,128 @@ class CommittedShard:
             self._tar.close()
 
 
-def commit_shard(
-    out: StoragePath,
-    work: StoragePath,
-    number: int,
-    rows: Sequence[ImageRow],
-    read_result: Callable[[str], SceneResult | None],
-    guard: Callable[[], None],
-    post_export: Mapping[str, Sequence[str]],
-) -> int:
-    """Write and publish a shard; returns the bytes of its scenes and tables.
+def stage_shard(out: StoragePath, call: CommitCall) -> StagedShard:
+    """Write the files of a shard whose scenes all have results, beside the dataset (phase one).
 
-    `work` is on the same file system or in the same store, `rows` are in the plan's order. `read_result` returns a
-    scene's new result, or None if what the committed shard has of it stays. `guard` is called before each step that
-    others see and raises if this process is no longer the writer. `post_export` has the tables that each post-export
-    stage writes.
+    Scenes without a new result stay as the committed shard has them. Memory holds one scene at a time, and all rows.
     """
-    staging = _staging(work, number)
-    remove_folder(staging)
-    done = _write_tar(out, staging, number, rows, read_result, post_export)
-    size, empty = _write_tables(staging, rows, done)
+    results = read_results(journal_path(out, call.shard))
+    rows: dict[str, SceneRows] = {}
+    damaged: list[str] = []
+    with ExitStack() as stack:
+
+        @cache
+        def load_committed() -> CommittedShard:
+            return stack.enter_context(closing(CommittedShard(out, call.shard)))
+
+        tar = TarShard(stack.enter_context(atomic_file(_staging(out, call.shard, call.token) / _staged("mjcf"))))
+        for scene_id in sorted(call.scene_ids, key=tar_sort_key):
+            try:
+                rows[scene_id] = _add_scene(tar, out, call, scene_id, results.get(scene_id), load_committed)
+            except (FileNotFoundError, FrameError):
+                damaged.append(scene_id)
+        tar.close()
+    if damaged:
+        remove_folder(_staging(out, call.shard, call.token))
+        return StagedShard(call.token, 0, (), tuple(damaged))
+    return _write_tables(out, call, rows)
+
+
+def publish_shard(out: StoragePath, shard: int, staged: StagedShard, guard: Callable[[], None]) -> None:
+    """Publish a staged shard (phase two).
+
+    `guard` is called before each step that others see and raises if this process is no longer the writer.
+    """
     guard()
-    write_atomic(_ready(work, number), "".join(["ready\n", *(f"{_WITHOUT}{table}\n" for table in empty)]).encode())
-    _publish(out, work, number, guard)
-    return size
+    lines = ("ready", staged.token, *(f"{_WITHOUT}{table}" for table in staged.empty))
+    write_atomic(_ready(out, shard), "".join(f"{line}\n" for line in lines).encode())
+    _publish(out, shard, guard)
 
 
-def publish_ready(out: StoragePath, work: StoragePath, guard: Callable[[], None] = lambda: None) -> None:
+def discard_staged(out: StoragePath, call: CommitCall) -> None:
+    """Remove what a lost worker staged."""
+    remove_folder(_staging(out, call.shard, call.token))
+
+
+def publish_ready(out: StoragePath, guard: Callable[[], None] = lambda: None) -> None:
     """Finish commits that a kill interrupted after their decision, and discard the others."""
-    names = list_names(work)
+    names = list_names(out / WORK)
     abort_uploads(out)
     for name in names:
         if name.endswith(READY):
-            _publish(out, work, int(name.removeprefix("shard-").removesuffix(READY)), guard)
-    for name in names:
-        if name.endswith(STAGING):
-            remove_folder(work / name)
-
-
-def _write_tar(
-    out: StoragePath,
-    staging: StoragePath,
-    number: int,
-    rows: Sequence[ImageRow],
-    read_result: Callable[[str], SceneResult | None],
-    post_export: Mapping[str, Sequence[str]],
-) -> dict[str, SceneRows]:
-    committed: CommittedShard | None = None
-    done: dict[str, SceneRows] = {}
-    with ExitStack() as stack:
-
-        def load_committed() -> CommittedShard:
-            nonlocal committed
-            committed = committed or stack.enter_context(closing(CommittedShard(out, number)))
-            return committed
-
-        tar = TarShard(stack.enter_context(atomic_file(_staged(staging, "mjcf"))))
-        for row in sorted(rows, key=lambda row: tar_sort_key(row.scene_id)):
-            result = read_result(row.scene_id)
-            if result is None:
-                done[row.scene_id] = load_committed().copy(row.scene_id, tar)
-                continue
-            scene = _add_scene(tar, row, result, number, post_export)
-            ran = {timing.stage for timing in result.timings}
-            if ran and ran <= post_export.keys() and is_committed(out, number):
-                scene = load_committed().merge_earlier_stages(row.scene_id, scene, post_export)
-            done[row.scene_id] = scene
-        tar.close()
-    return done
+            _publish(out, int(name.removeprefix("shard-").removesuffix(READY)), guard)
+    for name in filter(_STAGED.fullmatch, names):
+        remove_folder(out / WORK / name)
 
 
 def _add_scene(
-    tar: TarShard, row: ImageRow, result: SceneResult, number: int, post_export: Mapping[str, Sequence[str]]
+    tar: TarShard,
+    out: StoragePath,
+    call: CommitCall,
+    scene_id: str,
+    result: SceneResult | None,
+    load_committed: Callable[[], CommittedShard],
 ) -> SceneRows:
     """Append a scene's files to the tar and make its rows."""
-    rows: SceneRows = {table: [] for table in STORED_TABLES}
-    scene: dict[str, Any] = {}
-    offset: int | None = None
-    size: int | None = None
-    if result.exported is not None:
-        exported: ExportedScene = decode(result.exported)
-        scene = exported.scene_row
-        rows["objects"], rows["tasks"] = list(exported.object_rows), list(exported.task_rows)
-        rows["trajectories"] = add_digests(exported.trajectory_rows, exported.files)
-        offset, size = tar.add(exported)
-    if "trajectories" in post_export.get(result.stage, ()) and result.status == "done":
-        successes = sum(bool(trajectory["success"]) for trajectory in rows["trajectories"])
-        scene = {**scene, "n_trajectories": len(rows["trajectories"]), "n_successes": successes}
-    scene = {
-        **scene,
-        **{name: getattr(row, name) or None for name in ("name", "url", "source", "licence", "content_sha256")},
-        **{name: getattr(result, name) or None for name in ("reason", "error_kind", "detail")},
-        **{name: getattr(result, name) for name in ("status", "stage", "attempts")},
-        "scene_id": row.scene_id,
-        "kind": row.kind.value,
-        "uri": row.uri,
-        "licence_verdict": scene_license({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
-        **make_cost_columns(result.costs),
-        "shard": number,
-        "tar_offset": offset,
-        "tar_size": size,
-    }
-    rows["scenes"] = [scene]
-    rows["timings"] = [
-        {"scene_id": row.scene_id, "stage": t.stage, "cpu_s": t.cpu_s, "wall_s": t.wall_s} for t in result.timings
-    ]
+    if result is None:
+        return load_committed().copy(scene_id, tar)
+    own, place = None, None
+    if result.part is not None:
+        own = read_part_rows(out, call.shard, result.part)
+        place = tar.append(read_part_files(out, call.shard, result.part))
+    rows = complete_rows(result, own, call.shard, place)
+    ran = {timing.stage for timing in result.timings}
+    if ran and ran <= set(call.post_export) and is_committed(out, call.shard):
+        return load_committed().merge_earlier_stages(scene_id, rows, call.post_export)
     return rows
 
 
-def _write_tables(
-    staging: StoragePath, rows: Sequence[ImageRow], done: Mapping[str, SceneRows]
-) -> tuple[int, list[str]]:
-    """Write the tables; return the bytes of scenes and tables, and the tables without rows, which have no file."""
-    size = sum(scene["tar_size"] or 0 for entry in rows for scene in done[entry.scene_id]["scenes"])
+def _write_tables(out: StoragePath, call: CommitCall, rows: Mapping[str, SceneRows]) -> StagedShard:
+    """Write the tables; those without rows have no file."""
+    size = sum(scene["tar_size"] or 0 for tables in rows.values() for scene in tables["scenes"])
     empty: list[str] = []
     for table, schema in STORED_TABLES.items():
-        in_order = [row for entry in rows for row in done[entry.scene_id][table]]
+        in_order = [row for scene_id in call.scene_ids for row in rows[scene_id][table]]
         if table in SPARSE and not in_order:
             empty.append(table)
             continue
         data = encode_parquet(build_table(in_order, schema))
-        write_atomic(_staged(staging, table), data)
+        write_atomic(_staging(out, call.shard, call.token) / _staged(table), data)
         size += len(data)
-    return size, empty
+    return StagedShard(call.token, size, tuple(empty))
 
 
-def _publish(out: StoragePath, work: StoragePath, number: int, guard: Callable[[], None]) -> None:
+def _publish(out: StoragePath, number: int, guard: Callable[[], None]) -> None:
     """Move the staged files into place; safe to repeat after a kill at any point."""
-    staging = _staging(work, number)
+    _, token, *lines = read_whole(_ready(out, number)).decode().splitlines()
+    staging = _staging(out, number, token)
     staged = set(list_names(staging))
-    if _staged(staging, "scenes").name in staged:  # otherwise all of them have been moved already
+    if _staged("scenes") in staged:  # otherwise all of them have been moved already
         guard()
         remove(shard_path(out, "scenes", number))
-        _remove_emptied(out, read_whole(_ready(work, number)).decode(), number)
+        _remove_emptied(out, lines, number)
     for folder in (*SPARSE, *FOLDERS):
-        if _staged(staging, folder).name in staged:
+        if _staged(folder) in staged:
             guard()
-            move(_staged(staging, folder), shard_path(out, folder, number))
-    remove(_ready(work, number))
+            move(staging / _staged(folder), shard_path(out, folder, number))
+    remove(_ready(out, number))
     remove_folder(staging)
 
 
-def _remove_emptied(out: StoragePath, decision: str, number: int) -> None:
+def _remove_emptied(out: StoragePath, lines: Sequence[str], number: int) -> None:
     """Remove the shard's older files in folders for which it has no rows any more."""
-    for folder in (line.removeprefix(_WITHOUT) for line in decision.splitlines() if line.startswith(_WITHOUT)):
+    for folder in (line.removeprefix(_WITHOUT) for line in lines if line.startswith(_WITHOUT)):
         if folder in SPARSE and shard_name(folder, number) in list_names(out / folder):
             remove(shard_path(out, folder, number))
 
 
-def _staging(work: StoragePath, number: int) -> StoragePath:
-    return work / f"{shard_stem(number)}{STAGING}"
+def _staging(out: StoragePath, number: int, token: str) -> StoragePath:
+    return out / WORK / f"{shard_stem(number)}.{token}{STAGING}"
 
 
-def _ready(work: StoragePath, number: int) -> StoragePath:
-    return work / f"{shard_stem(number)}{READY}"
+def _ready(out: StoragePath, number: int) -> StoragePath:
+    return out / WORK / f"{shard_stem(number)}{READY}"
 
 
-def _staged(folder: StoragePath, table: str) -> StoragePath:
-    return folder / f"{table}.{(FOLDERS | SPARSE)[table]}"
+def _staged(table: str) -> str:
+    return f"{table}.{(FOLDERS | SPARSE)[table]}"

@@ -1,22 +1,60 @@
-"""Finished scenes of a shard that is not committed yet: an append-only file, or objects in a store."""
+"""Writers of journals: results of scenes whose shard is not committed yet (see `dataset.journals`)."""
 
-import os
-import re
-from collections.abc import Iterable
-from dataclasses import replace
+import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 
 from upath import UPath
 
-from schemas.codec import decode
+from schemas.codec import encode
 from schemas.work import SceneResult
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import encode_header
-from tableverse_factory.core.storage.files import StoragePath, make_write_error
-from workers.state.journal_frames import Journal, JournalEntry, JournalState, fold_frames, scan_journal
-from workers.state.object_journal import ObjectJournal, find_objects_end, read_object_journal, read_object_result
+from tableverse_factory.core.storage.files import StoragePath, get_store, make_write_error, remove_folder
+from tableverse_factory.dataset.journals import REOPEN, RESULT, read_journal, segment_name
 
-SUFFIX = ".journal"
-_NAME = re.compile(rf"shard-(\d{{5,9}}){re.escape(SUFFIX)}")
+MAX_BUFFER_BYTES = 8 * 1024**2
+MAX_BUFFER_AGE_S = 1.0
+
+
+class Journal(ABC):
+    """Journal of one shard, open for appending by one writer.
+
+    Every method raises BuildError if the disk or the store refuses, or another process writes this journal.
+    """
+
+    def __init__(self, path: StoragePath) -> None:
+        """Open or create the journal."""
+        self._end = read_journal(path).end
+
+    def record(self, result: SceneResult) -> None:
+        """Append a result; it survives a kill at once on the disk, after about a second in a store."""
+        payload = encode(result)
+        self._append(encode_header(payload, RESULT + result.scene_id.encode()) + payload)
+
+    def reopen(self, scene_id: str) -> None:
+        """Append that a scene must be recomputed; durable once the journal is flushed."""
+        self._append(encode_header(b"", REOPEN + scene_id.encode()))
+
+    @abstractmethod
+    def tick(self) -> None:
+        """Write results that have waited long enough; called several times a second."""
+
+    @abstractmethod
+    def flush(self) -> None:
+        """Write what waits."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what waits; the journal stays."""
+
+    @abstractmethod
+    def remove(self) -> None:
+        """Delete the journal, whose shard is committed."""
+
+    @abstractmethod
+    def _append(self, frame: bytes) -> None:
+        """Append a frame."""
 
 
 class FileJournal(Journal):
@@ -24,9 +62,8 @@ class FileJournal(Journal):
 
     def __init__(self, path: Path) -> None:
         """Open or create the journal and cut off a torn last frame."""
-        state = read_journal(path)
-        super().__init__(state)
-        self._path, self._end = path, state.end
+        super().__init__(path)
+        self._path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
@@ -34,12 +71,11 @@ class FileJournal(Journal):
         except OSError as error:
             raise make_write_error(path, error) from error
 
-    def read(self, scene_id: str) -> SceneResult:
-        """Read the latest result of a scene."""
-        return read_result(self._path, self.results[scene_id])
-
     def tick(self) -> None:
         """Do nothing: every result is on the disk when it is recorded."""
+
+    def flush(self) -> None:
+        """Do nothing, likewise."""
 
     def close(self) -> None:
         """Close the file, which stays."""
@@ -50,56 +86,74 @@ class FileJournal(Journal):
         self._file.close()
         self._path.unlink()
 
-    def _append(self, kind: bytes, scene_id: str, payload: bytes) -> JournalEntry:
+    def _append(self, frame: bytes) -> None:
         """Append a frame; if the disk is full, the journal stays as before."""
-        header = encode_header(payload, kind + scene_id.encode())
+        left = memoryview(frame)
         try:
-            for part in (header, payload):
-                left = memoryview(part)
-                while left:
-                    left = left[self._file.write(left) :]
+            while left:
+                left = left[self._file.write(left) :]
         except OSError as error:
             self._file.truncate(self._end)
             raise make_write_error(self._path, error) from error
-        entry = JournalEntry(self._end + len(header), len(payload))
-        self._end = entry.offset + entry.size
-        return entry
+        self._end += len(frame)
+
+
+class ObjectJournal(Journal):
+    """Journal in a store: results are buffered until they amount to 8 MB or the oldest is a second old.
+
+    A kill loses the buffer; its scenes are recomputed.
+    """
+
+    def __init__(self, folder: UPath) -> None:
+        """Read the journal; the first result creates the first object."""
+        super().__init__(folder)
+        self._folder = folder
+        self._buffer = bytearray()
+        self._since = 0.0
+        self._refused = False
+
+    def tick(self) -> None:
+        """Write the buffer if it is old enough."""
+        if self._buffer and time.monotonic() - self._since >= MAX_BUFFER_AGE_S:
+            self.flush()
+
+    def close(self) -> None:
+        """Write the buffer, unless the store has just refused it."""
+        if not self._refused:
+            self.flush()
+
+    def remove(self) -> None:
+        """Delete the journal and the buffer."""
+        self._buffer.clear()
+        remove_folder(self._folder)
+
+    def flush(self) -> None:
+        """Write the buffer as one object, which no other process may have written."""
+        if not self._buffer:
+            return
+        path = self._folder / segment_name(self._end)
+        self._refused = True
+        try:
+            etag = get_store(path).put_if_absent(path.path, bytes(self._buffer))
+        except OSError as error:
+            raise make_write_error(path, error) from error
+        if etag is None:
+            raise BuildError(
+                f"{path} was written by another process, so this one stops. Finished scenes are kept: when no other "
+                "build of this dataset runs, run the same command to go on"
+            )
+        self._refused = False
+        self._end += len(self._buffer)
+        self._buffer.clear()
+
+    def _append(self, frame: bytes) -> None:
+        if not self._buffer:
+            self._since = time.monotonic()
+        self._buffer += frame
+        if len(self._buffer) >= MAX_BUFFER_BYTES:
+            self.flush()
 
 
 def open_journal(path: StoragePath) -> Journal:
     """Open or create a journal."""
     return ObjectJournal(path) if isinstance(path, UPath) else FileJournal(path)
-
-
-def read_journal(path: StoragePath, start: int = 0) -> JournalState:
-    """Read a journal from `start` [bytes], 0 or an earlier end, without changing it; a missing one is empty."""
-    if isinstance(path, UPath):
-        return read_object_journal(path, start)
-    try:
-        with path.open("rb") as file:
-            state = fold_frames(scan_journal(file, start), start)
-            return replace(state, lost=max(os.fstat(file.fileno()).st_size - state.end, 0))
-    except (FileNotFoundError, NotADirectoryError):
-        return JournalState({}, frozenset(), start)
-
-
-def read_result(path: StoragePath, entry: JournalEntry) -> SceneResult:
-    """Read the result at `entry`; FileNotFoundError if the journal is gone, because its shard was committed."""
-    if isinstance(path, UPath):
-        return read_object_result(path, entry)
-    with path.open("rb") as file:
-        file.seek(entry.offset)
-        result: SceneResult = decode(file.read(entry.size))
-    return result
-
-
-def find_journal_end(path: StoragePath) -> int:
-    """Find where a journal ends, torn frames included [bytes]; 0 if there is none."""
-    if isinstance(path, UPath):
-        return find_objects_end(path)
-    return path.stat().st_size if path.exists() else 0
-
-
-def find_journals(names: Iterable[str]) -> frozenset[int]:
-    """Find the shards whose journals are among the names in `.work/`."""
-    return frozenset(int(match[1]) for match in map(_NAME.fullmatch, names) if match)

@@ -1,18 +1,17 @@
 """Progress of a build: journals of open shards, committed shards, and the step between them."""
 
-from collections.abc import Callable, Mapping, Sequence
+import secrets
+from collections.abc import Callable, Collection, Sequence
 
-from schemas.manifest import ImageRow
-from schemas.work import SceneResult
-from tableverse_factory.core.storage.files import StoragePath, list_names, redact_uri
+from schemas.work import CommitCall, SceneResult, StagedShard
+from tableverse_factory.core.storage.files import StoragePath, list_names, redact_uri, remove_folder
 from tableverse_factory.dataset.integrity import check_files, check_tars
+from tableverse_factory.dataset.journals import WORK, find_journals, journal_path, read_journal
+from tableverse_factory.dataset.parts import find_parts, parts_folder
 from tableverse_factory.dataset.shard_plan import Plan
-from tableverse_factory.dataset.shards import committed_shards, shard_stem
-from workers.state.commit import commit_shard, publish_ready
-from workers.state.journal import SUFFIX, find_journals, open_journal, read_journal
-from workers.state.journal_frames import Journal
-
-WORK = ".work"
+from tableverse_factory.dataset.shards import committed_shards
+from workers.state.commit import discard_staged, publish_ready, publish_shard, stage_shard
+from workers.state.journal import Journal, open_journal
 
 
 class Ledger:
@@ -25,56 +24,74 @@ class Ledger:
         self,
         out: StoragePath,
         plan: Plan,
-        rows: Sequence[ImageRow],
         guard: Callable[[], None] = lambda: None,
-        post_export: Mapping[str, Sequence[str]] | None = None,
+        post_export: Collection[str] = (),
     ) -> None:
-        """Repair what a kill left, and commit shards that were complete; `rows` are in the plan's order.
+        """Repair what a kill left, and commit shards that were complete.
 
         `guard` is called before anything is written and raises if this process is no longer the writer; `post_export`
-        has the tables that each post-export stage writes.
+        names the stages that add to exported scenes.
         """
-        self._guard, self._post_export = guard, post_export or {}
+        self._out, self._plan, self._guard, self._post_export = out, plan, guard, tuple(post_export)
         self.bytes_committed = 0  # of the shards that were written here
-        self.damaged: list[str] = []  # a message for each journal that cannot be read in part
-        self._out, self._work = out, out / WORK
-        self._plan, self._rows, self._members = plan, rows, plan.members()
-        self._ranks = {scene_id: rank for rank, scene_id in enumerate(plan.scene_ids)}
+        self.damaged: list[str] = []  # a message for each journal or part that cannot be read
+        self._members = plan.members()
         self._journals: dict[int, Journal] = {}
-        self._missing: dict[int, set[str]] = {}
-        publish_ready(out, self._work, guard)
-        committed, journals = committed_shards(out), find_journals(list_names(self._work))
+        publish_ready(out, guard)
+        committed, names = committed_shards(out), list_names(out / WORK)
+        journals = find_journals(names)
         check_files(out, committed)
         check_tars(out, committed)
-        for shard in range(plan.n_shards):
-            if shard not in committed or shard in journals:
-                self._open(shard, shard in committed, shard in journals)
+        self._missing: dict[int, set[str] | None] = {  # None for all scenes of the shard
+            shard: None for shard in range(plan.n_shards) if shard not in committed
+        }
+        for shard in sorted(find_parts(names) - journals):
+            remove_folder(parts_folder(out, shard))
+        for shard in sorted(journals):
+            self._open(shard, shard in committed)
 
     def todo(self) -> list[int]:
         """List the ranks of the pending scenes, in the plan's order."""
-        return sorted(self._ranks[scene_id] for missing in self._missing.values() for scene_id in missing)
-
-    def shard_of(self, scene_id: str) -> int:
-        """Return the scene's shard."""
-        return self._plan.shards[self._ranks[scene_id]]
+        return [
+            rank
+            for shard, missing in sorted(self._missing.items())
+            for rank in self._members[shard]
+            if missing is None or self._plan.scene_ids[rank] in missing
+        ]
 
     @property
     def committed(self) -> int:
         """Number of committed shards."""
         return self._plan.n_shards - len(self._missing)
 
-    def record(self, result: SceneResult) -> bool:
-        """Record a scene's result, and commit its shard if it was the last one missing."""
-        shard = self.shard_of(result.scene_id)
+    def record(self, rank: int, result: SceneResult) -> CommitCall | None:
+        """Record the result of the scene at `rank`; returns the call that stages its shard if it was the last one."""
+        shard = int(self._plan.shards[rank])
         self._guard()
         if shard not in self._journals:
             self._journals[shard] = open_journal(journal_path(self._out, shard))
         self._journals[shard].record(result)
-        self._missing[shard].discard(result.scene_id)
-        complete = not self._missing[shard]
-        if complete:
-            self._commit(shard)
-        return complete
+        missing = self._missing[shard]
+        if missing is None:
+            missing = self._missing[shard] = set(self._list_members(shard))
+        missing.discard(result.scene_id)
+        return None if missing else self._make_call(shard)
+
+    def publish(self, call: CommitCall, staged: StagedShard) -> list[int]:
+        """Publish a staged shard; or, if parts of it do not read, return the ranks of scenes to compute again."""
+        if staged.damaged:
+            return self._reopen(call.shard, staged.damaged)
+        publish_shard(self._out, call.shard, staged, self._guard)
+        self._journals.pop(call.shard).remove()
+        remove_folder(parts_folder(self._out, call.shard))
+        del self._missing[call.shard]
+        self.bytes_committed += staged.size
+        return []
+
+    def retry(self, call: CommitCall) -> CommitCall:
+        """Make the call again whose worker was lost."""
+        discard_staged(self._out, call)
+        return self._make_call(call.shard)
 
     def tick(self) -> None:
         """Write results that have waited long enough; called several times a second."""
@@ -89,11 +106,14 @@ class Ledger:
             journal.close()
         self._journals.clear()
 
-    def _open(self, shard: int, committed: bool, has_journal: bool) -> None:
-        members = {self._plan.scene_ids[rank] for rank in self._members[shard]}
-        if not has_journal:
-            self._missing[shard] = members
-            return
+    def _make_call(self, shard: int) -> CommitCall:
+        self._journals[shard].flush()
+        return CommitCall(shard, tuple(self._list_members(shard)), self._post_export, secrets.token_hex(8))
+
+    def _list_members(self, shard: int) -> list[str]:
+        return [str(self._plan.scene_ids[rank]) for rank in self._members[shard]]
+
+    def _open(self, shard: int, committed: bool) -> None:
         path = journal_path(self._out, shard)
         state = read_journal(path)
         if state.lost:
@@ -101,28 +121,24 @@ class Ledger:
                 f"{redact_uri(str(path))}: {state.lost} bytes hold no whole result, as after a kill or on a failing "
                 "disk: scenes whose results stood there are computed again"
             )
-        if committed and not state.reopened:
-            open_journal(path).remove()  # a kill came between the commit and this
+        if committed and not state.reopened:  # a kill came between the commit and this
+            open_journal(path).remove()
+            remove_folder(parts_folder(self._out, shard))
             return
-        self._missing[shard] = (set(state.reopened) if committed else members) - set(state.results)
+        self._missing[shard] = {*(state.reopened if committed else self._list_members(shard))} - set(state.results)
         if not self._missing[shard]:
             self._journals[shard] = open_journal(path)
-            self._commit(shard)
+            call = self._make_call(shard)
+            self.publish(call, stage_shard(self._out, call))
 
-    def _commit(self, shard: int) -> None:
-        journal = self._journals[shard]
-        rows = [self._rows[rank] for rank in self._members[shard]]
-
-        def read_result(scene_id: str) -> SceneResult | None:
-            return journal.read(scene_id) if scene_id in journal.results else None
-
-        self.bytes_committed += commit_shard(
-            self._out, self._work, shard, rows, read_result, self._guard, self._post_export
+    def _reopen(self, shard: int, scene_ids: Sequence[str]) -> list[int]:
+        """Take back results whose parts do not read, as after a loss of power."""
+        self._guard()
+        for scene_id in scene_ids:
+            self._journals[shard].reopen(scene_id)
+        missing = self._missing[shard] = set(scene_ids)
+        self.damaged.append(
+            f"shard {shard}: {len(scene_ids)} finished scenes do not read, as after a loss of power or on a failing "
+            f"disk ({', '.join(scene_ids[:3])}): they are computed again"
         )
-        journal.remove()
-        del self._missing[shard], self._journals[shard]
-
-
-def journal_path(out: StoragePath, shard: int) -> StoragePath:
-    """Path of the journal of an open shard."""
-    return out / WORK / f"{shard_stem(shard)}{SUFFIX}"
+        return [rank for rank in self._members[shard] if self._plan.scene_ids[rank] in missing]

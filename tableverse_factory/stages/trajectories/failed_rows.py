@@ -1,24 +1,24 @@
 """Rows of trajectories/ for tasks without a result."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
-from schemas.config import TrajectoriesConfig
+from schemas.config import Config, TrajectoriesConfig
+from schemas.outcome import Dropped, Failed
 from schemas.scene import ExportedScene
+from tableverse_factory.dataset.trajectory_files import add_trajectories
 
 MAX_DETAIL = 500
 
 
-def with_failed_trajectories(
-    scene: ExportedScene, config: TrajectoriesConfig, reason: str, detail: str
-) -> ExportedScene:
-    """Return the scene with a failed trajectory for each accepted task.
-
-    `reason` is why the stage did not end: `timeout`, `crash`, `out_of_memory`, or the kind of an error.
-    """
-    rows = (build_failed_row(task, config, reason, detail) for task in select_accepted_tasks(scene, config))
-    return replace(scene, trajectory_rows=tuple(rows))
+def with_failed_trajectories(scene: ExportedScene, config: Config, failure: Dropped | Failed) -> ExportedScene:
+    """Return the scene with a failed trajectory for each accepted task, because the stage did not end."""
+    settings = config.trajectories
+    why, detail = (
+        (failure.reason, failure.detail) if isinstance(failure, Dropped) else (failure.error_kind, failure.message)
+    )
+    rows = [build_failed_row(task, settings, why, detail) for task in select_accepted_tasks(scene, settings)]
+    return add_trajectories(scene, rows)
 
 
 def select_accepted_tasks(scene: ExportedScene, config: TrajectoriesConfig) -> Sequence[Mapping[str, Any]]:

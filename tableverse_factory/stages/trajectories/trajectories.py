@@ -4,7 +4,6 @@ Each task runs in a forked process (`fork_pool`), so a planner that crashes or h
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.outcome import Done, Outcome
 from schemas.scene import ExportedScene
-from tableverse_factory.dataset.trajectory_files import arrays_name
+from tableverse_factory.dataset.trajectory_files import add_trajectories, arrays_name
 from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.execution.arrays import encode_recording
 from tableverse_factory.robotics.robots.reach import compute_reach_map
@@ -33,7 +32,7 @@ def plan_trajectories(
     tasks = select_accepted_tasks(scene, settings)
     for_things, for_tasks = rng.spawn(2)
     if not tasks:
-        return Done(replace(scene, trajectory_rows=()))
+        return Done(add_trajectories(scene, ()))
     arm = load_arm(settings.robot)
     compute_reach_map(arm)  # once, here, for all of the processes apart
     cell = WorkCell(scene, arm, settings, for_things, services)
@@ -43,7 +42,8 @@ def plan_trajectories(
         return encode(_plan_task(cell, tasks[index], config, streams[index]))
 
     answers = map_in_fork(work, len(tasks), settings.task_deadline_s, config.run.memory_mb)
-    rows, files = [], dict(scene.files)
+    rows: list[dict[str, Any]] = []
+    files: dict[str, bytes] = {}
     for task, answer in zip(tasks, answers, strict=True):
         if isinstance(answer, ItemFailure):
             rows.append(build_failed_row(task, settings, answer.kind, answer.detail))
@@ -52,7 +52,7 @@ def plan_trajectories(
         rows.append(row)
         if row["arrays"] is not None:
             files[row["arrays"]] = arrays
-    return Done(replace(scene, files=tuple(sorted(files.items())), trajectory_rows=tuple(rows)))
+    return Done(add_trajectories(scene, rows, files))
 
 
 def _plan_task(

@@ -10,13 +10,13 @@ import pytest
 
 from schemas.config import Config, CurateConfig, RunConfig, SettleConfig
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.journals import WORK
 from tests.helpers.builds import QUICK, Silent, build, digests, request, scenes, write_manifest
 from workers.plan import invalidate, start
 from workers.plan.rerun import MARKER
 from workers.progress.build_state import read_build_state
 from workers.run import BuildRequest, run_build
 from workers.state import commit
-from workers.state.ledger import WORK
 
 NAMES = ["fine", "empty", "fine", "sad", "fine", "fine"]
 

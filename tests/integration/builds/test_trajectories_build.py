@@ -18,6 +18,7 @@ from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, ConfigError, InputError
 from tableverse_factory.dataset.committed_scene import load_exported_scene
 from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.delivery.license_filter import write_filtered_dataset
 from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
@@ -25,7 +26,6 @@ from tests.helpers.builds import QUICK, Silent, digests, finish, kill, request, 
 from tests.helpers.paths import HELPERS
 from workers.run import BuildRequest, run_build
 from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, CheckpointStore
-from workers.state.ledger import WORK
 
 NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty", "empty", "empty", "empty"]
 

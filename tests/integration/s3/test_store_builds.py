@@ -10,6 +10,7 @@ import pytest
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage import s3
 from tableverse_factory.core.storage.files import get_store, list_names, parse_path
+from tableverse_factory.dataset.journals import journal_path
 from tableverse_factory.dataset.shard_plan import read_plan
 from tests.helpers.builds import (
     Silent,
@@ -31,7 +32,7 @@ from workers.progress.follow import BuildFollower
 from workers.run import run_build
 from workers.state import commit
 from workers.state.journal import open_journal
-from workers.state.ledger import Ledger, journal_path
+from workers.state.ledger import Ledger
 from workers.state.lock import create_writer_lock
 
 NAMES = ["fine", "empty", "fine", "sad", "fine", "fell", "fine", "fine"]

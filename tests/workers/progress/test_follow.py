@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.journals import journal_path
 from tableverse_factory.dataset.shard_plan import read_plan
 from tests.helpers.builds import Silent, build, compute, finish, request, start, wait_until, write_manifest
 from workers.plan.invalidate import reopen_scenes
@@ -16,7 +17,7 @@ from workers.progress import follow
 from workers.progress.build_state import read_build_state
 from workers.progress.follow import BuildFollower
 from workers.run import run_build
-from workers.state.ledger import Ledger, journal_path
+from workers.state.ledger import Ledger
 
 pytestmark = pytest.mark.heavy
 

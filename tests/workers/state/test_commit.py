@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.journals import journal_path
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import FOLDERS, is_committed, shard_path
 from tests.helpers.builds import build, compute, digests, write_manifest
@@ -13,7 +14,7 @@ from workers.plan.read_manifest import read_manifest
 from workers.progress.build_state import read_build_state
 from workers.state import commit
 from workers.state.journal import open_journal
-from workers.state.ledger import Ledger, journal_path
+from workers.state.ledger import Ledger
 
 pytestmark = pytest.mark.heavy
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.journals import read_journal, read_result
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from workers.run import run_build
-from workers.state.journal import FileJournal, read_journal, read_result
+from workers.state.journal import FileJournal
 
 
 def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneResult:

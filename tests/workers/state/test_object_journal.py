@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import list_names, read_whole, write_atomic
+from tableverse_factory.dataset.journals import find_journal_end, read_journal, read_result
 from workers.state import object_journal
-from workers.state.journal import find_journal_end, open_journal, read_journal, read_result
+from workers.state.journal import open_journal
 
 pytestmark = pytest.mark.heavy
 
