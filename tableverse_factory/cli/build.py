@@ -118,12 +118,11 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
         print(f"still to do: {left}; run the same command with a larger --max-usd or --max-calls")
     elif state.remaining > tally.postponed:
         print(f"still to do: {left}; run it again, without --limit or --shards for all of them")
-        print(f"rows and files appear when their shard is whole: {state.committed} of {state.shards} shards are")
     if tally.before == tally.total:
         print("nothing was left to do")
     planned = pluralize(state.total, "scene")
     print(f"{state.done} done, {state.dropped} dropped, {state.failed} failed of {planned}, in {out}")
-    if state.done and state.committed:
+    if state.done:
         print(f"look at them: tableverse view {out}, or a gallery of files: tableverse report {out}")
     if state.failed or (state.dropped and not state.done):
         print(f"see why: tableverse failures {out}")

@@ -1,4 +1,4 @@
-"""Datasets as consumers read them: tables as pyarrow datasets, and scenes opened straight from their shard."""
+"""Datasets as consumers read them: tables as pyarrow datasets, and scenes opened straight from their bytes."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -16,10 +16,13 @@ from fsspec.implementations.local import LocalFileSystem
 
 from schemas.tables import TABLES
 from tableverse_factory.core.errors import InputError, StoreError
-from tableverse_factory.core.storage.files import resolve_filesystem
+from tableverse_factory.core.framing import FrameError
+from tableverse_factory.core.storage.files import parse_path, resolve_filesystem
 from tableverse_factory.core.storage.parquet import make_arrow_filesystem, read_remote_table
 from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.dataset.consolidated_tables import MADE_FROM, MERGED, digest_shards
+from tableverse_factory.dataset.parts import read_part_files
+from tableverse_factory.dataset.provisional import NO_OFFSET, ProvisionalScenes, read_provisional
 from tableverse_factory.dataset.scene import Scene
 from tableverse_factory.dataset.shard_plan import PLAN
 from tableverse_factory.dataset.shards import SPARSE, find_shards, shard_name
@@ -75,9 +78,9 @@ def _filesystem(path: str) -> tuple[fsspec.AbstractFileSystem, str]:
 
 
 class Dataset:
-    """Dataset at rest. Only committed shards count: those whose file in scenes/ exists.
+    """Dataset, finished or growing: committed shards, and scenes that ended in others, if it can list `.work`.
 
-    The shards are listed once, when a table is first read; open the dataset again to see newer ones.
+    They are listed once, when a table is first read; open the dataset again to see newer ones.
     """
 
     def __init__(self, path: str, filesystem: fsspec.AbstractFileSystem, root: str) -> None:
@@ -86,6 +89,8 @@ class Dataset:
         self._root = root.rstrip("/")
         # Arrow reads the disk by itself far faster than through Python.
         self._is_local = isinstance(filesystem, LocalFileSystem)
+        is_growing = self._is_local or path.startswith("s3://")  # or may be: other places hold what was published
+        self._out = parse_path(path if not self._is_local else self._root) if is_growing else None
         self._arrow = pa.fs.LocalFileSystem() if self._is_local else make_arrow_filesystem(filesystem)
 
     def record(self) -> dict[str, Any] | None:
@@ -108,7 +113,14 @@ class Dataset:
     @cached_property
     def shards(self) -> tuple[int, ...]:
         """Numbers of the committed shards, in order."""
+        if self._provisional is not None:
+            return self._provisional.shards
         return tuple(sorted(find_shards(self._list_sizes("scenes"))))
+
+    @cached_property
+    def _provisional(self) -> ProvisionalScenes | None:
+        """Scenes of shards that are not committed yet; None where they cannot be listed."""
+        return None if self._out is None else read_provisional(self._out)
 
     @cached_property
     def scenes(self) -> ds.Dataset:
@@ -139,12 +151,18 @@ class Dataset:
         folder = f"{self._root}/{name}"
         if missing := [name for name in names if name not in sizes]:
             raise InputError(f"{self.path}: damaged: {folder}/{missing[0]} is missing although its shard is committed")
-        if not names:
+        committed = self._open_shards(name, {name: sizes[name] for name in names})
+        provisional = None if self._provisional is None else self._provisional.tables[name]
+        return ds.dataset([committed, ds.dataset(provisional)]) if provisional else committed
+
+    def _open_shards(self, name: str, sizes: Mapping[str, int]) -> ds.Dataset:
+        """Open the committed rows of a table; `sizes` are of its files by name [bytes]."""
+        if not sizes:
             return ds.dataset(TABLES[name].empty_table())
         merged = f"{self._root}/{MERGED}/{name}.parquet"
-        if self._is_up_to_date(merged, {name: sizes[name] for name in names}):
+        if self._is_up_to_date(merged, sizes):
             return self._open_files([merged], name)
-        return self._open_files([f"{folder}/{name}" for name in names], name)
+        return self._open_files([f"{self._root}/{name}/{file}" for file in sizes], name)
 
     def _list_sizes(self, table: str) -> dict[str, int]:
         """List the sizes of a table's files by name [bytes]."""
@@ -172,7 +190,7 @@ class Dataset:
         return ds.dataset(paths, schema=TABLES[table], format="parquet", filesystem=self._arrow)
 
     def scene(self, scene_id: str) -> "Scene":
-        """Open a scene, reading its own bytes of the shard and nothing else.
+        """Open a scene, reading its own bytes and nothing else.
 
         Raises:
             InputError: if there is no such scene, with the nearest ids; or if it has no files, with the reason.
@@ -180,7 +198,7 @@ class Dataset:
         return self.scene_at(self.scene_row(scene_id))
 
     def scene_row(self, scene_id: str) -> dict[str, Any]:
-        """Read the scene's row of scenes/, from its shard's file alone; dropped and failed scenes have one too."""
+        """Read the scene's row of scenes/; dropped and failed scenes have one too."""
         shard = self._shard_by_scene.get(scene_id)
         rows = [] if shard is None else self._read_rows(shard, scene_id, "scenes")
         if not rows:
@@ -192,8 +210,23 @@ class Dataset:
         scene_id, shard = str(row["scene_id"]), int(row["shard"])
         if row["tar_offset"] is None or row["tar_size"] is None:
             raise InputError(f"scene {scene_id} has no files: {_describe_loss(row)}")
-        rows = partial(self._read_rows, shard, scene_id)
-        return Scene(scene_id, row, read_scene_files(scene_id, self._read_scene_bytes(row, shard)), rows)
+        data = self._read_part(scene_id) if row["tar_offset"] == NO_OFFSET else self._read_scene_bytes(row, shard)
+        if data is None:  # its shard was committed meanwhile
+            row = self._read_rows(shard, scene_id, "scenes")[0]
+            data = self._read_scene_bytes(row, shard)
+        return Scene(scene_id, row, read_scene_files(scene_id, data), partial(self._read_rows, shard, scene_id))
+
+    def _read_part(self, scene_id: str) -> bytes | None:
+        """Read the members of a scene that no tar holds yet; None if it has been moved to its shard."""
+        if self._out is None or self._provisional is None or scene_id not in self._provisional.parts:
+            return None
+        shard, part = self._provisional.parts[scene_id]
+        try:
+            return read_part_files(self._out, shard, part)
+        except FileNotFoundError:
+            return None
+        except FrameError as error:
+            raise InputError(f"scene {scene_id}: damaged ({error}); the next run of its build makes it again") from None
 
     @cached_property
     def _shard_by_scene(self) -> dict[str, int]:
@@ -219,9 +252,11 @@ class Dataset:
         return dict(zip(*(column.to_pylist() for column in plan.columns), strict=True))
 
     def _read_rows(self, shard: int, scene_id: str, table: str) -> list[dict[str, Any]]:
-        """Read the scene's rows from a table's file of one shard; none if the shard is not committed."""
+        """Read the scene's rows in a table; none if it has not ended."""
         path = f"{self._root}/{table}/{shard_name(table, shard)}"
         mine = pc.field("scene_id") == scene_id
+        if self._provisional is not None and (found := self._provisional.tables[table].filter(mine)):
+            return found.to_pylist()
         try:
             if self._is_local:
                 found = self._open_files([path], table).to_table(filter=mine)
@@ -251,10 +286,10 @@ class Dataset:
     def _describe_unknown(self, scene_id: str) -> str:
         ids = list(self._shard_by_scene)
         if scene_id in self._shard_by_scene:
-            return f"scene {scene_id} is planned, and its shard is not committed yet"
+            return f"scene {scene_id} is planned and not finished yet"
         started = [known for known in ids if scene_id and known.startswith(scene_id)]
         nearest = started[:3] or difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)
-        many = f"{pluralize(len(ids), 'scene')} committed so far, `tableverse query {self.path}` shows them"
+        many = f"{pluralize(len(ids), 'scene')} so far, `tableverse query {self.path}` shows them"
         hint = f"nearest: {', '.join(nearest)}" if nearest else many
         return f"no scene {sanitize_line(scene_id, 100)!r}; {hint}"
 

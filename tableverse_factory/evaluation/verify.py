@@ -7,6 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.dataset as ds
 
 from schemas.config import TrajectoriesConfig
 from schemas.tables import TABLES
@@ -56,7 +57,8 @@ def verify_scenes(path: str, jobs: int, trajectories: bool = False, robot: str |
         try:
             fragments = dataset.table(table).get_fragments()
             for fragment in () if table in SPARSE else fragments:  # damaged trajectories cost only their scenes
-                fragment.ensure_complete_metadata()
+                if isinstance(fragment, ds.ParquetFileFragment):
+                    fragment.ensure_complete_metadata()
         except (InputError, OSError, pa.ArrowException) as error:
             raise InputError(
                 f"{error}: delete the file of that name in scenes/, and the same build makes the shard again"
