@@ -11,13 +11,13 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.codec import encode
 from schemas.config import Config, RunConfig
 from schemas.manifest import ImageRow
-from schemas.work import SandboxSetup, SceneResult, StageCall
+from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain
 from tests.helpers.paths import HELPERS
 from workers.run import BuildRequest, BuildSummary, run_build
 from workers.sandbox.child import StageRunner
+from workers.sandbox.messages import decode_message
 
 QUICK = {"shard_size": 4, "deadline_s": 8.0, "memory_mb": 400}
 
@@ -63,13 +63,13 @@ def compute(row: ImageRow, out: Path) -> SceneResult:
         str(out.parent / "cache"),
         1,
         1000,
-        str(out.parent / "records"),
+        str(out / ".stages"),
     )
-    runner, item = StageRunner(setup), encode(row)
-    for position in range(4):
-        report, item = runner.run(StageCall(row.scene_id, row.kind.value, position, 60.0), item)
-        assert report.outcome is None
-    return SceneResult(row.scene_id, "done", "pack", "", "", "", 1, (), item)
+    calls = (*(StageCall(60.0, str(position)) for position in range(3)), StageCall(60.0, ""))
+    messages = []
+    StageRunner(setup).run_chain(StageChain(row, 0, 0, calls), messages.append)
+    part = decode_message(messages[-1]).output
+    return SceneResult(row, "done", "pack", attempts=1, part=part)
 
 
 def start(manifest: Path, out: Path, executor: str = "local", workers: int = 1, **run: object) -> subprocess.Popen[str]:

@@ -2,22 +2,24 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Dropped, Failed, ModelCost
-from schemas.work import SceneResult, StageChainReport, StageReport
+from schemas.work import CommitCall, ScenePart, SceneResult, StageChainReport, StagedShard, StageReport
 from tableverse_factory.stage import Stage
 from tests.helpers.builds import Silent
 from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, resume_budget
 from workers.driver.driver import Driver
 from workers.driver.in_flight import BuildSpec
-from workers.executors.protocol import CallFinished, Event, Job, JobResult, WorkerLost, WorkerReady
+from workers.executors.protocol import CallFinished, Event, Job, JobResult, ShardStaged, WorkerLost, WorkerReady
 from workers.executors.schedule import PoolLimits, ScheduleLimits
 from workers.progress.tally import Tally
-from workers.state.checkpoint_store import CheckpointStore
+from workers.state.checkpoint_store import CheckpointStore, name_checkpoint
 
+PART = ScenePart("0123.parts", 0, 10, 20)
 LOSE_WORKER, LOSE_INPUT = "lose worker", "lose input"
 Action = Dropped | Failed | ModelCost | str
 """Outcome of a stage; a cost for one that is done; or a loss."""
@@ -45,6 +47,7 @@ def make_spec(
 ) -> BuildSpec:
     return BuildSpec(
         rows=rows,
+        shards=[0] * len(rows),
         pipelines={SceneKind.CAPTURE: stages},
         config=config or Config(),
         fingerprints={SceneKind.CAPTURE: {stage.name: "f" for stage in stages}},
@@ -63,14 +66,19 @@ class FakeLedger:
     def __init__(self, n_scenes: int) -> None:
         self._n_scenes = n_scenes
         self.results: dict[str, SceneResult] = {}
+        self.published = 0
 
-    def shard_of(self, scene_id: str) -> int:
-        return 0
-
-    def record(self, result: SceneResult) -> bool:
+    def record(self, rank: int, result: SceneResult) -> CommitCall | None:
         assert result.scene_id not in self.results, "a scene ends once"
         self.results[result.scene_id] = result
-        return len(self.results) == self._n_scenes
+        return CommitCall(0, tuple(self.results), (), "0") if len(self.results) == self._n_scenes else None
+
+    def publish(self, call: CommitCall, staged: StagedShard) -> list[int]:
+        self.published += 1
+        return []
+
+    def retry(self, call: CommitCall) -> CommitCall:
+        return replace(call, token=f"{call.token}1")
 
 
 class FakeExecutor:
@@ -103,7 +111,7 @@ class FakeExecutor:
         for job in jobs:
             result = self._run(job)
             if result is None:
-                self._events.append(WorkerLost(worker, tuple(j.rank for j in jobs), "its node is gone"))
+                self._events.append(WorkerLost(worker, jobs, "its node is gone"))
                 return
             results.append(result)
         self._events.append(CallFinished(worker, tuple(results)))
@@ -115,8 +123,8 @@ class FakeExecutor:
     def retire(self, worker: int) -> None:
         pass
 
-    def fetch(self, payload: bytes) -> bytes:
-        return payload
+    def stage_shard(self, worker: int, call: CommitCall) -> None:
+        self._events.append(ShardStaged(worker, call, StagedShard(call.token, 0, ())))
 
     def close(self) -> None:
         pass
@@ -124,25 +132,27 @@ class FakeExecutor:
     def _run(self, job: Job) -> JobResult | None:
         """Run the stages of a job; None if its worker is lost."""
         reports: list[StageReport] = []
-        chain = job.chain
-        assert bool(chain.input_record) != bool(job.payload), "the input is a checkpoint or the payload"
-        for call, record in zip(chain.calls, chain.output_records, strict=True):
-            key = (call.scene_id, call.position)
+        chain, output = job.chain, ""
+        assert bool(chain.input) == bool(chain.position), "the input is a checkpoint or the row"
+        for position, call in enumerate(chain.calls, chain.position):
+            key = (chain.row.scene_id, position)
             self.runs[key] += 1
             action = self._script[key].pop(0) if self._script[key] else None
             if action == LOSE_WORKER:
                 return None
             if action == LOSE_INPUT:
-                return JobResult(job.rank, StageChainReport(tuple(reports), input_lost=True), b"")
+                return JobResult(job.rank, StageChainReport(tuple(reports), output, input_lost=True))
             cost = action if isinstance(action, ModelCost) else ModelCost()
             outcome = action if isinstance(action, Dropped | Failed) else None
             attempts = 2 if isinstance(outcome, Failed) and outcome.error_kind == "crash" else 1
             reports.append(StageReport(outcome, attempts, 0.1, 0.2, "trace" if outcome else "", cost, cost))
             if outcome is not None:
-                return JobResult(job.rank, StageChainReport(tuple(reports)), b"")
-            if record:
-                self._store.write(record, b"output")
-        return JobResult(job.rank, StageChainReport(tuple(reports)), b"output")
+                break
+            output = PART
+            if call.key:
+                name = name_checkpoint(chain.shard, chain.row.scene_id, STAGES[position].name, call.key)
+                output = self._store.write(name, b"output").name
+        return JobResult(job.rank, StageChainReport(tuple(reports), output))
 
 
 class FakeBuild:

@@ -29,7 +29,18 @@ from schemas.observation import Observation
 from schemas.outcome import Allowance, Done, Dropped, Failed, ModelCost
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, NoMotion, Phase, Placement, Verdict
-from schemas.work import SandboxSetup, SceneResult, StageCall, StageChain, StageChainReport, StageReport, StageTiming
+from schemas.work import (
+    CommitCall,
+    SandboxSetup,
+    ScenePart,
+    SceneResult,
+    StageCall,
+    StageChain,
+    StageChainReport,
+    StagedShard,
+    StageReport,
+    StageTiming,
+)
 
 HARD_TEXT = 'Ünïcode \U0001f600 \x1b[2J\n\0 \'"/><x a=" $array'
 
@@ -88,7 +99,9 @@ def examples(seed: int) -> dict[str, object]:
         ({"object_id": "obj_000", "distinguishing_phrases": ("a", HARD_TEXT)},),
         (),
     )
-    result = SceneResult("a-1", "failed", "place", "", "crash", HARD_TEXT, 2, (StageTiming("place", 0.1, 0.2),), b"\0")
+    row = ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT)
+    part = ScenePart("0123.parts", 7, 100, 1000)
+    result = SceneResult(row, "failed", "place", "", "crash", HARD_TEXT, 2, (StageTiming("place", 0.1, 0.2),), part)
     found = (
         Allowance(int(rng.integers(99)), None),
         assessment,
@@ -110,7 +123,7 @@ def examples(seed: int) -> dict[str, object]:
         Placement(pose(), 0.004),
         NoMotion(Phase.GRASP.value, "blocked", f"{rng.random()} {HARD_TEXT}"),
         Verdict(False, "grasp", "slipped", HARD_TEXT, *(float(x) for x in floats(2))),
-        ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x", name=HARD_TEXT),
+        row,
         observation,
         perceived,
         PerceivedObjects("a-1", observation, pose(), table, ids, (perceived,), "replay"),
@@ -122,9 +135,12 @@ def examples(seed: int) -> dict[str, object]:
         result,
         settled,
         ModelCost(2, 1800, 80, float(rng.random())),
-        StageCall("a-1", "capture", 3, 1.5),
-        StageChain((StageCall("a-1", "capture", 3, 1.5),), "", ("a-1.cut.0",), Allowance(5)),
-        StageChainReport((StageReport(None, 1, 0.1, 0.2),)),
+        part,
+        StageCall(1.5, "0123"),
+        StageChain(row, 3, 1, (StageCall(1.5, "0123"),), "a-1.cut.0", Allowance(5)),
+        StageChainReport((StageReport(None, 1, 0.1, 0.2),), part),
+        CommitCall(3, ("a-1", "b"), ("trajectories",), "0123"),
+        StagedShard("0123", 100, ("trajectories",), ("a-1",)),
         StageReport(Dropped("x"), 1, 0.1, 0.2, "trace", ModelCost(1), ModelCost(2)),
         StageTiming("place", 0.1, 0.2),
         table,
@@ -174,6 +190,9 @@ def test_records_come_back(name):
 def _has_numbers(record: object) -> bool:
     """Whether `examples` draws anything for this type."""
     return type(record) not in (
+        CommitCall,
+        ScenePart,
+        StagedShard,
         StageChain,
         StageChainReport,
         Dropped,

@@ -33,13 +33,13 @@ class CheckpointIndex:
         self._restore_costs(scene, self._index[1])
         return scene
 
-    def resume(self, scenes: Iterable[InFlightScene], inputs_lost: bool) -> None:
-        """Move scenes behind their last readable checkpoint, if that is further or their inputs are lost."""
+    def resume(self, scenes: Iterable[InFlightScene]) -> None:
+        """Move scenes whose worker or input is lost behind their last readable checkpoint."""
         indexes: dict[int, Mapping[str, CheckpointRef]] = {}
         for scene in scenes:
             if scene.shard not in indexes:
                 indexes[scene.shard] = self._store.index(scene.shard)
-            scene.resume(self._find_readable(scene, indexes[scene.shard]), inputs_lost)
+            scene.resume(self._find_readable(scene, indexes[scene.shard]))
             self._restore_costs(scene, indexes[scene.shard])
 
     def delete(self, shard: int) -> None:

@@ -143,7 +143,7 @@ class Driver:
                 self._count_loss(why)
                 ranks = [job.rank for job in jobs]
                 self._settle_from_log(ranks)
-                self._requeue([self._running.pop(rank) for rank in ranks], inputs_lost=False)
+                self._requeue([self._running.pop(rank) for rank in ranks])
             case ShardStaged(call=call, staged=staged):
                 self._losses_in_a_row = 0
                 self._commits_in_flight -= 1
@@ -179,7 +179,7 @@ class Driver:
 
     def _advance(self, scene: InFlightScene, answer: JobResult) -> None:
         if answer.report.input_lost:
-            self._requeue([scene], inputs_lost=True)
+            self._requeue([scene])
             return
         first_position = scene.position
         output = answer.report.output
@@ -220,14 +220,14 @@ class Driver:
                 "kept: see to the cluster, then run the same command to go on"
             )
 
-    def _requeue(self, scenes: Sequence[InFlightScene], inputs_lost: bool) -> None:
+    def _requeue(self, scenes: Sequence[InFlightScene]) -> None:
         """Requeue scenes whose worker or input is lost; one that loses its worker too often fails."""
         requeued = []
         for scene in scenes:
             scene.losses += 1
             if scene.losses < MAX_LOSSES_PER_SCENE or not self._outcomes.record_lost(scene):
                 requeued.append(scene)
-        self._checkpoints.resume(requeued, inputs_lost)
+        self._checkpoints.resume(requeued)
         self._waiting |= {scene.rank: scene for scene in requeued}
 
     def _update_tally(self) -> None:

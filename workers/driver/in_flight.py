@@ -54,18 +54,16 @@ class InFlightScene:
 
     def start(self, checkpoints: Mapping[str, CheckpointRef]) -> None:
         """Move behind the last stage with a checkpoint, or to the first stage."""
-        self.position = 1 + self._find_last(checkpoints)
+        found = [position for position, name in enumerate(self.records) if name in checkpoints]
+        self.position = 1 + max(found, default=-1)
         self.input = checkpoints[self.records[self.position - 1]].location if self.position else ""
 
-    def resume(self, checkpoints: Mapping[str, CheckpointRef], input_lost: bool) -> None:
-        """Move behind the last stage with a checkpoint if that is further, or if the input is lost."""
-        if input_lost or self._find_last(checkpoints) >= self.position:
-            self.start(checkpoints)
+    def resume(self, checkpoints: Mapping[str, CheckpointRef]) -> None:
+        """Move behind the last stage with a checkpoint, forward or back."""
+        position = self.position
+        self.start(checkpoints)
+        if self.position != position:
             self.failure = None
-            passed = {stage.name for stage in self.stages[: self.position]}
-            self.timings = [timing for timing in self.timings if timing.stage in passed]
-            self.costs = {stage: cost for stage, cost in self.costs.items() if stage in passed}
-
-    def _find_last(self, checkpoints: Mapping[str, CheckpointRef]) -> int:
-        """Find the position of the last stage with a checkpoint; -1 for none."""
-        return max((position for position, name in enumerate(self.records) if name in checkpoints), default=-1)
+        passed = {stage.name for stage in self.stages[: self.position]}
+        self.timings = [timing for timing in self.timings if timing.stage in passed or self.failure is not None]
+        self.costs = {stage: cost for stage, cost in self.costs.items() if stage in passed}

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from schemas.outcome import Failed
-from schemas.work import StageReport
+from schemas.work import ScenePart, StageReport
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.stage import Stage
 from tests.helpers.builds import Silent
@@ -14,11 +14,11 @@ from workers.driver.checkpoints import CheckpointIndex
 from workers.driver.in_flight import InFlightScene
 from workers.driver.outcomes import OutcomeRecorder
 from workers.progress.tally import Tally
-from workers.state.checkpoint_store import CheckpointStore
 
 ADDING = Stage(
-    "trajectories", "trajectories", lambda *_: None, reads=("trajectories",), post_export_tables=("trajectories",)
+    "trajectories", "trajectories", lambda *_: None, reads=("trajectories",), record_failure=lambda item, *_: item
 )
+PART = ScenePart("0123.parts", 0, 10, 20)
 
 
 class Recorder:
@@ -28,14 +28,17 @@ class Recorder:
         self.spec = make_spec(folder, make_rows(n), stages, keep=keep)
         self.ledger, self.display = FakeLedger(n), Silent()
         self.tally = Tally(("manifest", *(stage.name for stage in stages)), n, 0, 1)
-        self.checkpoints = CheckpointIndex(self.spec, self.ledger)
-        self.outcomes = OutcomeRecorder(self.spec, self.ledger, self.checkpoints, self.tally, self.display)
+        self.checkpoints = CheckpointIndex(self.spec)
+        self.outcomes = OutcomeRecorder(self.ledger, self.tally, self.display)
 
     def scene(self, rank: int, position: int) -> InFlightScene:
         return replace(self.checkpoints.start(rank), position=position)
 
-    def fail(self, rank: int, position: int, kind: str, message: str = "m") -> None:
-        self.outcomes.record_unfinished(self.scene(rank, position), StageReport(Failed(kind, message), 1, 0.1, 0.1))
+    def fail(self, rank: int, position: int, kind: str, message: str = "m") -> InFlightScene:
+        scene = self.scene(rank, position)
+        ended = self.outcomes.record_unfinished(scene, StageReport(Failed(kind, message), 1, 0.1, 0.1))
+        assert ended == (scene.failure is None)
+        return scene
 
 
 @pytest.mark.parametrize("kind", ["ModelAccessError", "StoreError"])
@@ -68,7 +71,7 @@ def test_a_silent_model_postpones_added_stages_and_stops_after_five_in_a_row(tmp
     recorder = Recorder(tmp_path, (*STAGES, ADDING), n=9)
     for rank in range(4):
         recorder.fail(rank, 4, "ModelError", "no answer")
-    recorder.outcomes.record_done(recorder.scene(4, 4), b"exported")
+    recorder.outcomes.record_done(recorder.scene(4, 4), PART)
     for rank in range(5, 9):
         recorder.fail(rank, 4, "ModelError", "no answer")
     assert recorder.tally.postponed == 8
@@ -85,11 +88,10 @@ def test_a_wrong_configuration_of_an_added_stage_stops_the_build(tmp_path):
     assert recorder.ledger.results["s0"].status == "failed"
 
 
-def test_checkpoints_of_a_whole_shard_are_deleted_unless_kept(tmp_path):
-    for keep in (True, False):
-        recorder = Recorder(tmp_path / str(keep), n=1, keep=keep)
-        store = CheckpointStore(recorder.spec.records_dir)
-        scene = recorder.scene(0, 3)
-        store.write(scene.records[0], b"output")
-        recorder.outcomes.record_done(scene, b"exported")
-        assert bool(store.index(0)) == keep
+def test_a_failure_of_an_added_stage_is_first_written_as_rows(tmp_path):
+    recorder = Recorder(tmp_path, (*STAGES, ADDING))
+    scene = recorder.fail(0, 4, "crash", "SIGSEGV")
+    assert scene.failure == Failed("crash", "SIGSEGV")
+    assert recorder.ledger.results == {}
+    assert recorder.outcomes.record_unfinished(scene, StageReport(Failed("crash", "again"), 1, 0.1, 0.1))
+    assert recorder.ledger.results["s0"].status == "failed", "rows that cannot be written do not loop"

@@ -43,11 +43,11 @@ def test_only_what_replaces_another_worker_is_a_restart():
     for worker in (0, 1):
         crew.on_event(WorkerReady(worker))
     serve(crew, [0, 1])
-    crew.on_event(WorkerLost(0, (0,), "its node is gone"))
+    crew.on_event(WorkerLost(0, (), "its node is gone"))
     assert crew.restarts == 0
     serve(crew, [0])
     assert (crew.alive["physics"], crew.restarts) == (2, 1)
-    crew.on_event(CallFinished(1, tuple(JobResult(rank, StageChainReport(()), b"") for rank in (1, 2))))
+    crew.on_event(CallFinished(1, tuple(JobResult(rank, StageChainReport(())) for rank in (1, 2))))
     assert crew.alive["physics"] == 1
     serve(crew, [3, 4])
     assert (crew.alive["physics"], crew.restarts) == (2, 2)
@@ -114,7 +114,7 @@ class Cluster:
         events += [WorkerLost(worker, self.calls.pop(worker), "its node is gone") for worker in lost]
         if self.calls:
             worker = self._chance.choice(sorted(self.calls))
-            answers = tuple(JobResult(rank, StageChainReport(()), b"") for rank in self.calls.pop(worker))
+            answers = tuple(JobResult(rank, StageChainReport(())) for rank in self.calls.pop(worker))
             events.append(CallFinished(worker, answers))
         return events
 
@@ -134,7 +134,7 @@ def build(cluster: Cluster, stages: list[str], n: int, lose_at: int | None = Non
         for event in cluster.events():
             crew.on_event(event)
             if isinstance(event, WorkerLost):
-                running -= set(event.ranks)
+                running -= set(event.work)
             if isinstance(event, CallFinished):
                 moved.append(now)
                 most = 0
@@ -240,7 +240,7 @@ def test_after_a_loss_the_sizes_follow_what_is_known():
     crew.dispatch([ReadyScene(0, "a", 2), ReadyScene(1, "b", 1)], lambda rank: rank)
     slow = StageChainReport((StageReport(None, 1, 100.0, 100.0),))
     crew.on_event(WorkerReady(0))
-    crew.on_event(CallFinished(0, (JobResult(0, slow, b""),)))
+    crew.on_event(CallFinished(0, (JobResult(0, slow),)))
     crew.dispatch([], lambda rank: rank)
     assert crew.sizes == {"a": 2, "b": 2}
     crew.on_event(WorkerLost(1, (), "its node is gone"))

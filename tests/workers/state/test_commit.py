@@ -13,6 +13,7 @@ from tests.helpers.builds import build, compute, digests, write_manifest
 from workers.plan.read_manifest import read_manifest
 from workers.progress.build_state import read_build_state
 from workers.state import commit
+from workers.state import ledger as ledger_module
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger
 
@@ -49,7 +50,7 @@ def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
     """Reopens a scene and dies before the n-th thing that writing the shard anew does to the disk."""
     manifest, out = finished
     before = digests(out)
-    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    plan = read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
     count = itertools.count()
 
@@ -61,20 +62,21 @@ def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
 
         return do
 
-    ledger = Ledger(out, plan, rows)
+    ledger = Ledger(out, plan)
     for name in ("write_atomic", "move", "remove", "remove_folder"):
         monkeypatch.setattr(commit, name, until_killed(getattr(commit, name)))
+    monkeypatch.setattr(ledger_module, "remove_folder", until_killed(ledger_module.remove_folder))
     if step < STEPS:
         with pytest.raises(_Killed):
-            ledger.record(result)
+            _commit(ledger, out, result)
         scenes = shard_path(out, "scenes", 0)
         assert not scenes.exists() or shard_path(out, "mjcf", 0).exists()
     else:
-        ledger.record(result)
+        _commit(ledger, out, result)
         assert next(count) == STEPS
     monkeypatch.undo()
     ledger.close()
-    again = Ledger(out, plan, rows)
+    again = Ledger(out, plan)
     assert again.todo() == []
     assert again.committed == 1
     again.close()
@@ -84,7 +86,7 @@ def test_a_kill_between_any_two_files_is_repaired(finished, monkeypatch, step):
 
 def test_the_scenes_file_is_there_only_when_all_others_are(finished, monkeypatch):
     manifest, out = finished
-    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    plan = read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
     move, seen = commit.move, []
 
@@ -93,19 +95,19 @@ def test_the_scenes_file_is_there_only_when_all_others_are(finished, monkeypatch
         seen.append((target.parent.name, is_committed(out, 0)))
 
     monkeypatch.setattr(commit, "move", watch)
-    Ledger(out, plan, rows).record(result)
+    _commit(Ledger(out, plan), out, result)
     assert seen == [(folder, folder == "scenes") for folder in FOLDERS]
 
 
 def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
     manifest, out = finished
-    rows, plan = read_manifest(manifest), read_plan(out / "plan.parquet")
+    plan = read_plan(out / "plan.parquet")
     result = _reopen_with_its_own_result(manifest, out)
-    ledger = Ledger(out, plan, rows)
+    ledger = Ledger(out, plan)
     tar = shard_path(out, "mjcf", 0)
     tar.write_bytes(tar.read_bytes()[:2000])
     with pytest.raises(BuildError, match="too early"):
-        ledger.record(result)
+        _commit(ledger, out, result)
 
 
 @pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder != "scenes"])
@@ -133,6 +135,12 @@ def test_a_tar_of_another_length_is_noticed_before_a_build_says_that_nothing_is_
     tar.write_bytes(whole[:length])
     with pytest.raises(BuildError, match=rf"{tar} is damaged \(\d+ bytes, not {len(whole)}\): delete scenes/"):
         build(manifest, out)
+
+
+def _commit(ledger, out, result):
+    """Records the result of the first scene, as the driver, and commits its shard, as a worker and the driver."""
+    call = ledger.record(0, result)
+    assert ledger.publish(call, commit.stage_shard(out, call)) == []
 
 
 def _reopen_with_its_own_result(manifest, out):

@@ -9,26 +9,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from schemas.manifest import ImageRow, SceneKind
 from schemas.work import SceneResult, StageTiming
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.dataset.journals import read_journal, read_result
+from tableverse_factory.dataset.journals import read_journal, read_result, read_results
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from workers.run import run_build
 from workers.state.journal import FileJournal
 
 
-def _result(scene_id: str, exported: bytes | None = b"\x00scene\xff") -> SceneResult:
-    status = "done" if exported is not None else "failed"
-    return SceneResult(scene_id, status, "export", "", "", "why", 1, (StageTiming("cut", 0.5, 0.6),), exported)
+def _result(scene_id: str, detail: str = "why") -> SceneResult:
+    row = ImageRow(scene_id=scene_id, kind=SceneKind.CAPTURE, uri="/x")
+    return SceneResult(row, "failed", "export", "", "crash", detail, 1, (StageTiming("cut", 0.5, 0.6),))
 
 
 def test_what_is_recorded_is_read_back(tmp_path):
     journal = FileJournal(tmp_path / "j")
     for name in ("a", "b", "c"):
-        journal.record(_result(name, name.encode() * 1000))
+        journal.record(_result(name, name * 1000))
     journal.close()
-    again = FileJournal(tmp_path / "j")
-    assert [again.read(name) for name in ("a", "b", "c")] == [_result(n, n.encode() * 1000) for n in ("a", "b", "c")]
+    assert read_results(tmp_path / "j") == {name: _result(name, name * 1000) for name in ("a", "b", "c")}
 
 
 @pytest.mark.heavy
@@ -45,7 +45,7 @@ def test_a_torn_tail_costs_only_what_was_torn(tmp_path_factory, cut):
     os.truncate(path, cut)
     whole = [name for name, end in zip("abc", ends, strict=True) if end <= cut]
     again = FileJournal(path)
-    assert sorted(again.results) == whole
+    assert sorted(read_results(path)) == whole
     again.record(_result("d"))
     again.close()
     assert sorted(read_journal(path).results) == [*whole, "d"]
@@ -70,16 +70,17 @@ def test_a_flipped_bit_is_never_believed(tmp_path_factory, at, bit):
 
 def test_a_reopened_scene_is_to_do_until_it_has_a_new_result(tmp_path):
     journal = FileJournal(tmp_path / "j")
-    journal.record(_result("a", None))
+    journal.record(_result("a", "old"))
     journal.record(_result("b"))
     journal.reopen("a")
     journal.close()
     contents = read_journal(tmp_path / "j")
     assert (set(contents.results), contents.reopened) == ({"b"}, {"a"})
+    assert set(read_results(tmp_path / "j")) == {"b"}
     again = FileJournal(tmp_path / "j")
     again.record(_result("a"))
-    assert set(again.results) == {"a", "b"}
-    assert again.reopened == {"a"}
+    assert read_results(tmp_path / "j") == {"a": _result("a"), "b": _result("b")}
+    assert read_journal(tmp_path / "j").reopened == {"a"}
 
 
 @pytest.mark.heavy
@@ -88,19 +89,21 @@ def test_a_full_disk_is_a_clear_error_and_loses_nothing(tmp_path):
     script = f"""
 import resource, signal
 from pathlib import Path
+from schemas.manifest import ImageRow, SceneKind
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from workers.state.journal import FileJournal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 journal = FileJournal(Path({str(tmp_path / "j")!r}))
-result = lambda name, data: SceneResult(name, "done", "export", "", "", "", 1, (), data)
-journal.record(result("a", b"x" * 10_000))
+row = lambda name: ImageRow(scene_id=name, kind=SceneKind.CAPTURE, uri="/x")
+result = lambda name, detail: SceneResult(row(name), "failed", "export", "", "", detail)
+journal.record(result("a", "x" * 10_000))
 try:
-    journal.record(result("b", b"x" * 50_000))
+    journal.record(result("b", "x" * 50_000))
 except BuildError as error:
     print(error)
-journal.record(result("c", b"x" * 100))
+journal.record(result("c", "x" * 100))
 """
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert "run the same command to go on" in ran.stdout
