@@ -38,7 +38,7 @@ def test_schemas_are_those_of_the_contract_also_of_an_empty_dataset(tmp_path):
     for table, schema in ((dataset.scenes, SCENES), (dataset.objects, OBJECTS), (dataset.tasks, TASKS)):
         assert table.schema.equals(schema)
         assert table.count_rows() == 0
-    with pytest.raises(InputError, match="0 scenes committed"):
+    with pytest.raises(InputError, match="0 scenes so far"):
         dataset.scene("a-1")
 
 

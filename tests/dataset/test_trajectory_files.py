@@ -4,7 +4,8 @@ import hashlib
 
 import pytest
 
-from schemas.config import TrajectoriesConfig
+from schemas.config import Config
+from schemas.outcome import Failed
 from schemas.scene import Certificate, ExportedScene
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.shards import check_exported
@@ -67,13 +68,16 @@ def test_what_changed_after_it_was_written_is_found():
 
 
 def test_a_scene_that_was_given_up_says_so_for_each_task_that_was_to_be_tried():
-    lost = with_failed_trajectories(scene([], {}), TrajectoriesConfig(max_tasks=2), "timeout", "no answer within 5 s")
+    lost = with_failed_trajectories(
+        scene([], {}), Config(trajectories={"max_tasks": 2}), Failed("timeout", "no answer within 5 s")
+    )
     check_exported(lost, "a")
     assert [(row["task_id"], row["success"], row["reason"]) for row in lost.trajectory_rows] == [
         ("task_000", False, "timeout"),
         ("task_001", False, "timeout"),
     ]
     assert lost.trajectory_rows[0]["robot"] == "panda"
+    assert (lost.scene_row["n_trajectories"], lost.scene_row["n_successes"]) == (2, 0)
 
 
 @pytest.mark.parametrize("task_id", ["../x", "", ".hidden", "a/b", "x" * 81])

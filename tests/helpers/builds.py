@@ -55,7 +55,7 @@ def build(manifest: Path, out: Path, **run: object) -> BuildSummary:
     return run_build(request(manifest, out, **run), Silent())
 
 
-def compute(row: ImageRow, out: Path) -> SceneResult:
+def compute(row: ImageRow, out: Path, shard: int = 0) -> SceneResult:
     """The result of a scene that the tiny pipeline gets done, computed in this process."""
     setup = SandboxSetup(
         "tests.helpers.tiny_pipeline:PIPELINES",
@@ -67,7 +67,7 @@ def compute(row: ImageRow, out: Path) -> SceneResult:
     )
     calls = (*(StageCall(60.0, str(position)) for position in range(3)), StageCall(60.0, ""))
     messages = []
-    StageRunner(setup).run_chain(StageChain(row, 0, 0, calls), messages.append)
+    StageRunner(setup).run_chain(StageChain(row, shard, 0, calls), messages.append)
     part = decode_message(messages[-1]).output
     return SceneResult(row, "done", "pack", attempts=1, part=part)
 

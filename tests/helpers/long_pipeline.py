@@ -9,7 +9,9 @@ import tableverse_factory.dataset.committed_scene  # noqa: F401 no deadline of a
 from schemas.manifest import SceneKind
 from schemas.outcome import Done, Dropped
 from tableverse_factory.core.errors import ModelError
+from tableverse_factory.dataset.trajectory_files import add_trajectories
 from tableverse_factory.stage import Stage
+from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
 from tests.helpers import tiny_pipeline
 from tests.helpers.tiny_pipeline import _mark
 
@@ -37,21 +39,23 @@ def plan(scene, config, rng, services):
         raise ModelError("the grasp server does not answer")
     if name == "drop_plan":
         return Dropped("no_robot", "there is no robot")
-    files, rows = list(scene.files), []
+    files, rows = {}, []
     for task in [task for task in scene.task_rows if task["accepted"]][: config.trajectories.max_tasks]:
         success = task["task_id"] == "task_000"
         named = f"trajectories/{task['task_id']}.npz" if success else None
         row = {"scene_id": scene.scene_id, "task_id": task["task_id"], "success": success, "arrays": named}
         if success:
-            files.append((named, rng.bytes(300)))
+            files[named] = rng.bytes(300)
         else:
             row |= {"failed_phase": "grasp", "reason": "no_grasp"}
         rows.append({**row, "robot": config.trajectories.robot})
-    return Done(replace(scene, files=tuple(sorted(files)), trajectory_rows=tuple(rows)))
+    return Done(add_trajectories(scene, rows, files))
 
 
 _SHORT = (*tiny_pipeline._STAGES[:3], Stage("pack", "curation", pack, reads=("export",)))
-_TRAJECTORIES = ("trajectories",)
-_LONG = (*_SHORT, Stage("trajectories", "trajectories", plan, _TRAJECTORIES, post_export_tables=_TRAJECTORIES))
+_TRAJECTORIES = Stage(
+    "trajectories", "trajectories", plan, reads=("trajectories",), record_failure=with_failed_trajectories
+)
+_LONG = (*_SHORT, _TRAJECTORIES)
 SHORT = dict.fromkeys(SceneKind, _SHORT)
 LONG = dict.fromkeys(SceneKind, _LONG)

@@ -5,12 +5,14 @@ A finished stage is reported for every stage of every scene, so it is a short li
 
 import json
 from dataclasses import astuple, dataclass
+from typing import Any
 
 from schemas.codec import decode, encode
 from schemas.outcome import NO_COST, Failed, ModelCost
 from schemas.work import ScenePart, StageReport
 
 _DONE, _REPORT, _BROKEN, _NO_INPUT = b"d", b"r", b"b", b"n"
+_PART = [str, int, int, int]  # types of the fields of a `ScenePart`
 _N_NUMBERS = 3 + 2 * len(astuple(NO_COST))
 
 
@@ -38,7 +40,7 @@ def encode_message(message: SandboxMessage) -> bytes:
         case StageDone(report=report, cpu_s=cpu_s, output=output):
             numbers = (report.cpu_s, report.wall_s, cpu_s, *astuple(report.cost), *astuple(report.paid))
             place = output if isinstance(output, str) else astuple(output)
-            return _DONE + json.dumps((numbers, place)).encode()
+            return _DONE + json.dumps((*numbers, place)).encode()
         case StageReport():
             return _REPORT + encode(message)
         case Failed():
@@ -53,8 +55,11 @@ def decode_message(data: bytes) -> SandboxMessage:
     if kind == _NO_INPUT:
         return InputMissing()
     if kind == _DONE:
-        numbers, place = json.loads(rest)
-        if len(numbers) == _N_NUMBERS and {type(n) for n in numbers} <= {int, float}:
+        values: Any = json.loads(rest)
+        numbers: list[Any] = values[:-1] if isinstance(values, list) else []
+        place: Any = values[-1] if numbers else None
+        is_place = isinstance(place, str) or (isinstance(place, list) and [type(v) for v in place] == _PART)
+        if is_place and len(numbers) == _N_NUMBERS and {type(n) for n in numbers} <= {int, float}:
             cost, paid = ModelCost(*numbers[3:7]), ModelCost(*numbers[7:])
             report = StageReport(None, 1, numbers[0], numbers[1], "", cost, paid)
             return StageDone(report, numbers[2], place if isinstance(place, str) else ScenePart(*place))

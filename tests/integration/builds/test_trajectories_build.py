@@ -12,8 +12,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.codec import decode, encode
+from schemas.codec import encode
 from schemas.config import Config, RunConfig, TrajectoriesConfig
+from schemas.scene import ExportedScene
 from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, ConfigError, InputError
 from tableverse_factory.dataset.committed_scene import load_exported_scene
@@ -25,7 +26,7 @@ from tableverse_factory.run_record import read_run
 from tests.helpers.builds import QUICK, Silent, digests, finish, kill, request, scenes, wait_until, write_manifest
 from tests.helpers.paths import HELPERS
 from workers.run import BuildRequest, run_build
-from workers.state.checkpoint_store import CHECKPOINTS, TOMBSTONE_PREFIX, CheckpointStore
+from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore
 
 NAMES = ["fine", "empty", "fine", "fell", "idle", "sad", "fine", "fine", "empty", "empty", "empty", "empty"]
 
@@ -117,9 +118,9 @@ def test_a_scene_read_back_is_the_record_that_was_written(made):
             continue
         original = long_records.read(names[0])
         assert original is not None
-        assert encode(decode(original)) == original
         for out in ("long", "short"):
-            assert encode(load_exported_scene(made / out, row["shard"], row["scene_id"])) == original
+            again = load_exported_scene(made / out, row["shard"], row["scene_id"])
+            assert encode(again) == encode(original.record)
             read += 1
     assert read == 10
     assert load_exported_scene(made / "long", 77, "scene_000") is None
@@ -355,7 +356,7 @@ def test_pointers_left_behind_are_never_taken_for_more_than_they_are(copy, marks
     pointers = [
         n
         for n, at in records.index(0).items()
-        if (records._read_stored(at.location) or b"").startswith(TOMBSTONE_PREFIX)
+        if at.size < 1000 and isinstance(records.read(at.location).record, ExportedScene)
     ]
     assert len(pointers) == 2
     marks()

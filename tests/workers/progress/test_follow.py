@@ -17,6 +17,7 @@ from workers.progress import follow
 from workers.progress.build_state import read_build_state
 from workers.progress.follow import BuildFollower
 from workers.run import run_build
+from workers.state.commit import stage_shard
 from workers.state.ledger import Ledger
 
 pytestmark = pytest.mark.heavy
@@ -72,9 +73,11 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
     assert following.read_tally().accounted == 0
     real = follow.read_result
     monkeypatch.setattr(follow, "read_result", lambda path, entry: read.append(entry) or real(path, entry))
-    ledger = Ledger(out, read_plan(out / "plan.parquet"), rows)
+    ledger = Ledger(out, read_plan(out / "plan.parquet"))
     for number, row in enumerate(rows, start=1):
-        ledger.record(compute(row, out))
+        call = ledger.record(number - 1, compute(row, out, shard=(number - 1) // 4))
+        if call is not None:
+            assert ledger.publish(call, stage_shard(out, call)) == []
         tally = following.read_tally()
         assert tally.accounted == number
         assert tally.committed == (number >= 4) + (number == 6)

@@ -6,21 +6,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
 
-from schemas.codec import decode, encode
 from schemas.config import Config
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
-from schemas.work import SandboxSetup, StageCall, StageChain
+from schemas.work import SandboxSetup, ScenePart, StageCall, StageChain
 from tableverse_factory.core.errors import BuildError
+from tableverse_factory.dataset.parts import read_part_files, read_part_rows
+from tableverse_factory.dataset.tar_members import read_scene_files
 from tests.helpers.builds import wait_until
 from tests.helpers.paths import ROOT
-from workers.sandbox.channel import Channel
 from workers.sandbox.parent import Sandbox
 
 pytestmark = pytest.mark.heavy
@@ -40,22 +39,22 @@ def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
         "cache_dir": str(tmp_path),
         "attempts": 2,
         "memory_mb": 400,
-        "records_dir": str(tmp_path / "records"),
+        "records_dir": str(tmp_path / ".stages"),
     }
     return SandboxSetup(**{**given, **changes})
 
 
 def _run_line(sandbox: Sandbox, name: str):
-    """The report of the last stage that ran, and what it gave."""
-    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
-    report, value = sandbox.run(_chain(range(4)), item)
-    return report.stages[-1], value
+    """The report of the last stage that ran, and the place of what the last one that is done gave."""
+    report = sandbox.run(_chain(name, range(4)))
+    return report.stages[-1], report.output
 
 
-def _chain(positions: Sequence[int], deadline_s: float = 3.0) -> StageChain:
+def _chain(name: str, positions: Sequence[int], deadline_s: float = 3.0, **more: object) -> StageChain:
     """These stages of the tiny pipeline on scene `a`; what they give is kept."""
-    calls = tuple(StageCall("a", "capture", position, deadline_s) for position in positions)
-    return StageChain(calls, "", tuple(f"shard-00000/a.{position}.0" for position in positions))
+    row = ImageRow(scene_id="a", kind="capture", uri="/x", name=name)
+    calls = tuple(StageCall(deadline_s, "" if position == 3 else str(position)) for position in positions)
+    return StageChain(row, 0, positions[0], calls, **more)
 
 
 def _children() -> list[psutil.Process]:
@@ -64,23 +63,24 @@ def _children() -> list[psutil.Process]:
     return [child for child in living if "workers.sandbox.child" in child.cmdline()]
 
 
-def _run_one(sandbox: Sandbox, position: int, item: bytes, *watch, deadline_s: float = 3.0):
-    """The report of one stage alone, and what it gave."""
-    report, value = sandbox.run(_chain([position], deadline_s), item, *watch)
-    return report.stages[-1], value
+def _run_one(sandbox: Sandbox, position: int, name: str, *watch, deadline_s: float = 3.0, **more: object):
+    """The report of one stage alone, and the place of what it gave."""
+    report = sandbox.run(_chain(name, [position], deadline_s, **more), *watch)
+    return report.stages[-1], report.output
 
 
-def test_a_scene_runs_to_its_end(sandbox):
-    report, item = _run_line(sandbox, "fine")
+def test_a_scene_runs_to_its_end(sandbox, tmp_path):
+    report, part = _run_line(sandbox, "fine")
     assert report.outcome is None
     assert report.attempts == 1
-    assert dict(decode(item).files)["scene.xml"] == b"<mujoco model='a'/>"
+    assert read_part_rows(tmp_path, 0, part)["scenes"][0]["scene_id"] == "a"
+    assert read_scene_files("a", read_part_files(tmp_path, 0, part))["scene.xml"] == b"<mujoco model='a'/>"
 
 
 def test_a_drop_is_no_failure(sandbox):
-    report, item = _run_line(sandbox, "empty")
+    report, place = _run_line(sandbox, "empty")
     assert report.outcome == Dropped("nothing_there", "looked at empty")
-    assert item == b""
+    assert place == ""
 
 
 @pytest.mark.parametrize(
@@ -98,8 +98,9 @@ def test_a_drop_is_no_failure(sandbox):
     ],
 )
 def test_every_end_has_its_kind_and_the_next_scene_runs(sandbox, name, kind, attempts, words):
-    report, item = _run_line(sandbox, name)
-    assert (report.outcome.error_kind, report.attempts, item) == (kind, attempts, b"")
+    report, place = _run_line(sandbox, name)
+    assert (report.outcome.error_kind, report.attempts) == (kind, attempts)
+    assert isinstance(place, str), "no scene"
     assert words in report.outcome.message
     assert _run_line(sandbox, "fine")[0].outcome is None
 
@@ -113,14 +114,13 @@ def test_messages_are_one_line_without_addresses_and_folders(sandbox):
 
 def test_a_crash_that_passes_is_done_at_the_second_attempt(sandbox, tmp_path, monkeypatch):
     monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    report, _ = _run_one(sandbox, 1, _looked_at(sandbox, "segfault_once"))
+    report, _ = _run_one(sandbox, 1, "segfault_once", input=_look_at(sandbox, "segfault_once"))
     assert report.outcome is None
     assert report.attempts == 2
 
 
 def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
-    item = _looked_at(sandbox, "slow_1")
-    killed = []
+    place, killed = _look_at(sandbox, "slow_1"), []
 
     def kill_once():
         children = _children()
@@ -128,7 +128,7 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
             killed.append(children[0].pid)
             os.kill(children[0].pid, signal.SIGKILL)
 
-    report, _ = _run_one(sandbox, 1, item, kill_once)
+    report, _ = _run_one(sandbox, 1, "slow_1", kill_once, input=place)
     assert killed
     assert report.outcome is None
     assert report.attempts == 1
@@ -137,14 +137,14 @@ def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
 def test_the_clock_of_the_deadline_starts_with_the_stage_not_with_the_import(tmp_path):
     sandbox = Sandbox(_setup(tmp_path, attempts=1))
     started = time.monotonic()
-    report, _ = _run_one(sandbox, 0, b"no message", deadline_s=0.001)
+    report, _ = _run_one(sandbox, 0, "fine", deadline_s=0.001)
     sandbox.close()
     assert report.wall_s < 0.5 * (time.monotonic() - started), "most of the time is the import"
 
 
 def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
     with pytest.raises(BuildError, match="no_such_module"):
-        _run_one(Sandbox(_setup(tmp_path, pipeline="no_such_module:PIPELINES")), 0, b"")
+        _run_one(Sandbox(_setup(tmp_path, pipeline="no_such_module:PIPELINES")), 0, "fine")
 
 
 def test_close_leaves_no_process(sandbox):
@@ -163,9 +163,9 @@ from tests.workers.sandbox import test_parent as t
 from workers.sandbox.channel import Channel
 from workers.sandbox.parent import Sandbox
 sandbox = Sandbox(t._setup(Path({str(tmp_path)!r}), attempts=1))
-item = t._looked_at(sandbox, "hang")
+place = t._look_at(sandbox, "hang")
 print("ready", flush=True)
-t._run_one(sandbox, 1, item, deadline_s=60.0)
+t._run_one(sandbox, 1, "hang", deadline_s=60.0, input=place)
 """
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout.readline() == "ready\n"
@@ -183,9 +183,8 @@ def test_children_compute_on_one_thread_with_fixed_hashes(sandbox):
     assert environment["PYTHONHASHSEED"] == "0"
 
 
-def _looked_at(sandbox: Sandbox, name: str) -> bytes:
-    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name=name))
-    return _run_one(sandbox, 0, item)[1]
+def _look_at(sandbox: Sandbox, name: str) -> str:
+    return _run_one(sandbox, 0, name)[1]
 
 
 def test_the_trace_of_a_crash_is_found_behind_whatever_was_printed_before(sandbox):
@@ -200,8 +199,7 @@ def test_a_crash_in_the_middle_repeats_that_stage_alone(sandbox, tmp_path, monke
     marks = tmp_path / "marks"
     marks.mkdir()
     monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
-    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="segfault_once"))
-    report, value = sandbox.run(_chain(range(4)), item)
+    report = sandbox.run(_chain("segfault_once", range(4)))
     assert [stage.attempts for stage in report.stages] == [1, 2, 1, 1]
     assert {path.name: path.stat().st_size for path in marks.iterdir()} == {
         "a.look": 1,
@@ -209,30 +207,32 @@ def test_a_crash_in_the_middle_repeats_that_stage_alone(sandbox, tmp_path, monke
         "a.settle": 1,
         "a.pack": 1,
     }
-    assert decode(value).scene_id == "a"
-
-
-def test_a_chain_whose_records_are_not_kept_begins_again(tmp_path, monkeypatch):
-    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    sandbox = Sandbox(_setup(tmp_path))
-    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="segfault_once"))
-    report, value = sandbox.run(replace(_chain(range(4)), output_records=("",) * 4), item)
-    sandbox.close()
-    assert [stage.attempts for stage in report.stages] == [2, 2, 1, 1]
-    assert decode(value).scene_id == "a"
+    assert isinstance(report.output, ScenePart)
 
 
 def test_an_input_that_is_gone_is_no_failure_of_the_scene(sandbox):
-    report, value = sandbox.run(replace(_chain([1]), input_record="shard-00000/a.0.9"), b"")
+    report = sandbox.run(_chain("fine", [1], input="shard-00000/a.look.9"))
     assert report.input_lost
-    assert (report.stages, value) == ((), b"")
+    assert (report.stages, report.output) == ((), "")
+
+
+def test_stages_get_the_same_from_the_stage_before_and_from_a_checkpoint(tmp_path):
+    """Between stages of one process nothing is encoded: what a process gave up has to be the same."""
+    whole, halves = Sandbox(_setup(tmp_path)), Sandbox(_setup(tmp_path))
+    part = whole.run(_chain("fine", range(4))).output
+    place = halves.run(_chain("fine", range(2))).output
+    other = halves.run(_chain("fine", range(2, 4), input=place)).output
+    for read in (read_part_rows, read_part_files):
+        assert read(tmp_path, 0, part) == read(tmp_path, 0, other)
+    whole.close()
+    halves.close()
 
 
 def test_a_disk_that_refuses_records_stops_the_build_and_names_the_file(tmp_path):
-    (tmp_path / "records").write_text("a file where the folder should be")
+    (tmp_path / ".stages").write_text("a file where the folder should be")
     sandbox = Sandbox(_setup(tmp_path))
-    with pytest.raises(BuildError, match=r"cannot write .*records.*run the same command"):
-        _run_one(sandbox, 0, encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="fine")))
+    with pytest.raises(BuildError, match=r"cannot write .*stages.*run the same command"):
+        _run_one(sandbox, 0, "fine")
     sandbox.close()
 
 
@@ -246,34 +246,22 @@ def test_code_in_the_folder_where_a_build_is_started_is_not_imported(tmp_path, m
 
 
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_child_that_dies_while_it_hands_over_its_last_answer_has_given_none(tmp_path, monkeypatch, sent):
-    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    sandbox = Sandbox(_setup(tmp_path, memory_mb=2000))
-    item = encode(ImageRow(scene_id="a", kind="capture", uri="/x", name="bulky"))
-    killed = []
+def test_a_child_that_dies_while_it_writes_the_scene_has_written_none(tmp_path, sent):
+    sandbox, killed = Sandbox(_setup(tmp_path, memory_mb=2000)), []
 
-    def kill_at_the_end() -> None:
-        """Forty megabytes do not fit into a socket: the child hangs in its sending while nobody reads."""
-        if not killed and (tmp_path / "a.pack").exists():
+    def kill_while_it_writes() -> None:
+        if not killed and any(path.is_file() for path in (tmp_path / ".work").rglob("*.parts")):
             (child,) = _children()
             killed.append(child.pid)
             child.send_signal(sent)
 
-    real = Channel.receive
-
-    def slow_receive(self: Channel) -> bytes:
-        message = real(self)
-        if message[:1] == b"d":
-            kill_at_the_end()
-        return message
-
-    monkeypatch.setattr(Channel, "receive", slow_receive)
-    report, value = sandbox.run(_chain(range(4)), item)
+    report = sandbox.run(_chain("bulky", range(4)), kill_while_it_writes)
     sandbox.close()
     assert killed
     assert [stage.outcome for stage in report.stages] == [None] * 4
-    assert len(decode(value).files[0][1]) == 40_000_000
-    assert report.stages[-1].attempts == (1 if sent == signal.SIGKILL else 2)
+    files = read_scene_files("a", read_part_files(tmp_path, 0, report.output))
+    assert sum(map(len, files.values())) >= 40_000_000
+    assert report.stages[-1].attempts <= 2
 
 
 def test_a_child_that_dies_while_it_has_nothing_to_do_is_nobodys_fault(tmp_path, monkeypatch):
@@ -290,7 +278,7 @@ def test_a_child_that_dies_while_it_has_nothing_to_do_is_nobodys_fault(tmp_path,
 
 def test_records_that_cannot_be_read_stop_the_build(tmp_path):
     sandbox = Sandbox(_setup(tmp_path))
-    (tmp_path / "records" / "shard-00000" / "odd.pack").mkdir(parents=True)
-    with pytest.raises(BuildError, match=r"cannot read .*odd\.pack@0"):
-        sandbox.run(replace(_chain([1]), input_record="shard-00000/odd.pack@0"), b"")
+    (tmp_path / ".stages" / "shard-00000" / "odd.pack").mkdir(parents=True)
+    with pytest.raises(BuildError, match=r"cannot read .*a\.look\.0"):
+        sandbox.run(_chain("fine", [1], input="shard-00000/a.look.0@odd.pack@0"))
     sandbox.close()
