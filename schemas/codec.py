@@ -32,6 +32,11 @@ RECORD_TYPES: dict[str, type[Any]] = {  # the dataclasses that flow between stag
     if is_dataclass(kind) or issubclass(kind, BaseModel)
 }
 
+# Names of the fields of each record, and their default values
+_FIELDS = {
+    kind: tuple((its.name, its.default) for its in fields(kind)) for kind in RECORD_TYPES.values() if is_dataclass(kind)
+}
+
 Blob: TypeAlias = bytes | memoryview | Any  # or a buffer of Arrow, which has no types
 
 _ARRAY_KINDS = "biufc"
@@ -124,7 +129,7 @@ def normalize(value: Any) -> Any:
     kind = _get_kind(value)
     if isinstance(value, BaseModel):
         return kind.model_validate_json(value.model_dump_json(by_alias=True))
-    given = [getattr(value, its.name) for its in fields(value)]
+    given = [getattr(value, name) for name, _ in _FIELDS[kind]]
     parts = [normalize(part) for part in given]
     return value if _is_same(parts, given) else kind(*parts)
 
@@ -222,7 +227,16 @@ def _to_tree(value: Any, blobs: _Blobs) -> Any:
     kind = _get_kind(value)
     if isinstance(value, BaseModel):
         return {"$model": kind.__name__, "json": value.model_dump_json(by_alias=True)}
-    return {"$record": kind.__name__, "fields": [_to_tree(getattr(value, its.name), blobs) for its in fields(value)]}
+    given = [getattr(value, name) for name, _ in _FIELDS[kind]]
+    while given and _is_default(given[-1], _FIELDS[kind][len(given) - 1][1]):
+        given.pop()  # the constructor adds it again
+    return {"$record": kind.__name__, "fields": [_to_tree(part, blobs) for part in given]}
+
+
+def _is_default(value: Any, default: Any) -> bool:
+    """Whether a value is the default, exactly: 0.0 is not -0.0."""
+    same = type(value) is type(default) and value == default
+    return same and (type(value) is not float or str(value) == str(default))
 
 
 def _from_tree(tree: Any, get_blob: Callable[[Any], Blob], parent: Any = None) -> Any:

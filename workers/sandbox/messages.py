@@ -38,8 +38,13 @@ def encode_message(message: SandboxMessage) -> bytes:
     """Encode a message as bytes."""
     match message:
         case StageDone(report=report, cpu_s=cpu_s, output=output):
-            numbers = (report.cpu_s, report.wall_s, cpu_s, *astuple(report.cost), *astuple(report.paid))
+            costs = (
+                (0, 0, 0, 0.0) * 2
+                if not (report.cost or report.paid)
+                else (*astuple(report.cost), *astuple(report.paid))
+            )
             place = output if isinstance(output, str) else astuple(output)
+            numbers = (report.cpu_s, report.wall_s, cpu_s, *costs)
             return _DONE + json.dumps((*numbers, place)).encode()
         case StageReport():
             return _REPORT + encode(message)

@@ -31,6 +31,7 @@ from workers.progress.build_state import read_build_state
 from workers.progress.follow import BuildFollower
 from workers.run import run_build
 from workers.state import commit
+from workers.state import ledger as ledger_module
 from workers.state.journal import open_journal
 from workers.state.ledger import Ledger
 from workers.state.lock import create_writer_lock
@@ -155,15 +156,17 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
 
         return do
 
-    ledger = Ledger(store, plan, rows)
-    result = compute(rows[0], out)
+    ledger = Ledger(store, plan)
+    result = compute(rows[0], store)
     with monkeypatch.context() as patched:
         for name in ("write_atomic", "move", "remove", "remove_folder"):
             patched.setattr(commit, name, until_killed(getattr(commit, name)))
+        patched.setattr(ledger_module, "remove_folder", until_killed(ledger_module.remove_folder))
+        call = ledger.record(0, result)
         with pytest.raises(Killed):
-            ledger.record(result)
+            ledger.publish(call, commit.stage_shard(store, call))
         ledger.close()
-    again = Ledger(store, plan, rows)
+    again = Ledger(store, plan)
     assert (again.todo(), again.committed) == ([], 2)
     again.close()
     assert list_names(store / ".work") == []

@@ -118,5 +118,5 @@ def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(stor
         executor.close()
     (event,) = events
     assert isinstance(event, WorkerLost)
-    assert (event.worker, event.ranks) == (worker, ())
+    assert (event.worker, event.work) == (worker, ())
     assert event.why.startswith(f"{store}/one: access denied")
