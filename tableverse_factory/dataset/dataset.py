@@ -212,7 +212,7 @@ class Dataset:
             raise InputError(f"scene {scene_id} has no files: {_describe_loss(row)}")
         data = self._read_part(scene_id) if row["tar_offset"] == NO_OFFSET else self._read_scene_bytes(row, shard)
         if data is None:  # its shard was committed meanwhile
-            row = self._read_rows(shard, scene_id, "scenes")[0]
+            row = self._read_committed_rows(shard, scene_id, "scenes")[0]
             data = self._read_scene_bytes(row, shard)
         return Scene(scene_id, row, read_scene_files(scene_id, data), partial(self._read_rows, shard, scene_id))
 
@@ -253,10 +253,15 @@ class Dataset:
 
     def _read_rows(self, shard: int, scene_id: str, table: str) -> list[dict[str, Any]]:
         """Read the scene's rows in a table; none if it has not ended."""
+        provisional = None if self._provisional is None else self._provisional.tables[table]
+        if provisional and (found := provisional.filter(pc.field("scene_id") == scene_id)):
+            return found.to_pylist()
+        return self._read_committed_rows(shard, scene_id, table)
+
+    def _read_committed_rows(self, shard: int, scene_id: str, table: str) -> list[dict[str, Any]]:
+        """Read the scene's rows from a table's file of one shard; none if the shard is not committed."""
         path = f"{self._root}/{table}/{shard_name(table, shard)}"
         mine = pc.field("scene_id") == scene_id
-        if self._provisional is not None and (found := self._provisional.tables[table].filter(mine)):
-            return found.to_pylist()
         try:
             if self._is_local:
                 found = self._open_files([path], table).to_table(filter=mine)

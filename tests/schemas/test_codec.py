@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from schemas import codec
-from schemas.codec import RECORD_TYPES, decode, encode
+from schemas.codec import RECORD_TYPES, decode, decode_stored, encode, encode_stored, normalize
 from schemas.curation import AnswerOrigin, Assessment, ObjectAssessment, TaskAssessment
 from schemas.detection import Composite, Container, Content, Detection, DetectionRecord, DetectionRemark, Detections
 from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
@@ -203,6 +203,57 @@ def _has_numbers(record: object) -> bool:
         StageCall,
         StageReport,
     ) and not (isinstance(record, Assessment | StageTiming))
+
+
+@pytest.mark.parametrize("name", sorted(RECORD_TYPES))
+def test_a_normal_record_is_what_its_message_gives_back(name):
+    """What the next stage gets is the same from the stage before it and from a checkpoint."""
+    record = examples(0)[name]
+    assert_equal(normalize(record), decode(encode(record)))
+    assert encode(normalize(record)) == encode(record)
+
+
+def test_normal_arrays_have_the_layout_of_those_that_come_back():
+    grid = np.arange(24.0).reshape(4, 6)
+    messy = {"t": grid.T, "f": np.asfortranarray(grid), "s": grid[::2, ::3], "n": np.float32(0.5), "l": [grid[0], 1]}
+    normal, back = normalize(messy), decode(encode(messy))
+    assert_equal(normal, back)
+    for key in "tfs":
+        assert normal[key].flags.c_contiguous
+        assert not normal[key].flags.writeable
+        assert normal[key].strides == back[key].strides
+    assert normalize(normal) is normal, "nothing is made twice"
+    with pytest.raises(TypeError, match="does not travel"):
+        normalize(np.array(["text"]))
+    with pytest.raises(TypeError, match="no record type"):
+        normalize(object())
+
+
+def test_a_stored_record_refers_to_its_parent_and_holds_each_array_once():
+    mesh = TriangleMesh(np.random.default_rng(0).random((200, 3)), np.zeros((100, 3), dtype=np.int32))
+    settled = examples(0)["SettledScene"]
+    (thing, *_), layout = settled.rectified.placed.objects, settled.rectified.placed
+    layout = dataclasses.replace(layout, objects=(dataclasses.replace(thing, mesh=mesh),))
+    rectified = dataclasses.replace(settled.rectified, placed=layout)
+    settled = dataclasses.replace(settled, rectified=rectified)
+    first, parent = encode_stored("a.rectify.0", rectified)
+    second, child = encode_stored("a.settle.1", settled, parent)
+    assert len(second) < len(encode(settled)) / 2
+    assert child.blobs.keys() == parent.blobs.keys()
+    moved = dataclasses.replace(rectified, placed=dataclasses.replace(layout, perception="again"))
+    third, _ = encode_stored("a.other.2", moved, parent)
+    assert len(third) < len(first), "arrays that the parent holds are not repeated"
+
+    stored = {"a.rectify.0": first, "a.settle.1": second, "a.other.2": third}
+
+    def read(name):
+        return decode_stored(name, stored[name], read)
+
+    assert_equal(read("a.settle.1").record, settled)
+    assert_equal(read("a.other.2").record, moved)
+    del stored["a.rectify.0"]
+    with pytest.raises(ValueError, match="not a message"):
+        read("a.settle.1")
 
 
 def test_arrays_come_back_read_only():

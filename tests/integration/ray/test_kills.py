@@ -7,6 +7,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tableverse_factory.dataset.journals import WORK
 from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 from tests.helpers.processes import command_of, is_alive
 from workers.progress.build_state import read_build_state
@@ -54,6 +55,25 @@ def test_twenty_killed_actors_and_sandboxes_cost_nothing_but_time(tmp_path):
     code, errors = finish(process, LIMIT_S)
     assert code == 0, errors
     _same(out, expected, n_scenes)
+
+
+def test_an_actor_killed_in_the_middle_of_a_commit_costs_nothing(tmp_path):
+    manifest = write_manifest(tmp_path / "images.parquet", ["bulky"] * 6)
+    run = {"memory_mb": 2000, "shard_size": 3}
+    build(manifest, tmp_path / "whole", **run)
+    out, killed = tmp_path / "out", 0
+    process = start(manifest, out, "ray", 2, **run)
+    while process.poll() is None and killed < 3:
+        staging = [*(out / WORK).glob("*.staging/mjcf.tar*")]
+        writers = [its for its in psutil.process_iter() if staging and "stage_shard" in command_of(its)]
+        for writer in writers:
+            writer.kill()
+            killed += 1
+        time.sleep(0.005)
+    code, errors = finish(process, LIMIT_S)
+    assert code == 0, errors
+    assert killed
+    assert digests(out) == digests(tmp_path / "whole")
 
 
 def _die_somewhere(process, out: Path, moment: int, rng: random.Random) -> list[psutil.Process]:
