@@ -11,12 +11,12 @@ MAX_LABEL_CHARS = 120
 MAX_STEM_CHARS = 80
 RESERVED_IDS = ("scene", "sky", "table", "world")  # names of a scene's own parts, which no object can have
 
-_SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
+SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
 
 
 def check_id(value: str) -> str:
     """Return `value` if it is safe as an id, a file name and an XML name; else raise ValueError."""
-    if not _SAFE_ID.fullmatch(value) or ".." in value:
+    if not SAFE_ID.fullmatch(value) or ".." in value:
         raise ValueError(
             f"id {value[:100]!r} is not usable: give 1 to 80 letters, digits, '_', '-' or single '.', "
             "starting with a letter or digit"

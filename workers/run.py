@@ -132,7 +132,7 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
     return BuildSummary(request.out, tally, 0, budget.spent if over else None)
 
 
-def _read_rows(request: BuildRequest) -> list[ImageRow] | None:
+def _read_rows(request: BuildRequest) -> Sequence[ImageRow] | None:
     if request.manifest is None:
         return None
     rows = read_manifest(request.manifest)
@@ -142,7 +142,7 @@ def _read_rows(request: BuildRequest) -> list[ImageRow] | None:
 
 def _restore_from_dataset(
     request: BuildRequest, guard: Callable[[], None]
-) -> tuple[list[ImageRow], dict[str, Any], dict[str, Any]]:
+) -> tuple[Sequence[ImageRow], dict[str, Any], dict[str, Any]]:
     """Restore the manifest's rows, the recorded inputs and run.json of a finished dataset.
 
     Shards that a kill left unpublished are published first: one that is half in place does not count as committed.

@@ -22,10 +22,9 @@ def reopen_scenes(out: StoragePath, scene_ids: Collection[str]) -> int:
 
 def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) -> int:
     """Invalidate scenes of a locked dataset whose ready shards are published; survives a loss of power."""
-    shard_of = dict(zip(plan.scene_ids, plan.shards, strict=True))
     by_shard: dict[int, list[str]] = {}
     for scene_id in scene_ids:
-        by_shard.setdefault(shard_of[scene_id], []).append(scene_id)
+        by_shard.setdefault(plan.shards[plan.rank_of(scene_id)], []).append(scene_id)
     for shard, members in sorted(by_shard.items()):
         journal = open_journal(journal_path(out, shard))
         for scene_id in members:

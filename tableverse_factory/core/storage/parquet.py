@@ -40,12 +40,27 @@ def encode_parquet(table: pa.Table) -> bytes:
     return bytes(sink.getvalue())
 
 
+def open_parquet(path: StoragePath) -> pq.ParquetFile:
+    """Open a Parquet file, which a store sends whole."""
+    source = pa.BufferReader(read_whole(path)) if isinstance(path, UPath) else path
+    return pq.ParquetFile(source, pre_buffer=False)
+
+
 def read_table(path: StoragePath, schema: pa.Schema | None = None, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a Parquet file, or some columns of it."""
-    options: dict[str, Any] = {"schema": schema, "columns": None if columns is None else list(columns)}
-    if isinstance(path, UPath):
-        return pq.read_table(pa.BufferReader(read_whole(path)), **options)
-    return pq.read_table(path, partitioning=None, **options)
+    """Read a Parquet file, or some columns of it, in this thread; columns of `schema` that it lacks are null."""
+    with open_parquet(path) as file:
+        table = file.read(None if columns is None else list(columns), use_threads=False)
+    if schema is None:
+        return table
+    wanted = schema if columns is None else pa.schema([schema.field(name) for name in columns])
+    if table.schema.equals(wanted):
+        return table
+    there, nothing = set(table.column_names), pa.nulls(table.num_rows)
+    arrays = [
+        (table[name] if name in there else nothing).cast(kind)
+        for name, kind in zip(wanted.names, wanted.types, strict=True)
+    ]
+    return pa.Table.from_arrays(arrays, schema=wanted)
 
 
 class _TrackingHandler(pa.fs.FSSpecHandler):  # type: ignore[misc]
