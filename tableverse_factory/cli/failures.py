@@ -12,7 +12,7 @@ from tableverse_factory.core import errors
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
-    from workers.progress.build_state import SceneStatus
+    from workers.progress.build_state import LostScene
 
 
 def failures(
@@ -39,17 +39,17 @@ def failures(
     """
     from tableverse_factory.core.storage.files import parse_path
     from workers.plan.invalidate import reopen_scenes
-    from workers.progress.build_state import read_build_state
+    from workers.progress.build_state import LOST_COLUMNS, read_build_state
 
     place = parse_path(out)
-    state = read_build_state(place)
-    lost = [scene for scene in state.scenes if scene.status != "done"]
+    state = read_build_state(place, LOST_COLUMNS, ["stage"])
+    lost = state.list_lost()
     if stage is None and reason is None:
         selected = [scene for scene in lost if scene.status == "failed"]
     else:
         selected = [its for its in lost if stage in (None, its.stage) and reason in (None, its.why)]
     if not selected:
-        _check_filters(lost, [cost.stage for cost in state.compute_stage_costs()], stage, reason)
+        _check_filters(lost, state.timings["stage"].unique().to_pylist(), stage, reason)
     if as_json:
         names = ("scene_id", "status", "stage", "why", "detail", "attempts", "shard")
         print_json([{**{n: getattr(its, n) for n in names}, "help": _find_help(its.why)} for its in selected])
@@ -66,7 +66,7 @@ def _find_help(why: str) -> str:
     return f"{TROUBLESHOOTING}#{getattr(getattr(errors, why, None), 'topic', why)}"
 
 
-def _check_filters(lost: list["SceneStatus"], ran: list[str], stage: str | None, reason: str | None) -> None:
+def _check_filters(lost: list["LostScene"], ran: list[str], stage: str | None, reason: str | None) -> None:
     """Refuse a stage that does not exist, or a reason for which no scene was lost."""
     from schemas.config import Config
 
@@ -81,13 +81,13 @@ def _check_filters(lost: list["SceneStatus"], ran: list[str], stage: str | None,
         raise errors.InputError(f"--reason {sanitize_line(reason, 60)!r}: nothing was lost for that, but for {names}")
 
 
-def _format_none_failed(lost: list["SceneStatus"], out: str) -> str:
+def _format_none_failed(lost: list["LostScene"], out: str) -> str:
     if not (dropped := sum(scene.status == "dropped" for scene in lost)):
         return "none"
     return f"none failed; {dropped} {'was' if dropped == 1 else 'were'} dropped: tableverse status {out}"
 
 
-def _print_scenes(selected: list["SceneStatus"], nothing: str) -> None:
+def _print_scenes(selected: list["LostScene"], nothing: str) -> None:
     from rich.console import Console
 
     from tableverse_factory.viz.gallery.formatting import explain_reasons
@@ -95,7 +95,7 @@ def _print_scenes(selected: list["SceneStatus"], nothing: str) -> None:
     if not selected:
         print(nothing)
         return
-    groups: dict[tuple[str, str, str], list["SceneStatus"]] = {}
+    groups: dict[tuple[str, str, str], list["LostScene"]] = {}
     for scene in selected:
         groups.setdefault((scene.status, scene.stage, scene.why), []).append(scene)
     table = make_table("status", "stage", "why", figures=["scenes"])

@@ -45,15 +45,16 @@ def status(
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
         _follow(place, every)
         return
-    from tableverse_factory.dataset.judge_summary import summarize_judgements
-    from tableverse_factory.dataset.model_costs import read_model_costs
+    from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
+    from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
     from tableverse_factory.dataset.trajectory_summary import summarize_trajectories
-    from workers.progress.build_state import read_build_state
+    from workers.progress.build_state import OUTCOME_COLUMNS, read_build_state
     from workers.state.cost_log import sum_costs
 
-    state = read_build_state(place)
-    verdicts, motions = summarize_judgements(place, state.published), summarize_trajectories(place, state.published)
-    asked = read_model_costs(place, state.published), sum_costs(place)
+    columns = dict.fromkeys((*OUTCOME_COLUMNS, *JUDGEMENT_COLUMNS, *COST_COLUMNS))
+    state = read_build_state(place, [*columns], ["stage", "cpu_s"])
+    verdicts, motions = summarize_judgements(state.stored), summarize_trajectories(place, state.published)
+    asked = sum_model_costs(state.stored), sum_costs(place)
     if as_json:
         costs = {"costs": {asker: asdict(cost) for asker, cost in asked[0].items()}, "spent": asdict(asked[1])}
         print(_dump_json({**_to_dict(state, verdicts, motions), **costs}))

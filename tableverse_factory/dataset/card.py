@@ -8,18 +8,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.outcome import ModelCost
-from schemas.tables import SCENES
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.card_yaml import make_front_matter
-from tableverse_factory.dataset.committed_rows import read_shards
-from tableverse_factory.dataset.judge_summary import JudgeSummary, summarize_judgements
-from tableverse_factory.dataset.model_costs import read_model_costs
+from tableverse_factory.dataset.columns import count_groups
+from tableverse_factory.dataset.committed_rows import count_rows, read_columns
+from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, JudgeSummary, summarize_judgements
+from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
 from tableverse_factory.dataset.trajectory_summary import TrajectorySummary, summarize_trajectories
 
 _COLUMNS = (
-    *("status", "stage", "reason", "error_kind", "source", "licence", "licence_verdict", "mesh_licences"),
-    "perception",
+    *("stage", "reason", "error_kind", "source", "licence", "licence_verdict", "mesh_licences", "perception"),
+    *(*JUDGEMENT_COLUMNS, *COST_COLUMNS),
 )
 _MAX_ROWS = 40
 _EXAMPLE = """\
@@ -33,16 +33,13 @@ model = dataset.scene(done["scene_id"][0].as_py()).model()  # a mujoco.MjModel""
 
 def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence[int]) -> str:
     """Make the card of these committed shards as Markdown with the Hub's front matter; `run` is `run.json`."""
-    read = read_shards(out, "scenes", shards, _COLUMNS)
-    scenes = pa.concat_tables([SCENES.empty_table().select(list(_COLUMNS)), *read])
-    rows = {
-        table: sum(found.num_rows for found in read_shards(out, table, shards, ["scene_id"]))
-        for table in ("objects", "tasks")
-    }
-    status = Counter(scenes["status"].to_pylist())
+    scenes = read_columns(out, "scenes", shards, _COLUMNS)
+    rows = {table: count_rows(out, table, shards) for table in ("objects", "tasks")}
+    status = {outcome: count for (outcome,), count in count_groups(scenes, ["status"]).items()}
     motions = summarize_trajectories(out, shards)
-    bound = _select_done(scenes, "licence", "mesh_licences")
-    licences = [name for row in bound for name in (row["licence"] or "", *(row["mesh_licences"] or ()))]
+    done = scenes.filter(pc.equal(scenes["status"], "done"))
+    licences = {name or "" for name in pc.unique(done["licence"]).to_pylist()}
+    licences |= set(pc.unique(pc.list_flatten(done["mesh_licences"])).to_pylist())
     tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
     parts = [
         make_front_matter(scenes.num_rows, licences, tables),
@@ -52,7 +49,7 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
             ("what", "count"),
             [
                 ("scenes in the manifest", scenes.num_rows),
-                *((outcome, status[outcome]) for outcome in ("done", "dropped", "failed")),
+                *((outcome, status.get(outcome, 0)) for outcome in ("done", "dropped", "failed")),
                 *rows.items(),
                 *([("trajectories that succeed in simulation", motions.succeeded)] if motions.tasks else []),
                 ("shards", len(shards)),
@@ -62,11 +59,11 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
         _format_funnel(scenes),
         *_format_trajectories(motions),
         "## Licences",
-        _format_licences(scenes),
+        _format_licences(done),
         "## Sources",
-        _format_sources(scenes),
+        _format_sources(done),
         "## Models",
-        _format_models(scenes, summarize_judgements(out, shards), read_model_costs(out, shards)),
+        _format_models(done, summarize_judgements(scenes), sum_model_costs(scenes)),
         "## Reading it",
         f"```python\n{_EXAMPLE}\n```",
         "## How it was made",
@@ -82,8 +79,9 @@ def _format_funnel(scenes: pa.Table) -> str:
     lost = scenes.filter(pc.not_equal(scenes["status"], "done"))
     if not lost.num_rows:
         return "None was."
-    whys = [row["reason"] or row["error_kind"] for row in lost.select(["reason", "error_kind"]).to_pylist()]
-    counts = Counter(zip(lost["status"].to_pylist(), lost["stage"].to_pylist(), whys, strict=True))
+    counts = Counter[tuple[str, ...]]()
+    for (status, stage, reason, kind), count in count_groups(lost, ("status", "stage", "reason", "error_kind")).items():
+        counts[status, stage, reason or kind] += count
     return _format_table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _sort_by_count(counts)])
 
 
@@ -98,14 +96,18 @@ def _format_trajectories(motions: TrajectorySummary) -> list[str]:
     return parts
 
 
-def _format_licences(scenes: pa.Table) -> str:
+def _format_licences(done: pa.Table) -> str:
     """Count licences by verdict and by name.
 
     A scene is an adaptation of its picture, so the picture's licence binds it, and those of generated meshes.
     """
-    done = _select_done(scenes, "licence_verdict", "licence", "mesh_licences")
-    verdicts = Counter(row["licence_verdict"] or "unknown" for row in done)
-    names = Counter((_name_licences(row), row["licence_verdict"] or "unknown") for row in done)
+    verdicts, names = Counter[str](), Counter[tuple[str, str]]()
+    licences = done.select(["licence", "licence_verdict"])
+    licences = licences.append_column("meshes", pc.binary_join(done["mesh_licences"], ", "))
+    for (licence, given, meshes), count in count_groups(licences, licences.column_names).items():
+        verdict = given or "unknown"
+        verdicts[verdict] += count
+        names[(licence or "not stated") + (f"; meshes: {meshes}" if meshes else ""), verdict] += count
     by_verdict = _format_table(("verdict", "done scenes"), _sort_by_count(verdicts))
     named = [(*key, count) for key, count in _sort_by_count(names)]
     by_name = _format_table(("licence", "verdict", "done scenes"), named)
@@ -113,19 +115,12 @@ def _format_licences(scenes: pa.Table) -> str:
     return f"{by_verdict}\n\n{by_name}\n\n{note}"
 
 
-def _name_licences(row: Mapping[str, Any]) -> str:
-    meshes = row["mesh_licences"]
-    return (row["licence"] or "not stated") + (f"; meshes: {', '.join(meshes)}" if meshes else "")
+def _format_sources(done: pa.Table) -> str:
+    return _format_table(("source", "done scenes"), _count_values(done, "source", "not stated"))
 
 
-def _format_sources(scenes: pa.Table) -> str:
-    sources = Counter(row["source"] or "not stated" for row in _select_done(scenes, "source"))
-    return _format_table(("source", "done scenes"), _sort_by_count(sources))
-
-
-def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:
-    found = Counter(row["perception"] or "none" for row in _select_done(scenes, "perception"))
-    rows = [("perception", name, count) for name, count in _sort_by_count(found)]
+def _format_models(done: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:
+    rows = [("perception", name, count) for name, count in _count_values(done, "perception", "none")]
     rows += [("judge", name, count) for name, count in _sort_by_count(verdicts.judges)]
     parts = [_format_table(("role", "model", "done scenes"), rows)]
     if spent:
@@ -149,8 +144,11 @@ def _format_models(scenes: pa.Table, verdicts: JudgeSummary, spent: Mapping[str,
     return "\n\n".join(parts)
 
 
-def _select_done(scenes: pa.Table, *columns: str) -> list[dict[str, Any]]:
-    return scenes.filter(pc.equal(scenes["status"], "done")).select(columns).to_pylist()
+def _count_values(done: pa.Table, name: str, missing: str) -> list[tuple[Any, int]]:
+    counts = Counter[str]()
+    for (value,), count in count_groups(done, [name]).items():
+        counts[value or missing] += count
+    return _sort_by_count(counts)
 
 
 def _sort_by_count(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:

@@ -80,3 +80,9 @@ class HashIndex:
         shared[:-1] |= same
         ranks: list[int] = np.sort(self._ranks[shared]).tolist()
         return ranks
+
+
+def count_groups(table: pa.Table, names: Sequence[str]) -> dict[tuple[Any, ...], int]:
+    """Count the rows by their values in these columns."""
+    groups = table.group_by(list(names)).aggregate([([], "count_all")]).to_pylist()
+    return {tuple(group[name] for name in names): group["count_all"] for group in groups}

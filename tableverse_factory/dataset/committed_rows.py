@@ -4,16 +4,24 @@ Consumers open a finished dataset with `open_dataset`, which reads HTTP and the 
 summarizes and checks it.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
 
 import pyarrow as pa
+from upath import UPath
 
 from schemas.tables import STORED_TABLES
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.files import StoragePath, list_names
-from tableverse_factory.core.storage.parquet import read_table
+from tableverse_factory.core.storage.parquet import open_parquet, read_table
 from tableverse_factory.dataset.shards import SPARSE, advise_repair, shard_name, shard_path
+
+T = TypeVar("T")
+
+_STORE_THREADS, _DISK_THREADS = 8, 3
+_SHARDS_AT_ONCE = 64
 
 
 def read_shard(out: StoragePath, table: str, shard: int, columns: Sequence[str] | None = None) -> pa.Table:
@@ -23,30 +31,64 @@ def read_shard(out: StoragePath, table: str, shard: int, columns: Sequence[str] 
         FileNotFoundError: if the shard is being rewritten, or has no rows in this table.
     """
     path = shard_path(out, table, shard)
-    try:
+    with _name_damage(path):
         return read_table(path, STORED_TABLES[table], columns)
+
+
+@contextmanager
+def _name_damage(path: StoragePath) -> Iterator[None]:
+    try:
+        yield
     except (FileNotFoundError, StoreError):
         raise
     except (OSError, pa.ArrowException) as error:
         raise BuildError(f"{path} is damaged ({' '.join(str(error).split())[:200]}): {advise_repair(path)}") from error
 
 
-def read_shards(
-    out: StoragePath, table: str, shards: Iterable[int], columns: Sequence[str] | None = None
-) -> Iterator[pa.Table]:
-    """Read a table of these shards, in their order, without those that are being rewritten just now."""
+def read_columns(out: StoragePath, table: str, shards: Iterable[int], columns: Sequence[str]) -> pa.Table:
+    """Read columns of a table of these shards, in their order, without those that are being rewritten just now."""
     present = set(list_names(out / table)) if table in SPARSE else None
-    for shard in shards:
-        if present is None or shard_name(table, shard) in present:
-            try:
-                yield read_shard(out, table, shard, columns)
-            except FileNotFoundError:
-                continue
+    numbers = [shard for shard in shards if present is None or shard_name(table, shard) in present]
+    nothing = STORED_TABLES[table].empty_table().select(list(columns))
+
+    def read(part: Sequence[int]) -> pa.Table:
+        found = (_read_if_there(out, table, shard, columns) for shard in part)
+        return pa.concat_tables([nothing, *(rows for rows in found if rows is not None)]).combine_chunks()
+
+    return pa.concat_tables([nothing, *map_parts(read, out, numbers)])
 
 
-def read_rows(
-    out: StoragePath, table: str, shards: Iterable[int], columns: Sequence[str] | None = None
-) -> Iterator[dict[str, Any]]:
-    """Read the rows of a table of these shards, as `read_shards` reads them."""
-    for found in read_shards(out, table, shards, columns):
-        yield from found.to_pylist()
+def _read_if_there(out: StoragePath, table: str, shard: int, columns: Sequence[str]) -> pa.Table | None:
+    try:
+        return read_shard(out, table, shard, columns)
+    except FileNotFoundError:
+        return None
+
+
+def count_rows(out: StoragePath, table: str, shards: Iterable[int]) -> int:
+    """Count the rows of a table of these shards, without those that are being rewritten just now."""
+    return sum(map_parts(lambda part: sum(_count_if_there(out, table, shard) for shard in part), out, shards))
+
+
+def _count_if_there(out: StoragePath, table: str, shard: int) -> int:
+    path = shard_path(out, table, shard)
+    try:
+        with _name_damage(path), open_parquet(path) as file:
+            return int(file.metadata.num_rows)
+    except FileNotFoundError:
+        return 0
+
+
+def map_parts(work: Callable[[Sequence[int]], T], out: StoragePath, shards: Iterable[int]) -> list[T]:
+    """Apply `work` to parts of the shards in several threads; the results are in the order of the shards.
+
+    On the disk a part has many shards, because each needs only a millisecond, most of it in Python; in a store it has
+    one, because reads mostly wait for answers.
+    """
+    numbers = list(shards)
+    size, n_threads = (1, _STORE_THREADS) if isinstance(out, UPath) else (_SHARDS_AT_ONCE, _DISK_THREADS)
+    parts = [numbers[start : start + size] for start in range(0, len(numbers), size)]
+    if len(parts) < 2:
+        return list(map(work, parts))
+    with ThreadPoolExecutor(n_threads) as threads:
+        return list(threads.map(work, parts))

@@ -2,19 +2,15 @@
 
 import tarfile
 from collections.abc import Collection, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from upath import UPath
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names, list_sizes
-from tableverse_factory.dataset.committed_rows import read_shard
-from tableverse_factory.dataset.shards import FOLDERS, advise_repair, shard_path
-
-_N_THREADS = 8
+from tableverse_factory.dataset.committed_rows import map_parts, read_shard
+from tableverse_factory.dataset.shards import FOLDERS, advise_repair, shard_name, shard_path
 
 
 def check_files(out: StoragePath, committed: Iterable[int]) -> None:
@@ -26,16 +22,16 @@ def check_files(out: StoragePath, committed: Iterable[int]) -> None:
     shards = sorted(committed)
     for folder in (name for name in FOLDERS if name != "scenes"):
         names = set(list_names(out / folder)) if shards else set()
-        for path in (shard_path(out, folder, shard) for shard in shards):
-            if path.name not in names:
+        for shard in shards:
+            if shard_name(folder, shard) not in names:
+                path = shard_path(out, folder, shard)
                 raise BuildError(f"{path} is damaged (it is missing): {advise_repair(path)}")
 
 
 def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
     """Compare the length of every tar with the offsets of its scenes; needs a dataset that no build is writing.
 
-    A table of trajectories must exist if scenes have some. In a store several shards are read at once, because reads
-    mostly wait for answers.
+    A table of trajectories must exist if scenes have some.
 
     Raises:
         FileNotFoundError: if a shard is being rewritten just now.
@@ -43,12 +39,7 @@ def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
     shards = sorted(committed)
     trajectory_files = frozenset(list_names(out / "trajectories") if shards else ())
     check = partial(_check_tar, out, list_sizes(out / "mjcf") if shards else {}, trajectory_files)
-    if not isinstance(out, UPath):
-        for shard in shards:
-            check(shard)
-        return
-    with ThreadPoolExecutor(_N_THREADS) as threads:
-        list(threads.map(check, shards))
+    map_parts(lambda part: list(map(check, part)), out, shards)
 
 
 def tar_length(end: int) -> int:

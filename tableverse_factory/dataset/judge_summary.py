@@ -1,15 +1,16 @@
 """Summary of a dataset's judgements, and of how far the rules agree."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from statistics import mean, median
-from typing import Any
 
-from tableverse_factory.core.storage.files import StoragePath
-from tableverse_factory.dataset.committed_rows import read_rows
+import pyarrow as pa
+import pyarrow.compute as pc
 
-_COLUMNS = (
+from tableverse_factory.dataset.columns import count_groups
+
+JUDGEMENT_COLUMNS = (
     *("status", "judge", "judge_model", "judge_remarks", "usable", "quality_score", "rules_usable", "rules_score"),
     *("rules_names_share", "rules_mass_ratio", "rules_tasks", "rules_shared_tasks"),
 )
@@ -36,25 +37,32 @@ class JudgeSummary:
     agreement: RulesAgreement | None  # None if only the rules judged
 
 
-def summarize_judgements(out: StoragePath, shards: Sequence[int]) -> JudgeSummary:
-    """Summarize the judgements of the scenes of these committed shards."""
-    rows = [row for row in read_rows(out, "scenes", shards, _COLUMNS) if row["status"] == "done"]
-    judges = Counter(": ".join(filter(None, (row["judge"] or "none", row["judge_model"]))) for row in rows)
-    remarks = Counter(remark.partition(":")[0] for row in rows for remark in row["judge_remarks"] or ())
-    compared = [row for row in rows if row["rules_score"] is not None]
+def summarize_judgements(scenes: pa.Table) -> JudgeSummary:
+    """Summarize the judgements of rows of scenes/ with `JUDGEMENT_COLUMNS`."""
+    done = scenes.filter(pc.equal(scenes["status"], "done"))
+    judges, remarks = Counter[str](), Counter[str]()
+    for (judge, model), count in count_groups(done, ("judge", "judge_model")).items():
+        judges[": ".join(filter(None, (judge or "none", model)))] += count
+    for remark in pc.value_counts(pc.list_flatten(done["judge_remarks"])).to_pylist():
+        remarks[remark["values"].partition(":")[0]] += remark["counts"]
+    compared = done.filter(pc.is_valid(done["rules_score"]))
     return JudgeSummary(
         judges=dict(sorted(judges.items())),
         remarks=dict(sorted(remarks.items(), key=lambda item: (-item[1], item[0]))),
-        agreement=_agreement(compared) if compared else None,
+        agreement=_agreement(compared) if compared.num_rows else None,
     )
 
 
-def _agreement(rows: Sequence[Mapping[str, Any]]) -> RulesAgreement:
+def _agreement(rows: pa.Table) -> RulesAgreement:
+    usable, ruled = rows["usable"], rows["rules_usable"]
+    n_same = pc.sum(pc.equal(usable, ruled)).as_py() or 0
+    n_same += pc.sum(pc.and_(pc.is_null(usable), pc.is_null(ruled))).as_py()
+    shared, tasks = (pc.sum(rows[name]).as_py() or 0 for name in ("rules_shared_tasks", "rules_tasks"))
     return RulesAgreement(
-        scenes=len(rows),
-        usable_share=mean(row["usable"] == row["rules_usable"] for row in rows),
-        score_difference=float(median(row["quality_score"] - row["rules_score"] for row in rows)),
-        names_share=mean(row["rules_names_share"] for row in rows),
-        mass_ratio=median(row["rules_mass_ratio"] for row in rows),
-        tasks_share=sum(row["rules_shared_tasks"] for row in rows) / max(sum(row["rules_tasks"] for row in rows), 1),
+        scenes=rows.num_rows,
+        usable_share=n_same / rows.num_rows,
+        score_difference=float(median(pc.subtract(rows["quality_score"], rows["rules_score"]).to_pylist())),
+        names_share=mean(rows["rules_names_share"].to_pylist()),
+        mass_ratio=median(rows["rules_mass_ratio"].to_pylist()),
+        tasks_share=shared / max(tasks, 1),
     )

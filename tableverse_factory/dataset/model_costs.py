@@ -1,12 +1,16 @@
 """Costs of a dataset's models, as its scenes record them: when each answer was first given, by any build."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from schemas.outcome import NO_COST, ModelCost
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from schemas.outcome import ModelCost
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import pluralize
-from tableverse_factory.dataset.committed_rows import read_rows
+from tableverse_factory.dataset.committed_rows import read_columns
 
 MODEL_ROLE_BY_STAGE = {"perceive": "detector", "curate": "judge"}  # of the model that it asks; prefixes columns
 _FIGURES = ("calls", "input_tokens", "output_tokens", "usd")
@@ -25,7 +29,7 @@ def make_cost_columns(costs: Iterable[tuple[str, ModelCost]]) -> dict[str, Any]:
 
 def read_model_costs(out: StoragePath, shards: Sequence[int]) -> dict[str, ModelCost]:
     """Sum the costs of each role over all scenes of these committed shards, dropped and failed ones too."""
-    return sum_model_costs(read_rows(out, "scenes", shards, COST_COLUMNS))
+    return sum_model_costs(read_columns(out, "scenes", shards, COST_COLUMNS))
 
 
 def format_cost(cost: ModelCost) -> str:
@@ -34,10 +38,14 @@ def format_cost(cost: ModelCost) -> str:
     return f"{pluralize(cost.calls, 'call')}, {cost.input_tokens} tokens read, {cost.output_tokens} written{price}"
 
 
-def sum_model_costs(rows: Iterable[Mapping[str, Any]]) -> dict[str, ModelCost]:
+def sum_model_costs(scenes: pa.Table) -> dict[str, ModelCost]:
     """Sum the costs of each role over rows of scenes/, without roles that asked nothing."""
-    sums = dict.fromkeys(MODEL_ROLE_BY_STAGE.values(), NO_COST)
-    for row in rows:
-        for role in sums:
-            sums[role] += ModelCost(*(row[f"{role}_{figure}"] or 0 for figure in _FIGURES))
+    sums = {role: _sum_role(scenes, role) for role in MODEL_ROLE_BY_STAGE.values()}
     return {role: cost for role, cost in sums.items() if cost}
+
+
+def _sum_role(scenes: pa.Table, role: str) -> ModelCost:
+    calls, read, written = (pc.sum(scenes[f"{role}_{figure}"]).as_py() or 0 for figure in _FIGURES[:3])
+    prices = scenes[f"{role}_usd"].drop_null().to_numpy()
+    # one after the other, as they were added when each scene was an object: the same rounding
+    return ModelCost(calls, read, written, float(np.add.accumulate(prices)[-1]) if len(prices) else 0.0)

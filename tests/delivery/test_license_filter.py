@@ -15,9 +15,10 @@ from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.storage.parquet import build_table, encode_parquet
 from tableverse_factory.dataset.card import make_dataset_card
+from tableverse_factory.dataset.committed_rows import read_columns
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.journals import WORK
-from tableverse_factory.dataset.judge_summary import summarize_judgements
+from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
 from tableverse_factory.dataset.licences import LicenceVerdict
 from tableverse_factory.dataset.shard_plan import Plan, write_plan
 from tableverse_factory.dataset.shards import TarShard, shard_path
@@ -284,7 +285,7 @@ def test_a_dataset_of_an_earlier_version_is_still_read(dataset):
         table = pq.read_table(path)
         old = [name for name in table.column_names if not name.startswith(("judge_", "rules_", "licence_v"))]
         write_atomic(path, encode_parquet(table.select(old)))
-    assert summarize_judgements(dataset, range(3)).judges == {"none": 7}
+    assert summarize_judgements(read_columns(dataset, "scenes", range(3), JUDGEMENT_COLUMNS)).judges == {"none": 7}
     assert "| unknown | 7 |" in make_dataset_card(dataset, {"seed": 0, "fingerprint": "f" * 64}, range(3))
 
 

@@ -211,7 +211,7 @@ def test_retry_computes_the_failed_scene_alone_and_gives_the_bytes_of_a_lucky_bu
         monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
         build(manifest, tmp_path / name, attempts=1)
     out, whole = tmp_path / "out", digests(tmp_path / "lucky")
-    failed = [ending.scene_id for ending in read_build_state(out).scenes if ending.status == "failed"]
+    failed = [ending.scene_id for ending in read_build_state(out).list_lost() if ending.status == "failed"]
     assert failed == ["scene_001"]
     assert digests(out) != whole
 

@@ -4,6 +4,9 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, read_whole, remove, write_atomic
@@ -11,7 +14,6 @@ from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.run_record import AFTERWARDS, CODE, map_parts_to_stages
 from tableverse_factory.stage import Pipelines, Stage
-from workers.progress.build_state import SceneStatus
 from workers.state.checkpoint_store import CheckpointStore
 
 MARKER = "again.json"  # names the stage and the build, from the invalidation until the build is complete
@@ -103,17 +105,17 @@ def check_upstream_unchanged(
 
 
 def list_scenes_to_recompute(
-    plan: Plan, pipelines: Pipelines, points: Mapping[str, int], scenes: Sequence[SceneStatus]
+    plan: Plan, pipelines: Pipelines, points: Mapping[str, int], scenes: pa.Table
 ) -> list[str]:
     """List the ids of the scenes that are done, or ended at one of the stages to recompute."""
-    kind_of = dict(zip(plan.scene_ids, plan.kinds, strict=True))
-    restarts = _list_restarts(pipelines, points)
-    recomputed = {kind: {stage.name for stage in stages[point:]} for kind, stages, point in restarts}
-    return [
-        scene.scene_id
-        for scene in scenes
-        if scene.status == "done" or scene.stage in recomputed[kind_of[scene.scene_id]]
-    ]
+    ranks = pc.index_in(scenes["scene_id"], plan.scene_ids.values)
+    kinds = pc.take(plan.kinds.values, ranks)
+    wanted = pc.equal(scenes["status"], "done")
+    for kind, stages, point in _list_restarts(pipelines, points):
+        again = pc.is_in(scenes["stage"], pa.array([stage.name for stage in stages[point:]], pa.string()))
+        wanted = pc.or_(wanted, pc.and_(pc.equal(kinds, kind), again))
+    ids: list[str] = scenes["scene_id"].filter(wanted).to_pylist()
+    return ids
 
 
 def delete_checkpoints(records: CheckpointStore, plan: Plan, pipelines: Pipelines, points: Mapping[str, int]) -> None:

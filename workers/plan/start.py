@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import pyarrow.compute as pc
+
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError
@@ -160,11 +162,10 @@ def _invalidate_from(
     guard()
     clear_rerun_marker(out)
     publish_ready(out, guard)
-    scenes = read_build_state(out).scenes
+    scenes = read_build_state(out, ("scene_id", "status", "stage"), ()).scenes
     if is_append_only(pipelines, points):
-        checkpoint_exported_scenes(
-            out, plan, rows, fingerprints, {scene.scene_id for scene in scenes if scene.status == "done"}
-        )
+        done = scenes["scene_id"].filter(pc.equal(scenes["status"], "done"))
+        checkpoint_exported_scenes(out, plan, rows, fingerprints, done.to_pylist())
     invalidate_scenes(out, plan, list_scenes_to_recompute(plan, pipelines, points, scenes))
     delete_checkpoints(CheckpointStore(out / CHECKPOINTS), plan, pipelines, points)
 

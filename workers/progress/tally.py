@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from schemas.work import Status
 
 _STEPS = (1.0, 1.25, 1.6, 2.0, 2.5, 3.15, 4.0, 5.0, 6.3, 8.0)
@@ -32,6 +35,12 @@ class Durations:
         """Count one call."""
         self.buckets[bisect_left(BOUNDS_S, seconds)] += 1
         self.total_s += seconds
+
+    def add_all(self, seconds: NDArray[np.float64]) -> None:
+        """Count many calls."""
+        counts = np.bincount(np.searchsorted(BOUNDS_S, seconds), minlength=len(self.buckets))
+        self.buckets = [before + here for before, here in zip(self.buckets, counts.tolist(), strict=True)]
+        self.total_s += float(seconds.sum())
 
     @property
     def count(self) -> int:

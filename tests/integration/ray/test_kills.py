@@ -103,4 +103,4 @@ def _workers(driver: int) -> list[psutil.Process]:
 
 
 def _accounted(out: Path) -> int:
-    return len(read_build_state(out).scenes) if (out / "run.json").exists() else 0
+    return read_build_state(out).scenes.num_rows if (out / "run.json").exists() else 0

@@ -124,4 +124,4 @@ def _workers(driver: int, *kinds: str) -> list[psutil.Process]:
 
 
 def _accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in read_build_state(out).scenes}
+    return set(read_build_state(out).scenes["scene_id"].to_pylist())

@@ -75,4 +75,4 @@ def _start(manifest: Path, out: Path, cache: Path, executor: str, workers: int =
 
 
 def _accounted(out: Path) -> int:
-    return len(read_build_state(out).scenes) if (out / "run.json").exists() else 0
+    return read_build_state(out).scenes.num_rows if (out / "run.json").exists() else 0

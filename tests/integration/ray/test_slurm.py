@@ -92,4 +92,4 @@ def command_line(process: psutil.Process) -> str:
 
 
 def accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in read_build_state(out).scenes} if (out / "run.json").exists() else set()
+    return set(read_build_state(out).scenes["scene_id"].to_pylist()) if (out / "run.json").exists() else set()

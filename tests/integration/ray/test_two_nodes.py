@@ -128,4 +128,4 @@ def start_build(folder: Path, manifest: Path, out: Path, address: str, keys: dic
 
 
 def accounted(out: Path) -> set[str]:
-    return {ending.scene_id for ending in read_build_state(out).scenes} if (out / "run.json").exists() else set()
+    return set(read_build_state(out).scenes["scene_id"].to_pylist()) if (out / "run.json").exists() else set()

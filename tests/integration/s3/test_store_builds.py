@@ -176,7 +176,7 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
 def test_retry_computes_the_failed_scene_alone(whole, store):
     manifest, out = whole
     build_in(manifest, store)
-    failed = [ending.scene_id for ending in read_build_state(store).scenes if ending.status == "failed"]
+    failed = [ending.scene_id for ending in read_build_state(store).list_lost() if ending.status == "failed"]
     assert reopen_scenes(store, failed) == 1
     assert read_build_state(store).remaining == 1
     assert build_in(manifest, store).tally.before == len(NAMES) - 1

@@ -57,7 +57,7 @@ def test_a_complete_build_is_read_once(out, monkeypatch):
     same_as_survey(out, tally)
     assert tally.stages == ("manifest", "look", "cut", "fall", "pack")
     assert tally.passed["look"] == 7
-    monkeypatch.setattr(follow, "read_committed_scenes", lambda *_, **__: pytest.fail("read again"))
+    monkeypatch.setattr(follow, "read_committed_shard", lambda *_, **__: pytest.fail("read again"))
     again = following.read_tally()
     assert (again.ended, again.passed, again.wall) == (tally.ended, tally.passed, tally.wall)
 
@@ -89,7 +89,7 @@ def test_every_step_of_a_build_is_seen(tmp_path, monkeypatch):
 def test_scenes_that_are_put_back_are_to_do_again(out):
     following = BuildFollower(out)
     before = following.read_tally()
-    failed = [ending for ending in read_build_state(out).scenes if ending.status == "failed"]
+    failed = [ending for ending in read_build_state(out).list_lost() if ending.status == "failed"]
     reopen_scenes(out, [ending.scene_id for ending in failed])
     tally = following.read_tally()
     assert tally.accounted == before.accounted - len(failed)
