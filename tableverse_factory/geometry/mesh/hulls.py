@@ -8,6 +8,9 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Points, TriangleMesh
+from tableverse_factory.geometry.mesh.manifold_threads import limit_manifold_threads
+
+limit_manifold_threads()
 
 VERTICES_PER_ROUND = 6
 SLIVER = 1e-9  # a triangle lower than this share of its length has no reliable normal

@@ -10,9 +10,12 @@ from jaxtyping import Int64
 from schemas.geometry import TriangleMesh
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.mesh.manifold_threads import limit_manifold_threads
 from tableverse_factory.geometry.mesh.meshes import check_mesh, from_trimesh, to_trimesh
 from tableverse_factory.geometry.mesh.remesh import remesh
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
+
+limit_manifold_threads()
 
 MIN_FILL_SHARE = 1e-7  # a solid that fills less of the cube of its extent is flat: remeshing gives it body
 MAX_CAP_SHARE = 0.25  # most share of the surface that caps may have: an open bowl of one sheet must stay open
