@@ -10,9 +10,9 @@ from trimesh.triangles import closest_point
 
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
 from tableverse_factory.geometry.math.aabb import aabb
-from tableverse_factory.geometry.mesh.hulls import compute_face_heights, measure_protrusion, unite_hulls
+from tableverse_factory.geometry.mesh.hulls import compute_face_heights, unite_hulls
 from tableverse_factory.geometry.mesh.repair import solid_to_mesh
-from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to_surface, sample_surface
+from tableverse_factory.geometry.mesh.surface_samples import find_largest_distance_to_surface, sample_surface
 
 SAMPLES = 10_000
 MAX_POINTS = 30_000
@@ -27,7 +27,7 @@ def add_metrics(pieces: ConvexPieces, solid: manifold3d.Manifold) -> ConvexPiece
     stride = -(-len(mesh.vertices) // MAX_POINTS)
     points = np.concatenate([mesh.vertices[::stride], sample_surface(mesh, SAMPLES)[0]])
     uncovered = float(measure_distance_to_pieces(points, pieces.hulls).max())
-    back = float(measure_distance_to_surface(sample_surface(around, SAMPLES)[0], mesh, 2 * SAMPLES).max())
+    back = find_largest_distance_to_surface(sample_surface(around, SAMPLES)[0], mesh, 2 * SAMPLES)
     volume, filled, hull = float(solid.volume()), float(union.volume()), float(solid.hull().volume())
     cavity = hull - volume
     return replace(
@@ -46,7 +46,7 @@ def measure_distance_to_pieces(points: Points, hulls: Sequence[TriangleMesh]) ->
         low, high = aabb(hull.vertices)
         in_box = (points >= low - INSIDE_TOLERANCE).all(axis=1) & (points <= high + INSIDE_TOLERANCE).all(axis=1)
         near = np.flatnonzero(outside & in_box)
-        outside[near] = measure_protrusion(hull, points[near])[0] > INSIDE_TOLERANCE
+        outside[near] = compute_face_heights(hull, points[near]).max(axis=1) > INSIDE_TOLERANCE
     distances = np.zeros(len(points))
     distances[outside] = _measure_distance_outside(points[outside], hulls)
     return distances

@@ -61,17 +61,20 @@ def find_extreme_points(points: Points) -> Points:
     """Find the points that lie furthest in some of 96 directions: their hull approximates that of all."""
     if len(points) <= len(_SUPPORTS):
         return points
-    along = np.ascontiguousarray((points @ _SUPPORTS.T).T)
-    return points[np.unique(np.argmax(along, axis=1))]
+    return points[np.unique(np.argmax(_SUPPORTS @ points.T, axis=1))]
 
 
 def make_bounded_hull(points: Points, max_vertices: int, tolerance: float) -> TriangleMesh:
-    """Make a hull of at most `max_vertices` that covers the points, or nearly.
+    """Make a hull of at most `max_vertices` that covers the points, or nearly."""
+    return reduce_hull(make_hull_mesh(points).vertices, max_vertices, tolerance)
 
-    It grows from a simplex: each round adds, face by face, the point furthest outside, until none lies further out than
-    `tolerance` or there are enough. Points still outside are then covered by moving the corners outward.
+
+def reduce_hull(corners: Points, max_vertices: int, tolerance: float) -> TriangleMesh:
+    """Make a hull of at most `max_vertices` that covers the corners of a convex hull, or nearly.
+
+    It grows from a simplex: each round adds, face by face, the corner furthest outside, until none lies further out
+    than `tolerance` or there are enough. Those still outside are then covered by moving the chosen ones outward.
     """
-    corners = make_hull_mesh(points).vertices
     chosen = _find_simplex(corners)
     hull = make_hull_mesh(corners[chosen])
     while len(chosen) < max_vertices:
@@ -95,14 +98,17 @@ def _expand_hull(hull: TriangleMesh, points: Points) -> TriangleMesh:
     heights, face = measure_protrusion(hull, points)
     lift = np.zeros(len(hull.faces))
     np.maximum.at(lift, face, np.maximum(heights, 0.0))
-    normals = compute_face_normals(hull)
-    moved = hull.vertices.copy()
-    for corner in range(len(moved)):
-        mine = (hull.faces == corner).any(axis=1)
-        out = normals[mine].sum(axis=0)
-        out /= max(float(np.linalg.norm(out)), 1e-12)
-        moved[corner] += out * float((lift[mine] / np.maximum(normals[mine] @ out, MIN_CORNER_COSINE)).max())
-    return make_hull_mesh(moved)
+    order = np.argsort(hull.faces.ravel(), kind="stable")
+    corner, face_of = hull.faces.ravel()[order], order // 3
+    normals = compute_face_normals(hull)[face_of]
+    out = np.zeros_like(hull.vertices)
+    np.add.at(out, corner, normals)
+    out /= np.maximum(np.sqrt([way.dot(way) for way in out]), 1e-12)[:, None]
+    starts = np.searchsorted(corner, np.arange(len(out)))
+    around = zip(starts.tolist(), [*starts[1:].tolist(), len(corner)], out, strict=True)
+    cosine = np.concatenate([normals[start:end] @ way for start, end, way in around])
+    way_out = np.maximum.reduceat(lift[face_of] / np.maximum(cosine, MIN_CORNER_COSINE), starts)
+    return make_hull_mesh(hull.vertices + out * way_out[:, None])
 
 
 def make_hull_mesh(points: Points) -> TriangleMesh:

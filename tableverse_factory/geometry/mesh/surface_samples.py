@@ -9,6 +9,8 @@ from schemas.geometry import Points, TriangleMesh
 
 _R2_FIRST = 0.7548776662466927  # the plastic number's inverse and its square: a sequence that fills the unit square
 _R2_SECOND = 0.5698402909980532
+_BATCH = 256  # points measured at once
+_ROUNDING_M = 1e-12  # a sample lies on its triangle up to this
 
 
 def sample_surface(mesh: TriangleMesh, count: int) -> tuple[Points, Int64[np.ndarray, " n"]]:
@@ -45,11 +47,36 @@ def measure_distance_to_surface(
     points: Points, mesh: TriangleMesh, samples: int, neighbours: int = 8
 ) -> Float64[np.ndarray, " n"]:
     """Measure the distance of each point to the triangles of the samples nearest to it [m]."""
-    on_surface, triangle = sample_surface(mesh, samples)
-    _, near = cKDTree(on_surface).query(points, k=min(neighbours, len(on_surface)))
-    near = near.reshape(len(points), -1)
-    candidates = triangle[near]
-    repeated = np.repeat(points, candidates.shape[1], axis=0)
-    closest = closest_point(mesh.vertices[mesh.faces[candidates.ravel()]], repeated)
-    distances = np.linalg.norm(closest - repeated, axis=1).reshape(candidates.shape)
-    return distances.min(axis=1)
+    return _SampledSurface(mesh, samples).measure_distance(points, neighbours)
+
+
+def find_largest_distance_to_surface(points: Points, mesh: TriangleMesh, samples: int, neighbours: int = 8) -> float:
+    """Find the largest of `measure_distance_to_surface` [m].
+
+    The distance to the nearest sample bounds each, so that only points with large bounds are measured.
+    """
+    surface = _SampledSurface(mesh, samples)
+    bounds, _ = surface.tree.query(points)
+    order, largest = np.argsort(-bounds, kind="stable"), 0.0
+    for start in range(0, len(points), _BATCH):
+        batch = order[start : start + _BATCH]
+        if bounds[batch[0]] < largest - _ROUNDING_M:
+            break
+        largest = max(largest, float(surface.measure_distance(points[batch], neighbours).max()))
+    return largest
+
+
+class _SampledSurface:
+    """Samples of a mesh, with the triangle of each."""
+
+    def __init__(self, mesh: TriangleMesh, samples: int) -> None:
+        points, self._triangle = sample_surface(mesh, samples)
+        self._mesh, self.tree = mesh, cKDTree(points)
+
+    def measure_distance(self, points: Points, neighbours: int) -> Float64[np.ndarray, " n"]:
+        _, near = self.tree.query(points, k=min(neighbours, self.tree.n))
+        candidates = self._triangle[near.reshape(len(points), -1)]
+        repeated = np.repeat(points, candidates.shape[1], axis=0)
+        closest = closest_point(self._mesh.vertices[self._mesh.faces[candidates.ravel()]], repeated)
+        distances = np.linalg.norm(closest - repeated, axis=1).reshape(candidates.shape)
+        return distances.min(axis=1)
