@@ -4,7 +4,7 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64, Int64
 from PIL import Image
 from scipy.ndimage import binary_erosion
 
@@ -12,6 +12,7 @@ from schemas.geometry import Camera, Frozen, Mask, Picture, Points, Pose, Triang
 from schemas.objects import Evidence
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
+from tableverse_factory.geometry.mesh.hulls import cross_rows
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 
 LEAST_FACING = 0.2  # least cosine between normal and line of sight; pixels of steeper faces are too stretched
@@ -52,33 +53,49 @@ def load_projectors(evidence: Evidence, poses: list[Pose], scales: list[float]) 
     ]
 
 
-def project_colors(
-    photograph: ColorProjector, mesh: TriangleMesh, points: Points, faces: np.ndarray
-) -> tuple[Bool[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
-    """Find which points of the mesh's surface the picture shows, and their sRGB there.
+class PhotographedMesh:
+    """A mesh where it was placed before the camera, to find what the picture shows of its surface."""
 
-    Points are in the mesh's own frame, before scale, shape (n, 3); `faces` are those they lie on, shape (n,).
-    """
-    pose, scale = photograph.object_to_camera, photograph.scale
-    placed = transform_points(pose, mesh.vertices, scale)
-    at = transform_points(pose, points, scale)
-    corners = placed[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[faces]
-    lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(at, axis=1)
-    facing = -np.einsum("ij,ij->i", normals, at) > LEAST_FACING * np.maximum(lengths, 1e-30)
-    pixels = project(at, photograph.camera)
-    nearest = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64)
-    height, width = photograph.own.shape
-    inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
-    u, v = np.clip(nearest, 0, [width - 1, height - 1]).T
-    seen = facing & inside & photograph.own[v, u]
-    # A point is visible if no other part of the mesh is nearer on its line of sight.
-    scene = make_raycasting_scene(TriangleMesh(placed, mesh.faces))
-    first = scene.cast_rays(pack_rays(np.zeros(3), at[seen]), nthreads=1)["t_hit"].numpy()
-    seen[seen] = first > 1.0 - SAME_SURFACE
-    colors = np.zeros((len(points), 3))
-    colors[seen] = _sample_bilinear(photograph.color, pixels[seen])
-    return seen, colors
+    def __init__(self, photograph: ColorProjector, mesh: TriangleMesh) -> None:
+        self._photograph = photograph
+        placed = transform_points(photograph.object_to_camera, mesh.vertices, photograph.scale)
+        a, b, c = (placed[mesh.faces[:, k]] for k in range(3))
+        self._normals = cross_rows(b - a, c - a)
+        self._scene = make_raycasting_scene(TriangleMesh(placed, mesh.faces))
+
+    def find_shown(
+        self, points: Points, faces: np.ndarray
+    ) -> tuple[Int64[np.ndarray, " k"], Float64[np.ndarray, "k 2"]]:
+        """Find which points of the surface the picture shows: their indices and pixels.
+
+        Points are in the mesh's own frame, before scale, shape (n, 3); `faces` are those they lie on, shape (n,).
+        """
+        photograph = self._photograph
+        at = transform_points(photograph.object_to_camera, points, photograph.scale)
+        normals = self._normals[faces]
+        lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(at, axis=1)
+        facing = -np.einsum("ij,ij->i", normals, at) > LEAST_FACING * np.maximum(lengths, 1e-30)
+        shown = np.flatnonzero(facing)
+        pixels = project(at[shown], photograph.camera)
+        nearest = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64)
+        height, width = photograph.own.shape
+        inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
+        u, v = np.clip(nearest, 0, [width - 1, height - 1]).T
+        inside &= photograph.own[v, u]
+        shown, pixels = shown[inside], pixels[inside]
+        # A point is visible if no other part of the mesh is nearer on its line of sight.
+        first = self._scene.cast_rays(pack_rays(np.zeros(3), at[shown]), nthreads=1)["t_hit"].numpy()
+        visible = first > 1.0 - SAME_SURFACE
+        return shown[visible], pixels[visible]
+
+    def sample_colors(self, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+        """Sample the picture's sRGB at pixels."""
+        return _sample_bilinear(self._photograph.color, pixels)
+
+    @property
+    def texels_per_metre(self) -> float:
+        """Pixels per metre of the mesh's own length."""
+        return self._photograph.texels_per_metre
 
 
 def _sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

@@ -15,7 +15,7 @@ from schemas.geometry import Points, TriangleMesh
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.physics.mjcf.obj_assets import Appearance
 from tableverse_factory.stages.export.atlas import Atlas, find_corner_texels, lay_out_atlas, list_triangle_texels
-from tableverse_factory.stages.export.projected_color import ColorProjector, project_colors
+from tableverse_factory.stages.export.projected_color import ColorProjector, PhotographedMesh
 
 SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8  # factor of the density after each try that does not fit
@@ -31,20 +31,22 @@ def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -
         return Appearance.at_corners(encode_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
     if mesh.vertex_colors is None:
         return None
-    detail = _measure_detail(mesh, photograph)
-    painter = partial(_paint, mesh, photograph, detail > 0.0)
+    photographed = None if photograph is None else PhotographedMesh(photograph, mesh)
+    detail = _measure_detail(mesh, photographed)
+    painter = partial(_paint, mesh, photographed, detail > 0.0)
     atlas = _choose_atlas(mesh, detail)
     return _bake_faces(len(mesh.faces), painter) if atlas is None else _bake_atlas(atlas, painter)
 
 
-def _measure_detail(mesh: TriangleMesh, photograph: ColorProjector | None) -> Float64[np.ndarray, " m"]:
+def _measure_detail(mesh: TriangleMesh, photographed: PhotographedMesh | None) -> Float64[np.ndarray, " m"]:
     """Measure the texels per metre of each face: the picture's own where it shows the face, 0 elsewhere."""
-    count = len(mesh.faces)
-    if photograph is None:
-        return np.zeros(count)
-    probes = np.concatenate([mesh.vertices[mesh.faces], mesh.vertices[mesh.faces].mean(axis=1, keepdims=True)], axis=1)
-    seen, _ = project_colors(photograph, mesh, probes.reshape(-1, 3), np.repeat(np.arange(count), probes.shape[1]))
-    return np.where(seen.reshape(count, -1).any(axis=1), photograph.texels_per_metre, 0.0)
+    detail = np.zeros(len(mesh.faces))
+    if photographed is not None:
+        probes = np.concatenate([mesh.vertices[mesh.faces], mesh.vertices[mesh.faces].mean(axis=1, keepdims=True)], 1)
+        face_of = np.repeat(np.arange(len(detail)), probes.shape[1])
+        shown, _ = photographed.find_shown(probes.reshape(-1, 3), face_of)
+        detail[face_of[shown]] = photographed.texels_per_metre
+    return detail
 
 
 def _choose_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atlas | None:
@@ -58,20 +60,22 @@ def _choose_atlas(mesh: TriangleMesh, detail: Float64[np.ndarray, " m"]) -> Atla
 
 def _paint(
     mesh: TriangleMesh,
-    photograph: ColorProjector | None,
+    photographed: PhotographedMesh | None,
     shown: np.ndarray,
     faces: np.ndarray,
     weights: Float64[np.ndarray, "n 3"],
 ) -> Float64[np.ndarray, "n 3"]:
-    corners = mesh.faces[faces]
-    assert mesh.vertex_colors is not None  # noqa: S101 - bake asks first
-    own = mesh.vertex_colors[corners].astype(np.float64)
-    colors: Float64[np.ndarray, "n 3"] = np.einsum("nk,nkd->nd", weights, own)
-    if photograph is not None:
+    colors = np.empty((len(faces), 3))
+    plain = np.ones(len(faces), dtype=bool)
+    if photographed is not None:
         worth = np.flatnonzero(shown[faces])
-        points: Points = np.einsum("nk,nkd->nd", weights[worth], mesh.vertices[corners[worth]])
-        seen, found = project_colors(photograph, mesh, points, faces[worth])
-        colors[worth[seen]] = found[seen]
+        points: Points = np.einsum("nk,nkd->nd", weights[worth], mesh.vertices[mesh.faces[faces[worth]]])
+        seen, pixels = photographed.find_shown(points, faces[worth])
+        colors[worth[seen]] = photographed.sample_colors(pixels)
+        plain[worth[seen]] = False
+    assert mesh.vertex_colors is not None  # noqa: S101 - bake asks first
+    own = mesh.vertex_colors[mesh.faces[faces[plain]]].astype(np.float64)
+    colors[plain] = np.einsum("nk,nkd->nd", weights[plain], own)
     return colors
 
 
