@@ -84,8 +84,8 @@ class PhotographedMesh:
         inside &= photograph.own[v, u]
         shown, pixels = shown[inside], pixels[inside]
         # A point is visible if no other part of the mesh is nearer on its line of sight.
-        first = self._scene.cast_rays(pack_rays(np.zeros(3), at[shown]), nthreads=1)["t_hit"].numpy()
-        visible = first > 1.0 - SAME_SURFACE
+        rays = pack_rays(np.zeros(3), at[shown])
+        visible = ~self._scene.test_occlusions(rays, tfar=1.0 - SAME_SURFACE, nthreads=1).numpy()
         return shown[visible], pixels[visible]
 
     def sample_colors(self, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
