@@ -1,5 +1,6 @@
 """`tableverse bench factory` and `bench query`: overhead of builds, and query times of datasets."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -7,6 +8,7 @@ import typer
 
 from tableverse_factory.cli.options import AsJson
 from tableverse_factory.cli.tables import print_figures, print_json
+from tableverse_factory.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.factory import FactoryRun
@@ -19,6 +21,7 @@ def bench_factory(
     burning: Annotated[
         int, typer.Option(min=0, help="Scenes of the builds whose stages burn CPU; 0 skips them.")
     ] = 400,
+    payload: Annotated[str, typer.Option(help="Size of the files of each scene, e.g. 7MB.")] = "0",
     as_json: AsJson = False,
 ) -> None:
     """Measure the overhead of the factory: stages that do nothing, real sandboxes, commits to disk; and Ray Data.
@@ -28,12 +31,14 @@ def bench_factory(
     Example: `tableverse bench factory --sizes 300,1000,3000 --burning 100`
     """
     import sys
+    from functools import partial
 
     from tableverse_factory.evaluation.bench.factory import bench_factory, compare_runs
 
     asked = sorted({int(size) for size in sizes.split(",")})
     runs = []
-    for run in bench_factory(asked, workers, burning, lambda what: print(what, end=" … ", file=sys.stderr, flush=True)):
+    show = partial(print, end=" … ", file=sys.stderr, flush=True)
+    for run in bench_factory(asked, workers, burning, _parse_size(payload), show):
         print(f"{run.rate:.0f} scenes/s, {run.total_cpu_ms:.2f} ms of CPU each", file=sys.stderr)
         runs.append(run)
     ratios = compare_runs(runs)
@@ -51,13 +56,22 @@ def bench_factory(
 def _show_runs(runs: list["FactoryRun"]) -> None:
     rows = []
     for run in runs:
-        cpu = (f"{run.total_cpu_ms:.2f}", f"{run.cpu_ms.get('driver', 0.0):.2f}")
+        cpu = (f"{run.total_cpu_ms:.2f}", f"{run.driver_ms:.2f}", f"{run.driver_kb:.1f}")
         rates = (f"{run.rate:.0f}", f"{run.steady_rate:.0f}")
         memory = (f"{run.peak_mb:.0f}", f"{run.growth_mb:+.1f}")
         rows.append((run.what, run.workers, run.scenes, *rates, *cpu, *memory))
-    figures = ("workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver", "peak MB", "MB per 10,000")
+    figures = ("workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver ms", "KB", "peak MB", "MB per 10,000")
     print_figures(("build", *figures), rows)
-    print("CPU ms: per scene over all processes, and the share of the driver; flowing: after the first finished scene")
+    print("flowing: after the first finished scenes; CPU ms: per scene over all processes, starts and imports included")
+    print("driver ms, KB: its CPU time, and what it reads, writes and exchanges with actors per scene while they flow")
+
+
+def _parse_size(text: str) -> int:
+    """Parse a number of bytes such as `7MB`."""
+    match = re.fullmatch(r"(\d{1,9})\s*(k|M|G)?B?", text)
+    if match is None:
+        raise ConfigError(f"--payload {text[:80]!r}: give a number of bytes such as 7MB")
+    return int(match[1]) * {None: 1, "k": 10**3, "M": 10**6, "G": 10**9}[match[2]]
 
 
 def bench_query(

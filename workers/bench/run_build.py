@@ -1,7 +1,8 @@
 """A build of any pipeline in a process of its own with progress on stdout, for `tableverse bench factory`.
 
-`python -m workers.bench.run_build MANIFEST OUT EXECUTOR WORKERS PIPELINE` writes a line `seconds scenes` about once a
-second, and one at the end. Seconds are of the monotonic clock, which all processes of a machine share.
+`python -m workers.bench.run_build MANIFEST OUT EXECUTOR WORKERS PIPELINE` writes a line `seconds scenes cpu_s bytes`
+about once a second, and one at the end: seconds of the monotonic clock, which all processes of a machine share,
+finished scenes, CPU time of the driver, and bytes that it read, wrote and exchanged with actors.
 """
 
 import sys
@@ -27,17 +28,24 @@ class StdoutProgress:
         """Write a line after a change, about once a second."""
         if time.monotonic() >= self._next and tally.accounted != self._written:
             self._next = time.monotonic() + _EVERY_S
-            self.write(tally.accounted)
+            self.write(tally)
 
     def note(self, line: str) -> None:
         """Write a note to stderr."""
         sys.stderr.write(f"{line}\n")
 
-    def write(self, scenes: int) -> None:
+    def write(self, tally: Tally) -> None:
         """Write a line."""
-        self._written = scenes
-        sys.stdout.write(f"{time.monotonic():.3f} {scenes}\n")
+        self._written = tally.accounted
+        moved = tally.bytes_exchanged + _count_io()
+        sys.stdout.write(f"{time.monotonic():.3f} {tally.accounted} {time.process_time():.3f} {moved}\n")
         sys.stdout.flush()
+
+
+def _count_io() -> int:
+    """Count the bytes that this process has read and written."""
+    counters = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
+    return int(counters["rchar"]) + int(counters["wchar"])
 
 
 def main() -> None:
@@ -54,7 +62,7 @@ def main() -> None:
     )
     progress = StdoutProgress()
     summary = run_build(request, progress, StopSignals())
-    progress.write(summary.tally.accounted)
+    progress.write(summary.tally)
     sys.exit(128 + summary.signal if summary.signal else 0)
 
 

@@ -6,6 +6,7 @@ from outside.
 
 import hashlib
 import importlib.util
+import math
 import shutil
 import sys
 import tempfile
@@ -35,6 +36,8 @@ class FactoryRun:
     working_s: float  # from the start of the driver's work to the last commit, start of workers included [s]
     steady_s: float  # from the first finished scenes to the last commit [s]
     steady_scenes: int  # scenes finished in that time
+    driver_ms: float  # CPU time of the driver per scene in that time
+    driver_kb: float  # what the driver reads, writes and exchanges with actors per scene in that time
     cpu_ms: Mapping[str, float]  # CPU time per scene by kind of process, imports and the start of Ray included
     peak_mb: float  # peak resident memory of the driver
     growth_mb: float  # growth of the driver's memory per 10,000 scenes over the second half of the build
@@ -47,7 +50,7 @@ class FactoryRun:
     @property
     def steady_rate(self) -> float:
         """Scenes per second after the first finished ones; nan for a build too short to tell."""
-        return self.steady_scenes / self.steady_s if self.steady_s else float("nan")
+        return self.steady_scenes / self.steady_s if self.steady_s else math.nan
 
     @property
     def total_cpu_ms(self) -> float:
@@ -66,7 +69,7 @@ class FactoryComparison:
 
 
 def bench_factory(
-    sizes: Sequence[int], workers: int, burning: int, show: Callable[[str], None] = lambda _: None
+    sizes: Sequence[int], workers: int, burning: int, payload: int = 0, show: Callable[[str], None] = lambda _: None
 ) -> Iterator[FactoryRun]:
     """Measure one build after the other.
 
@@ -74,6 +77,7 @@ def bench_factory(
         sizes: Scenes of the builds on Ray and on Ray Data, ascending; the two smallest also run with one worker.
         workers: Ray workers in each pool.
         burning: Scenes of the builds whose stages burn CPU; 0 for none.
+        payload: Size of the files of each scene [bytes].
         show: Called with a description before each build.
     """
     plan = [("ray", workers, n, NOOP) for n in sizes]
@@ -84,7 +88,7 @@ def bench_factory(
     with tempfile.TemporaryDirectory(prefix="tableverse-bench-") as folder:
         for what, with_workers, scenes, line in plan:
             show(f"{what}: {scenes} scenes, {with_workers} workers")
-            yield _run_once(what, with_workers, scenes, line, Path(folder))
+            yield _run_once(what, with_workers, scenes, line, Path(folder), payload)
 
 
 def compare_runs(runs: Sequence[FactoryRun]) -> FactoryComparison:
@@ -96,17 +100,17 @@ def compare_runs(runs: Sequence[FactoryRun]) -> FactoryComparison:
     )
     burning = {run.workers: run.steady_rate for run in runs if run.what == "burning"}
     return FactoryComparison(
-        linear=_compute_marginal_ms(ray[-2:]) / _compute_marginal_ms(ray[:2]) if len(ray) > 2 else float("nan"),
+        linear=_compute_marginal_ms(ray[-2:]) / _compute_marginal_ms(ray[:2]) if len(ray) > 2 else math.nan,
         ray_ms=_compute_marginal_ms(one[:2]) - _compute_marginal_ms(local[:2]),
-        speed_up=burning[many] / burning[1] if len(burning) == 2 else float("nan"),
+        speed_up=burning[many] / burning[1] if len(burning) == 2 else math.nan,
         to_ray_data=_compute_marginal_rate(ray[-2:]) / _compute_marginal_rate(data[-2:]),
     )
 
 
-def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path) -> FactoryRun:
+def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path, payload: int) -> FactoryRun:
     manifest, out = folder / f"{scenes}.parquet", folder / "out"
     if not manifest.exists():
-        write_manifest(manifest, (_make_row(number) for number in range(scenes)))
+        write_manifest(manifest, (_make_row(number, payload) for number in range(scenes)))
     executor = () if what == "ray data" else ("local",) if what == "local" else ("ray",)
     module = "workers.bench.run_build" if executor else "workers.bench.ray_data_baseline"
     command = (sys.executable, "-m", module, manifest, out, *executor, workers, line)
@@ -118,8 +122,10 @@ def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path) -> 
 
 
 def _summarize_run(what: str, workers: int, scenes: int, seen: CommandMeasurement) -> FactoryRun:
-    times, counts = np.array(seen.lines).T
+    times, counts, *driver = np.array(seen.lines).T  # with its CPU time and traffic, which Ray Data does not tell
     flowing = int(np.argmax(counts > 0))
+    steady = max(1.0, counts[-1] - counts[flowing])
+    driver_s, driver_bytes = [(its[-1] - its[flowing]) / steady for its in driver] or (math.nan, math.nan)
     at = np.array(seen.memory)
     late = at[at[:, 0] > (times[0] + times[-1]) / 2]
     done = np.interp(late[:, 0], times, counts)
@@ -131,6 +137,8 @@ def _summarize_run(what: str, workers: int, scenes: int, seen: CommandMeasuremen
         working_s=float(times[-1] - times[0]),
         steady_s=float(times[-1] - times[flowing]),
         steady_scenes=int(counts[-1] - counts[flowing]),
+        driver_ms=1e3 * float(driver_s),
+        driver_kb=float(driver_bytes) / 1e3,
         cpu_ms={kind: 1e3 * seconds / scenes for kind, seconds in seen.cpu_s.items()},
         peak_mb=float(at[:, 1].max()),
         growth_mb=growth,
@@ -140,7 +148,7 @@ def _summarize_run(what: str, workers: int, scenes: int, seen: CommandMeasuremen
 def _compute_marginal_ms(runs: Sequence[FactoryRun]) -> float:
     """Compute the CPU time of one more scene between the smallest and the largest run [ms]."""
     if len(runs) < 2:
-        return float("nan")
+        return math.nan
     small, large = runs[0], runs[-1]
     extra = large.total_cpu_ms * large.scenes - small.total_cpu_ms * small.scenes
     return extra / (large.scenes - small.scenes)
@@ -149,15 +157,15 @@ def _compute_marginal_ms(runs: Sequence[FactoryRun]) -> float:
 def _compute_marginal_rate(runs: Sequence[FactoryRun]) -> float:
     """Compute scenes per second between the smallest and the largest run, which leaves out fixed costs."""
     if len(runs) < 2:
-        return float("nan")
+        return math.nan
     small, large = runs[0], runs[-1]
     return (large.scenes - small.scenes) / (large.working_s - small.working_s)
 
 
-def _make_row(number: int) -> ImageRow:
+def _make_row(number: int, payload: int = 0) -> ImageRow:
     digest, kind = hashlib.sha256(str(number).encode()).hexdigest(), SceneKind.CAPTURE
-    uri, scene_id = f"/noop/{number}", f"noop-{digest[:12]}"
-    return ImageRow(scene_id=scene_id, kind=kind, uri=uri, content_sha256=digest, licence="CC0-1.0")
+    place = {"uri": f"/noop/{number}", "name": str(payload) if payload else ""}
+    return ImageRow(scene_id=f"noop-{digest[:12]}", kind=kind, content_sha256=digest, licence="CC0-1.0", **place)
 
 
 def _classify_process(command: str) -> str:

@@ -21,7 +21,7 @@ _LAST_CHARS = 2000
 class CommandMeasurement:
     """Measurement of one command."""
 
-    lines: tuple[tuple[float, int], ...]  # of stdout: monotonic time [s], count
+    lines: tuple[tuple[float, ...], ...]  # numbers on stdout, the first of each line the monotonic time [s]
     memory: tuple[tuple[float, float], ...]  # resident memory of the main process: monotonic time [s], memory [MB]
     cpu_s: Mapping[str, float]  # CPU time by kind of process [s]
 
@@ -32,7 +32,7 @@ def measure_command(
     """Run a command to its end and sample its processes twice a second; usage after the last sample is lost.
 
     Args:
-        command: It writes lines `seconds count` to stdout, seconds of the monotonic clock.
+        command: It writes lines of numbers to stdout, first the seconds of the monotonic clock.
         environment: Added to that of this process.
         kind_of: Returns the kind of a child process for its command line.
 
@@ -57,7 +57,7 @@ def measure_command(
             raise BuildError(
                 f"{' '.join(command[1:4])} … ended with {process.returncode}: {errors.read()[-_LAST_CHARS:]}"
             )
-        lines = tuple((float(seconds), int(count)) for seconds, count in map(str.split, output))
+        lines = tuple(tuple(map(float, line.split())) for line in output)
     total: Counter[str] = Counter()
     for kind, seconds in cpu.values():
         total[kind] += seconds  # type: ignore[assignment]

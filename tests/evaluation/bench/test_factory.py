@@ -3,13 +3,15 @@
 import math
 import sys
 
+import numpy as np
 import pytest
 
+from schemas.config import Config
 from schemas.manifest import SceneKind
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.shards import check_exported
-from tableverse_factory.evaluation.bench import noop_pipeline
+from tableverse_factory.evaluation.bench import factory, noop_pipeline
 from tableverse_factory.evaluation.bench.factory import NOOP, FactoryRun, _run_once, compare_runs
 from tableverse_factory.evaluation.bench.process_meter import measure_command
 from tableverse_factory.evaluation.bench.query import OBJECTS_PER_SCENE, bench_query, write_query_dataset
@@ -24,7 +26,8 @@ def _measured(
     """A run in which every scene costs the same, after something that is done once; one CPU works."""
     seconds = once_s + each_ms * scenes / 1e3
     return FactoryRun(
-        what, workers, scenes, seconds, 10.0, int(10 * steady_rate), {"driver": 1e3 * seconds / scenes}, 90.0, 0.0
+        *(what, workers, scenes, seconds, 10.0, int(10 * steady_rate), each_ms, 1.0),
+        *({"driver": 1e3 * seconds / scenes}, 90.0, 0.0),
     )
 
 
@@ -58,12 +61,23 @@ def test_ratios_leave_out_what_is_done_once():
 
 
 def test_a_build_is_measured_from_outside(tmp_path):
-    run = _run_once("local", 1, 70, NOOP, tmp_path)
+    run = _run_once("local", 1, 70, NOOP, tmp_path, payload=0)
     assert run.scenes == 70
     assert run.working_s > 0.0
     assert {"driver", "sandboxes"} <= set(run.cpu_ms)
     assert 20.0 < run.peak_mb < 1000.0
     assert not (tmp_path / "out").exists()
+
+
+def test_a_payload_is_in_the_dataset_and_passes_by_the_driver(tmp_path):
+    payload, n = 3_000_000, 12
+    run = _run_once("ray", 1, n, NOOP, tmp_path, payload)
+    assert run.scenes == n
+    assert 0.5 < run.driver_kb < 20.0, "3 MB each, and a few thousand bytes"
+    row = factory._make_row(0, payload)
+    scene = noop_pipeline.observe_payload(row, Config(), np.random.default_rng(0)).value
+    files = noop_pipeline.export_minimal(scene).value.files
+    assert sum(len(data) for name, data in files if name.startswith("assets/")) == payload
 
 
 def test_the_meter_counts_the_cpu_of_children_and_says_what_failed():
