@@ -207,6 +207,9 @@ def _make_list(blobs: Sequence[Blob]) -> pa.ListArray:
 def _to_tree(value: Any, blobs: _Blobs) -> Any:
     if type(value) in _PLAIN:
         return value
+    if isinstance(blobs, _SharedBlobs) and value is blobs.parent:
+        blobs.uses_parent = True
+        return {"$parent": True}
     if isinstance(value, bytes):
         return {"$bytes": blobs.add(value)}
     if isinstance(value, np.generic):
@@ -221,9 +224,6 @@ def _to_tree(value: Any, blobs: _Blobs) -> Any:
         return [_to_tree(item, blobs) for item in value]
     if isinstance(value, dict):
         return {"$dict": [[_to_tree(k, blobs), _to_tree(v, blobs)] for k, v in value.items()]}
-    if isinstance(blobs, _SharedBlobs) and value is blobs.parent:
-        blobs.uses_parent = True
-        return {"$parent": True}
     kind = _get_kind(value)
     if isinstance(value, BaseModel):
         return {"$model": kind.__name__, "json": value.model_dump_json(by_alias=True)}

@@ -25,8 +25,9 @@ class StdoutProgress:
         self._written = -1
 
     def show(self, tally: Tally) -> None:
-        """Write a line after a change, about once a second."""
-        if time.monotonic() >= self._next and tally.accounted != self._written:
+        """Write a line after a change, about once a second, and after the last one."""
+        ready = time.monotonic() >= self._next or tally.accounted == tally.total
+        if ready and tally.accounted != self._written:
             self._next = time.monotonic() + _EVERY_S
             self.write(tally)
 

@@ -123,9 +123,9 @@ def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path, pay
 
 def _summarize_run(what: str, workers: int, scenes: int, seen: CommandMeasurement) -> FactoryRun:
     times, counts, *driver = np.array(seen.lines).T  # with its CPU time and traffic, which Ray Data does not tell
-    flowing = int(np.argmax(counts > 0))
+    flowing, ended = int(np.argmax(counts > 0)), int(np.argmax(counts == counts[-1]))
     steady = max(1.0, counts[-1] - counts[flowing])
-    driver_s, driver_bytes = [(its[-1] - its[flowing]) / steady for its in driver] or (math.nan, math.nan)
+    driver_s, driver_bytes = [(its[ended] - its[flowing]) / steady for its in driver] or (math.nan, math.nan)
     at = np.array(seen.memory)
     late = at[at[:, 0] > (times[0] + times[-1]) / 2]
     done = np.interp(late[:, 0], times, counts)
