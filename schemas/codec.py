@@ -128,7 +128,8 @@ def normalize(value: Any) -> Any:
         return value if _is_same([*entries, *entries.values()], [*value, *value.values()]) else entries
     kind = _get_kind(value)
     if isinstance(value, BaseModel):
-        return kind.model_validate_json(value.model_dump_json(by_alias=True))
+        again = kind.model_validate_json(value.model_dump_json(by_alias=True))
+        return value if again == value else again
     given = [getattr(value, name) for name, _ in _FIELDS[kind]]
     parts = [normalize(part) for part in given]
     return value if _is_same(parts, given) else kind(*parts)

@@ -47,10 +47,9 @@ class Driver:
         self._todo = [*spec.todo][::-1]
         self._waiting: dict[int, InFlightScene] = {}
         self._running: dict[int, InFlightScene] = {}
-        kinds = {spec.rows[rank].kind for rank in self._todo}
-        self._workers = WorkerManager(
-            executor, sorted({executor.pool_of(s.pool) for kind in kinds for s in spec.pipelines[kind]})
-        )
+        stages = [stage for kind in {spec.rows[rank].kind for rank in self._todo} for stage in spec.pipelines[kind]]
+        self._asking = {stage.name for stage in stages if calls_model(stage, spec.config)}
+        self._workers = WorkerManager(executor, sorted({executor.pool_of(stage.pool) for stage in stages}))
         self._losses_in_a_row = 0
         self.out_of_budget = False  # whether a scene waits for a budget that is spent
 
@@ -104,8 +103,8 @@ class Driver:
         return ready
 
     def _calls_model(self, scene: InFlightScene) -> bool:
-        stages = scene.stages[scene.position : self._find_end(scene)]
-        return any(calls_model(stage, self._spec.config) for stage in stages)
+        stages = scene.stages[scene.position : self._find_end(scene)] if self._asking else ()
+        return any(stage.name in self._asking for stage in stages)
 
     def _find_end(self, scene: InFlightScene) -> int:
         """Find the end of the scene's next stages that the same pool runs."""
