@@ -20,8 +20,8 @@ from tableverse_factory.dataset.shards import SPARSE, advise_repair, shard_name,
 
 T = TypeVar("T")
 
-_STORE_THREADS, _DISK_THREADS = 8, 3
-_SHARDS_AT_ONCE = 64
+_N_THREADS = 8
+_PART = 64
 
 
 def read_shard(out: StoragePath, table: str, shard: int, columns: Sequence[str] | None = None) -> pa.Table:
@@ -80,15 +80,13 @@ def _count_if_there(out: StoragePath, table: str, shard: int) -> int:
 
 
 def map_parts(work: Callable[[Sequence[int]], T], out: StoragePath, shards: Iterable[int]) -> list[T]:
-    """Apply `work` to parts of the shards in several threads; the results are in the order of the shards.
+    """Apply `work` to parts of the shards; the results are in the order of the shards.
 
-    On the disk a part has many shards, because each needs only a millisecond, most of it in Python; in a store it has
-    one, because reads mostly wait for answers.
+    On the disk a part has many shards; in a store it has one, and several are read at once, because reads mostly wait
+    for answers.
     """
     numbers = list(shards)
-    size, n_threads = (1, _STORE_THREADS) if isinstance(out, UPath) else (_SHARDS_AT_ONCE, _DISK_THREADS)
-    parts = [numbers[start : start + size] for start in range(0, len(numbers), size)]
-    if len(parts) < 2:
-        return list(map(work, parts))
-    with ThreadPoolExecutor(n_threads) as threads:
-        return list(threads.map(work, parts))
+    if isinstance(out, UPath):
+        with ThreadPoolExecutor(_N_THREADS) as threads:
+            return list(threads.map(lambda shard: work([shard]), numbers))
+    return [work(numbers[start : start + _PART]) for start in range(0, len(numbers), _PART)]

@@ -19,7 +19,7 @@ from tableverse_factory.dataset.model_costs import COST_COLUMNS
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.shards import committed_shards
 from tableverse_factory.run_record import read_run
-from workers.progress.shard_rows import ShardReader
+from workers.progress.scan import scan_shards
 
 OUTCOME_COLUMNS = ("status", "stage", "reason", "error_kind")
 LOST_COLUMNS = ("scene_id", *OUTCOME_COLUMNS, "detail", "attempts", "shard")
@@ -121,7 +121,7 @@ def read_build_state(
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     published = committed_shards(out)
     check_files(out, published)
-    rows = ShardReader(out, columns, timing_columns).read(plan.n_shards)
+    rows = scan_shards(out, columns, timing_columns, plan.n_shards)
     return BuildState(
         total=len(plan.scene_ids),
         shards=plan.n_shards,

@@ -38,16 +38,21 @@ class ShardReader:
         nothing = _make_table((), SCENES, columns)
         self._nothing = ShardRows(nothing, _make_table((), TIMINGS, timing_columns), nothing)
 
-    def read(self, n_shards: int) -> ShardRows:
-        """Read all shards of a plan, in their order."""
+    def read(self, shards: range) -> ShardRows:
+        """Read consecutive shards, in their order."""
         listing = self._list()
-        there = sorted(shard for shard in listing[0] | listing[1] if shard < n_shards)
-        return self._join(map_parts(lambda part: self._read_part(part, listing), self._out, there))
+        there = self.list_shards(shards, listing)
+        return self.join(map_parts(lambda part: self._read_part(part, listing), self._out, there))
+
+    def list_shards(self, shards: range, listing: _Listing | None = None) -> list[int]:
+        """List those of the shards that have a journal or are published."""
+        journals, published = self._list() if listing is None else listing
+        return sorted(shard for shard in journals | published if shard in shards)
 
     def _list(self) -> _Listing:
         return find_journals(list_names(self._out / WORK)), committed_shards(self._out)
 
-    def _join(self, parts: Iterable[ShardRows]) -> ShardRows:
+    def join(self, parts: Iterable[ShardRows]) -> ShardRows:
         """Join rows, because thousands of small tables take more memory than one."""
         scenes, timings, stored, whole = zip(self._nothing, *parts, strict=True)
         joined, times = _join_tables(scenes), _join_tables(timings)
@@ -55,7 +60,7 @@ class ShardReader:
         return ShardRows(joined, times, joined if same else _join_tables(stored), sum(whole))
 
     def _read_part(self, shards: Sequence[int], listing: _Listing) -> ShardRows:
-        return self._join([self._read_with_retries(shard, listing) for shard in shards])
+        return self.join([self._read_with_retries(shard, listing) for shard in shards])
 
     def _read_with_retries(self, shard: int, listing: _Listing) -> ShardRows:
         for _ in range(_ATTEMPTS):
@@ -82,7 +87,7 @@ class ShardReader:
         if shard not in published:
             return open_rows
         kept = self._read_kept(shard, journal.reopened | set(journal.results))
-        return self._join([open_rows, kept])._replace(whole=int(not journal.reopened))
+        return self.join([open_rows, kept])._replace(whole=int(not journal.reopened))
 
     def _read_kept(self, shard: int, replaced: Iterable[str]) -> ShardRows:
         """Read a published shard, whose replaced scenes only count as stored."""

@@ -13,11 +13,14 @@ from hypothesis import strategies as st
 
 from schemas.outcome import NO_COST, ModelCost
 from schemas.tables import SCENES, TIMINGS
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
 from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
+from tableverse_factory.dataset.shards import shard_path
 from tests.helpers.builds import Silent, build, request, scenes, write_manifest
 from workers.plan.invalidate import reopen_scenes
+from workers.progress import scan
 from workers.progress.build_state import BuildState, read_build_state
 from workers.progress.tally import Durations
 from workers.run import run_build
@@ -159,3 +162,21 @@ def test_journals_take_precedence_over_shards(tmp_path):
     few = read_build_state(out, ["status"], ["stage"])
     assert (few.scenes.column_names, few.timings.column_names) == (["status"], ["stage"])
     assert few.scenes["status"].to_pylist() == half.scenes["status"].to_pylist()
+
+
+@pytest.mark.heavy
+def test_processes_read_what_one_process_reads(tmp_path, monkeypatch):
+    manifest, out = write_manifest(tmp_path / "m.parquet", ["fine", "empty", "sad"] * 8), tmp_path / "out"
+    run_build(replace(request(manifest, out), limit=22), Silent())
+    reopen_scenes(out, [scenes(out)[4]["scene_id"]])
+    alone = read_build_state(out)
+    monkeypatch.setattr(scan, "_SHARDS_PER_PROCESS", 2)
+    monkeypatch.setattr(scan.os, "cpu_count", lambda: 3)
+    together = read_build_state(out)
+    assert (together.committed, together.published) == (alone.committed, alone.published) == (4, (0, 1, 2, 3, 4))
+    for name in ("scenes", "timings", "stored"):
+        assert getattr(together, name).equals(getattr(alone, name))
+    damaged = shard_path(out, "timings", 3)
+    damaged.write_bytes(damaged.read_bytes()[:-9])
+    with pytest.raises(BuildError, match=r"timings/shard-00003\.parquet is damaged"):
+        read_build_state(out)
