@@ -12,7 +12,8 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.dataset.columns import TextColumn
 
-BATCH_ROWS = 64 * 1024
+BATCH_ROWS = 64 * 1024  # of a table that is read
+_LINES = 4096  # rows that are in Python or JSON at once
 _ESCAPED = r"[^ !#-\[\]-~]"  # characters that JSON in ASCII escapes
 
 
@@ -53,7 +54,7 @@ class ImageRows(Sequence[ImageRow]):
         return ImageRow.model_validate({name: column[rank].as_py() for name, column in self._columns.items()})
 
     def __iter__(self) -> Iterator[ImageRow]:
-        for batch in self._table.to_batches(BATCH_ROWS):
+        for batch in self._table.to_batches(_LINES):
             yield from map(ImageRow.model_validate, batch.to_pylist())
 
     def column(self, name: str) -> TextColumn:
@@ -62,7 +63,7 @@ class ImageRows(Sequence[ImageRow]):
 
     def encode_lines(self) -> Iterator[memoryview]:
         """Encode the rows in parts of many lines: each row as JSON with sorted keys, without `url` if that is empty."""
-        for batch in self._table.to_batches(BATCH_ROWS):
+        for batch in self._table.to_batches(_LINES):
             yield from _encode_lines(batch)
 
 
