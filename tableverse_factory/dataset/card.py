@@ -17,10 +17,9 @@ from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, JudgeSum
 from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
 from tableverse_factory.dataset.trajectory_summary import TrajectorySummary, summarize_trajectories
 
-_COLUMNS = (
-    *("stage", "reason", "error_kind", "source", "licence", "licence_verdict", "mesh_licences", "perception"),
-    *(*JUDGEMENT_COLUMNS, *COST_COLUMNS),
-)
+_ORIGINS = ("source", "licence", "licence_verdict", "mesh_licences", "perception")
+_LOSSES = ("status", "stage", "reason", "error_kind")
+_COLUMNS = tuple(dict.fromkeys((*_ORIGINS, *_LOSSES, *JUDGEMENT_COLUMNS, *COST_COLUMNS)))
 _MAX_ROWS = 40
 _EXAMPLE = """\
 import pyarrow.compute as pc
@@ -37,7 +36,7 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
     rows = {table: count_rows(out, table, shards) for table in ("objects", "tasks")}
     status = {outcome: count for (outcome,), count in count_groups(scenes, ["status"]).items()}
     motions = summarize_trajectories(out, shards)
-    done = scenes.filter(pc.equal(scenes["status"], "done"))
+    done = scenes.select(list(_ORIGINS)).filter(pc.equal(scenes["status"], "done"))
     licences = {name or "" for name in pc.unique(done["licence"]).to_pylist()}
     licences |= set(pc.unique(pc.list_flatten(done["mesh_licences"])).to_pylist())
     tables = ["scenes", *(table for table in rows if rows[table]), *(["trajectories"] if motions.tasks else [])]
@@ -76,11 +75,11 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
 
 
 def _format_funnel(scenes: pa.Table) -> str:
-    lost = scenes.filter(pc.not_equal(scenes["status"], "done"))
+    lost = scenes.select(list(_LOSSES)).filter(pc.not_equal(scenes["status"], "done"))
     if not lost.num_rows:
         return "None was."
     counts = Counter[tuple[str, ...]]()
-    for (status, stage, reason, kind), count in count_groups(lost, ("status", "stage", "reason", "error_kind")).items():
+    for (status, stage, reason, kind), count in count_groups(lost, _LOSSES).items():
         counts[status, stage, reason or kind] += count
     return _format_table(("status", "stage", "why", "scenes"), [(*key, count) for key, count in _sort_by_count(counts)])
 

@@ -79,8 +79,8 @@ def _count_if_there(out: StoragePath, table: str, shard: int) -> int:
         return 0
 
 
-def map_parts(work: Callable[[Sequence[int]], T], out: StoragePath, shards: Iterable[int]) -> list[T]:
-    """Apply `work` to parts of the shards; the results are in the order of the shards.
+def map_parts(work: Callable[[Sequence[int]], T], out: StoragePath, shards: Iterable[int]) -> Iterator[T]:
+    """Apply `work` to parts of the shards, and iterate over the results in the order of the shards.
 
     On the disk a part has many shards; in a store it has one, and several are read at once, because reads mostly wait
     for answers.
@@ -88,5 +88,6 @@ def map_parts(work: Callable[[Sequence[int]], T], out: StoragePath, shards: Iter
     numbers = list(shards)
     if isinstance(out, UPath):
         with ThreadPoolExecutor(_N_THREADS) as threads:
-            return list(threads.map(lambda shard: work([shard]), numbers))
-    return [work(numbers[start : start + _PART]) for start in range(0, len(numbers), _PART)]
+            yield from threads.map(lambda shard: work([shard]), numbers)
+    else:
+        yield from (work(numbers[start : start + _PART]) for start in range(0, len(numbers), _PART))

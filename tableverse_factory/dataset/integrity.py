@@ -39,7 +39,8 @@ def check_tars(out: StoragePath, committed: Iterable[int]) -> None:
     shards = sorted(committed)
     trajectory_files = frozenset(list_names(out / "trajectories") if shards else ())
     check = partial(_check_tar, out, list_sizes(out / "mjcf") if shards else {}, trajectory_files)
-    map_parts(lambda part: list(map(check, part)), out, shards)
+    for _ in map_parts(lambda part: list(map(check, part)), out, shards):
+        pass
 
 
 def tar_length(end: int) -> int:

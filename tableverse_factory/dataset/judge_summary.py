@@ -10,10 +10,11 @@ import pyarrow.compute as pc
 
 from tableverse_factory.dataset.columns import count_groups
 
-JUDGEMENT_COLUMNS = (
-    *("status", "judge", "judge_model", "judge_remarks", "usable", "quality_score", "rules_usable", "rules_score"),
-    *("rules_names_share", "rules_mass_ratio", "rules_tasks", "rules_shared_tasks"),
+_COMPARED = (
+    *("usable", "quality_score", "rules_usable", "rules_score", "rules_names_share", "rules_mass_ratio"),
+    *("rules_tasks", "rules_shared_tasks"),
 )
+JUDGEMENT_COLUMNS = ("status", "judge", "judge_model", "judge_remarks", *_COMPARED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +40,13 @@ class JudgeSummary:
 
 def summarize_judgements(scenes: pa.Table) -> JudgeSummary:
     """Summarize the judgements of rows of scenes/ with `JUDGEMENT_COLUMNS`."""
-    done = scenes.filter(pc.equal(scenes["status"], "done"))
+    done = scenes.select(list(JUDGEMENT_COLUMNS)).filter(pc.equal(scenes["status"], "done"))
     judges, remarks = Counter[str](), Counter[str]()
     for (judge, model), count in count_groups(done, ("judge", "judge_model")).items():
         judges[": ".join(filter(None, (judge or "none", model)))] += count
     for remark in pc.value_counts(pc.list_flatten(done["judge_remarks"])).to_pylist():
         remarks[remark["values"].partition(":")[0]] += remark["counts"]
-    compared = done.filter(pc.is_valid(done["rules_score"]))
+    compared = done.select(list(_COMPARED)).filter(pc.is_valid(done["rules_score"]))
     return JudgeSummary(
         judges=dict(sorted(judges.items())),
         remarks=dict(sorted(remarks.items(), key=lambda item: (-item[1], item[0]))),
