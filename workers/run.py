@@ -170,6 +170,7 @@ def _make_spec(
 ) -> BuildSpec:
     return BuildSpec(
         rows=rows,
+        kinds=[SceneKind(kind) for kind in plan.kinds.find_distinct()],
         shards=plan.shards,
         pipelines=pipelines,
         config=pin_commits(request.config, recorded),
@@ -245,9 +246,10 @@ def _make_executor(request: BuildRequest, spec: BuildSpec, watch: Callable[[], N
     )
     if request.executor == "local":
         return LocalExecutor(setup, watch)
+    from workers.executors.preflight import sample_inputs
     from workers.executors.ray_executor import ClusterSpec, RayExecutor  # importing ray takes a second
 
-    inputs = [] if request.manifest is None else [row.uri for row in spec.rows]  # else only the dataset is read
+    inputs = [] if request.manifest is None else [row.uri for row in sample_inputs(spec.rows)]  # or the dataset alone
     return RayExecutor(setup, request.pools, ClusterSpec(request.address, request.workers, inputs, out / WORK))
 
 

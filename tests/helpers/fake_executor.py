@@ -47,6 +47,7 @@ def make_spec(
 ) -> BuildSpec:
     return BuildSpec(
         rows=rows,
+        kinds=[SceneKind.CAPTURE],
         shards=[0] * len(rows),
         pipelines={SceneKind.CAPTURE: stages},
         config=config or Config(),

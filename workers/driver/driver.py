@@ -47,7 +47,7 @@ class Driver:
         self._todo = [*spec.todo][::-1]
         self._waiting: dict[int, InFlightScene] = {}
         self._running: dict[int, InFlightScene] = {}
-        stages = [stage for kind in {spec.rows[rank].kind for rank in self._todo} for stage in spec.pipelines[kind]]
+        stages = [stage for kind in spec.kinds for stage in spec.pipelines[kind]]
         self._asking = {stage.name for stage in stages if calls_model(stage, spec.config)}
         self._workers = WorkerManager(executor, sorted({executor.pool_of(stage.pool) for stage in stages}))
         self._losses_in_a_row = 0

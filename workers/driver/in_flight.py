@@ -1,7 +1,7 @@
 """The work of a run, and a scene inside the stages: how far it has come, and where the input of its next stage lies."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from schemas.config import Config
@@ -18,6 +18,7 @@ class BuildSpec:
     """The work of one run of a build."""
 
     rows: Sequence[ImageRow]  # the whole manifest
+    kinds: Collection[SceneKind]  # of the rows
     shards: Sequence[int]  # of each row
     pipelines: Pipelines  # stages of each kind of row
     config: Config

@@ -4,7 +4,7 @@ import secrets
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import ray
 import ray.exceptions
@@ -23,6 +23,8 @@ from tableverse_factory.core.storage.untrusted import find_type
 from tableverse_factory.run_record import collect_versions
 from workers.executors.ray_cluster import Node
 from workers.sandbox.error_text import sanitize_error_text
+
+T = TypeVar("T")
 
 PROBE_TIMEOUT_S = 120.0
 SAMPLED_INPUTS = 16
@@ -55,7 +57,7 @@ def check_nodes(nodes: Sequence[Node], inputs: Sequence[str], shared: StoragePat
     check_inputs(len(visible), answers)
 
 
-def sample_inputs(inputs: Sequence[str]) -> tuple[str, ...]:
+def sample_inputs(inputs: Sequence[T]) -> tuple[T, ...]:
     """Select at most `SAMPLED_INPUTS` of the inputs, spread evenly."""
     step = max(1, -(-len(inputs) // SAMPLED_INPUTS))
     return tuple(inputs[::step])
