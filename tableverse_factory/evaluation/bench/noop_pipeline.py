@@ -38,7 +38,7 @@ _CERTIFICATE = Certificate(0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), (), (), True
 
 def observe_payload(row: ImageRow, _config: Config, rng: np.random.Generator, *_: Any) -> Outcome[Any]:
     """Return the row, with as many random bytes as its name says."""
-    if not row.name:
+    if not row.name.isdecimal():
         return Done(row)
     block = rng.integers(0, 256, _BLOCK_BYTES, dtype=np.uint8)
     return Done({"row": row, "payload": np.resize(block, int(row.name))})
