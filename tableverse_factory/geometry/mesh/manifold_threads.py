@@ -1,4 +1,4 @@
-"""manifold3d on one thread: for solids of objects its threads take twice the CPU time and save hardly any."""
+"""manifold3d on one thread: for solids of objects its threads cost up to twice the CPU time and save little."""
 
 import os
 from functools import cache
