@@ -1,5 +1,7 @@
 """Process pool whose results come in the order of the items and do not depend on the number of processes."""
 
+import ctypes
+import multiprocessing
 import os
 import signal
 import threading
@@ -7,7 +9,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,6 +19,7 @@ from tableverse_factory.core.errors import InputError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_PR_SET_PDEATHSIG = 1
 CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 
@@ -43,14 +45,23 @@ def parallel_map(
             yield from map(work, items)
         return
     # Forked children would share the threads' locks of libraries that are already at work.
-    context = get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(items)), context, threadpool_limits, (1,)) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(items)), context, _prepare_child) as pool:
         try:
             with _defer_interrupt():
                 results = pool.map(work, items, chunksize=chunk)
             yield from results
         except BrokenProcessPool as error:
             raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
+
+
+def _prepare_child() -> None:
+    """Limit a child to one thread, and end it with its parent: it would wait for work forever."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    parent = multiprocessing.parent_process()
+    if parent is None or os.getppid() != parent.pid:
+        os._exit(1)  # it was killed just before
+    threadpool_limits(1)
 
 
 @contextmanager
