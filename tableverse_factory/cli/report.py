@@ -1,11 +1,8 @@
 """`tableverse report`: a gallery of a dataset as static HTML."""
 
-import signal
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -35,7 +32,8 @@ def report(
 ) -> None:
     """Write a gallery of a dataset as static HTML.
 
-    It shows the funnel, statistics, and every scene beside its photograph.
+    It shows the funnel, statistics, and every scene beside its photograph. Run it again to go on where it was stopped,
+    and to add scenes built since: what is drawn stays.
 
     Example: `tableverse report out && xdg-open out-gallery/index.html`
     """
@@ -48,25 +46,10 @@ def report(
     dataset = open_dataset(out)
     check_robot_option(out, robot, needed=False)
     dest, processes = dest or choose_destination(out, "gallery"), jobs or count_available_cpus()
-    with _unwind_on_sigterm(), count_progress("drawn") as count:
+    with count_progress("scenes") as count:
         index = write_gallery(dataset, dest, processes, count.update, renders=renders, films=films, robot=robot)
     _report_damage(out, dataset.shards)
     print(index)
-
-
-@contextmanager
-def _unwind_on_sigterm() -> Iterator[None]:
-    """Let SIGTERM unwind the block as Ctrl-C does, once, to remove its large temporary files; the exit code is 143."""
-
-    def leave(number: int, _frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_IGN)  # a second one would interrupt the cleanup
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _report_damage(out: str, shards: Iterable[int]) -> None:

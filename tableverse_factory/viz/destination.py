@@ -1,15 +1,21 @@
-"""Destination folders of reports: the default ones, and the safe replacement of an earlier gallery."""
+"""Destination folders of reports: the default ones, and a gallery's, in which nothing else is written or removed."""
 
+import fcntl
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.storage.files import resolve_filesystem
+from tableverse_factory.core.storage.files import PARTIAL, remove, resolve_filesystem, write_atomic
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.version import __version__
 
-MARKER = "tableverse-gallery.json"  # file in every gallery that lists its files
+MARKER = "tableverse-gallery.json"  # file in every gallery that lists its files, also those that are still to be drawn
+LOCK = "drawn/.lock"  # empty; locked by the process that writes the gallery
+FOLDERS = ("drawn", "pictures", "scenes")
 
 _LOCAL = ("file://", "local://")
 _ELSE = "give a new or an empty folder"
@@ -29,10 +35,10 @@ def find_local_folder(path: str) -> Path | None:
 
 
 def resolve_destination(dest: Path, dataset: Path | None) -> Path:
-    """Resolve the links of a destination that is new, empty or an earlier gallery, and apart from the dataset.
+    """Resolve the links of a destination, which is apart from the dataset.
 
     Raises:
-        InputError: if it holds anything else, lies within the dataset, or holds it.
+        InputError: if it lies within the dataset, or holds it.
     """
     try:
         folder = dest.resolve()
@@ -44,82 +50,90 @@ def resolve_destination(dest: Path, dataset: Path | None) -> Path:
             raise InputError(f"{dest}: lies within the dataset, whose bytes stay as built; give another folder")
         if folder in root.parents:
             raise InputError(f"{dest}: the dataset lies within it; give a folder that the gallery has for itself")
-    if folder.is_mount():
-        raise InputError(f"{dest}: a file system of its own, which cannot be replaced; give a folder within it")
-    check_replaceable(folder, str(dest))
     return folder
 
 
-def check_replaceable(folder: Path, name: str) -> None:
-    """Raise an `InputError` unless a folder is absent, empty, or holds nothing but a gallery."""
+@contextmanager
+def lock_gallery(folder: Path, dataset: str, name: str) -> Iterator[frozenset[str]]:
+    """Make the folders of a gallery, or take those of an earlier one, hold its lock, and yield the files it may have.
+
+    Raises:
+        InputError: if the folder is not for this gallery (`check_gallery`), or another process writes it.
+    """
+    if not (folder / LOCK).is_file():
+        check_gallery(folder, dataset, name)  # before the lock is made in somebody's folder
+    for part in FOLDERS:
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            message = f"{name}: another `tableverse report` writes this gallery: wait for it, or give another --dest"
+            raise InputError(message) from None
+        yield check_gallery(folder, dataset, name)
+
+
+def check_gallery(folder: Path, dataset: str, name: str) -> frozenset[str]:
+    """Return the files that an earlier gallery may have, by name relative to the folder.
+
+    Raises:
+        InputError: unless the folder is absent, empty, or holds nothing but a gallery of this dataset.
+    """
     if not folder.exists():
-        return
+        return frozenset()
     if not folder.is_dir():
         raise InputError(f"{name}: a file; {_ELSE}")
-    found = list(_list_entries(folder))
-    if not found:
-        return
-    if not (folder / MARKER).is_file():
+    found = _list_entries(folder)  # before the marker is read, which lists a file before it is written
+    marked = (folder / MARKER).is_file()
+    files = _read_marker(folder / MARKER, dataset, name) if marked else frozenset()
+    own = {MARKER, LOCK, *(f"{part}/" for part in FOLDERS), *files}
+    foreign = sorted(entry for entry in found if entry.removesuffix(PARTIAL) not in own)
+    if foreign and not marked:
         raise InputError(f"{name}: holds something that is no gallery; {_ELSE}")
-    own = _read_marker(folder / MARKER, name)
-    foreign = [entry for entry in found if entry not in own]
     if foreign:
         more = f" and {len(foreign) - 1} more" if len(foreign) > 1 else ""
         raise InputError(f"{name}: holds {foreign[0]!r:.200}{more}, no part of the gallery there: move it, or {_ELSE}")
+    return files
 
 
-def _list_entries(folder: Path) -> Iterator[str]:
+def _list_entries(folder: Path) -> list[str]:
     """List everything below a folder by relative name; folders end in a slash. Links are not followed."""
+    entries = []
     for base, folders, files in os.walk(folder, onerror=_reraise):
         above = Path(base).relative_to(folder)
-        for name in sorted(files):
-            yield (above / name).as_posix()
-        for name in sorted(folders):
-            yield (above / name).as_posix() + ("" if (Path(base) / name).is_symlink() else "/")
+        entries += [(above / name).as_posix() for name in files]
+        entries += [(above / name).as_posix() + "/" * (not (Path(base) / name).is_symlink()) for name in folders]
+    return entries
 
 
 def _reraise(error: OSError) -> None:
     raise error
 
 
-def _read_marker(mark: Path, name: str) -> frozenset[str]:
-    """Return the marker itself, the files that it lists, and their folders."""
+def _read_marker(mark: Path, dataset: str, name: str) -> frozenset[str]:
+    """Return the files that the marker lists."""
     try:
         known: Any = json.loads(mark.read_text(encoding="utf-8"))
-        files = [str(file) for file in known["files"]]
-        folders = [str(folder) for folder in known["folders"]]
+        files, other = frozenset(str(file) for file in known["files"]), str(known["dataset"])
     except (KeyError, TypeError, ValueError, RecursionError):
         raise InputError(
             f"{name}: a gallery whose {MARKER} does not list its files, as of an earlier version: delete it, or {_ELSE}"
         ) from None
-    return frozenset([MARKER, *files, *folders])
+    if other != dataset:
+        shown = sanitize_line(other, 200)
+        raise InputError(f"{name}: the gallery of another dataset, {shown}: delete it, or {_ELSE}")
+    return files
 
 
-def write_marker(folder: Path, made_by: str, scenes: int) -> None:
-    """Write the marker of a finished gallery, which lists its files."""
-    entries = sorted(entry for entry in _list_entries(folder) if entry != MARKER)
-    mark = {
-        "made_by": made_by,
-        "scenes": scenes,
-        "folders": [entry for entry in entries if entry.endswith("/")],
-        "files": [entry for entry in entries if not entry.endswith("/")],
-    }
-    (folder / MARKER).write_text(json.dumps(mark, indent=1) + "\n", encoding="utf-8")
+def write_marker(folder: Path, dataset: str, scenes: int, files: Collection[str]) -> None:
+    """Write the marker, which lists the files that the gallery may have."""
+    made_by = f"tableverse-factory {__version__}"
+    mark = {"made_by": made_by, "dataset": dataset, "scenes": scenes, "files": sorted(files)}
+    write_atomic(folder / MARKER, (json.dumps(mark, indent=1) + "\n").encode())
 
 
-def replace_folder(new: Path, folder: Path, aside: Path, name: str) -> None:
-    """Rename the earlier gallery aside and the finished one to its folder; a kill between the two keeps both.
-
-    All are on one file system. If something was added to the folder meanwhile, it is restored.
-    """
-    if not folder.exists():
-        new.rename(folder)
-        return
-    try:
-        folder.rename(aside)
-        check_replaceable(aside, name)
-        new.rename(folder)
-    except BaseException:
-        if aside.exists() and not folder.exists():
-            aside.rename(folder)
-        raise
+def remove_leftovers(folder: Path, files: Collection[str], keep: Collection[str]) -> None:
+    """Remove those of the files that are not kept, and parts of files that a kill left."""
+    for entry in _list_entries(folder):
+        if entry not in keep and entry.removesuffix(PARTIAL) in files:
+            remove(folder / entry)

@@ -1,4 +1,4 @@
-"""Where a gallery is written: it replaces nothing but an earlier one, and nobody loses anything, whatever happens."""
+"""Where a gallery is written: into nothing but a gallery of the dataset, and nobody loses anything."""
 
 import os
 import shutil
@@ -11,10 +11,10 @@ from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.viz.destination import (
-    check_replaceable,
+    check_gallery,
     choose_destination,
     find_local_folder,
-    replace_folder,
+    lock_gallery,
 )
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tableverse_factory.viz.gallery.pages import Site
@@ -30,7 +30,7 @@ def out(tmp_path_factory) -> Path:
     return write_dataset(tmp_path_factory.mktemp("data") / "out", {"scene": NO_SCENE}, [])
 
 
-def test_only_a_gallery_is_ever_replaced(out, tmp_path):
+def test_only_a_gallery_is_ever_written_into(out, tmp_path):
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.txt").write_text("years")
@@ -66,7 +66,7 @@ def test_what_people_put_into_a_gallery_is_kept(out, tmp_path, name):
         write_gallery(open_dataset(out), site)
     assert os.path.lexists(site / name)
     assert (site / "index.html").is_file()
-    assert list(tmp_path.iterdir()) == [site], "no scratch is left"
+    assert list(tmp_path.iterdir()) == [site]
 
 
 def test_what_somebody_puts_there_meanwhile_is_kept_too(out, tmp_path):
@@ -82,16 +82,25 @@ def test_what_somebody_puts_there_meanwhile_is_kept_too(out, tmp_path):
     assert (site / "index.html").is_file()
 
 
-def test_the_earlier_gallery_is_back_where_the_new_one_cannot_be(out, tmp_path):
+def test_the_gallery_of_another_dataset_is_kept(out, tmp_path):
     site = write_gallery(open_dataset(out), tmp_path / "site").parent
     before = digest(site)
-    with pytest.raises(FileNotFoundError):
-        replace_folder(tmp_path / "never-made", site, tmp_path / "aside", "site")
+    other = write_dataset(tmp_path / "other", {"scene": NO_SCENE}, [])
+    with pytest.raises(InputError, match="the gallery of another dataset, out"):
+        write_gallery(open_dataset(other), site)
     assert digest(site) == before
-    assert list(tmp_path.iterdir()) == [site]
 
 
-def test_a_gallery_is_replaced_by_the_same_bytes_also_through_a_link(out, tmp_path):
+def test_two_reports_do_not_write_one_gallery(out, tmp_path):
+    with (
+        lock_gallery(tmp_path / "site", "out", "site"),
+        pytest.raises(InputError, match="another `tableverse report` writes this gallery"),
+    ):
+        write_gallery(open_dataset(out), tmp_path / "site")
+    write_gallery(open_dataset(out), tmp_path / "site")
+
+
+def test_a_gallery_stays_the_same_also_through_a_link(out, tmp_path):
     site = write_gallery(open_dataset(out), tmp_path / "site").parent
     before = digest(site)
     (tmp_path / "latest").symlink_to(site)
@@ -109,7 +118,7 @@ def test_a_mark_that_lists_nothing_licenses_nothing(tmp_path, mark):
     (tmp_path / "tableverse-gallery.json").write_text(mark)
     (tmp_path / "thesis.txt").write_text("years")
     with pytest.raises(InputError, match="does not list its files"):
-        check_replaceable(tmp_path, "here")
+        check_gallery(tmp_path, "out", "here")
 
 
 @pytest.mark.heavy

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 StoragePath: TypeAlias = Path | UPath
 
 MAX_URI_CHARS = 1024
-_TEMPORARY = ".partial"
+PARTIAL = ".partial"  # suffix of a file on the disk that is being written
 _PART_BYTES = 16 * 1024**2
 _READ_AHEAD_BYTES = 4 * 1024**2
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]")
@@ -116,7 +116,7 @@ def _translate_write_errors(path: StoragePath) -> Iterator[None]:
 
 @contextmanager
 def _write_and_rename(path: Path) -> Iterator[BinaryIO]:
-    partial = path.with_name(path.name + _TEMPORARY)
+    partial = path.with_name(path.name + PARTIAL)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as file:

@@ -4,23 +4,37 @@ Its texts come from untrusted pictures, labels and models: templates escape ever
 text, and ids are checked before they become file names.
 """
 
-import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib.resources import files
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from tableverse_factory import pipeline
 from tableverse_factory.core.process_pool import parallel_map
-from tableverse_factory.core.version import __version__
 from tableverse_factory.dataset.dataset import Dataset
-from tableverse_factory.viz.destination import find_local_folder, replace_folder, resolve_destination, write_marker
+from tableverse_factory.viz.destination import (
+    check_gallery,
+    find_local_folder,
+    lock_gallery,
+    remove_leftovers,
+    resolve_destination,
+    write_marker,
+)
 from tableverse_factory.viz.funnel import compute_funnel
+from tableverse_factory.viz.gallery.drawing import DrawingOptions, load_drawing, make_options
 from tableverse_factory.viz.gallery.pages import Site, make_lost_name, make_page_name
 from tableverse_factory.viz.gallery.records import Records, SceneRecord, make_charts, read_records
-from tableverse_factory.viz.gallery.scene import SceneCard, SceneJob, close_datasets, write_scene
-from tableverse_factory.viz.gallery.search_index import FILE_NAME, LOST_PAGE_SIZE, write_search_index
+from tableverse_factory.viz.gallery.scene import (
+    SceneCard,
+    SceneJob,
+    close_datasets,
+    list_possible_files,
+    make_card,
+    write_scene,
+)
+from tableverse_factory.viz.gallery.search_index import FILE_NAME, LOST_PAGE_SIZE, encode_search_index
 
 PAGE_SIZE = 24
 
@@ -30,6 +44,8 @@ SAMPLE_SIZE = 6  # of more scenes
 STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))  # stages of the funnel, in order
 
 _STATIC = ("gallery.css", "gallery.js")
+_RENEWAL_S = 10.0  # least time between two indexes of what is drawn so far
+_KEPT_PER_PROCESS = 100  # scenes already drawn, which are read and hashed in some hundredths of a second each
 _CHUNK = 4  # scenes per task of a process when most are not drawn, which takes some hundredths of a second each
 
 
@@ -54,70 +70,103 @@ def write_gallery(
 ) -> Path:
     """Write the gallery of a dataset and return the path of its index.html.
 
-    The dataset is only read; only committed shards are shown. `dest` may be new, empty, or an earlier gallery with
-    nothing else in it, which is replaced once the new one is complete. The first `renders` scenes are drawn from every
-    side, with at most `films` films each (defaults: `choose_amounts`); `progress` gets the numbers of drawn and of all
-    scenes. `robot` is the arm of recordings of other robots than ours: a file, or `menagerie:NAME`.
+    The dataset is only read. `dest` may be new, empty, or an earlier gallery of this dataset with nothing else in it,
+    finished or not: only scenes that are new or differ are drawn, and files of others are removed at the end. The first
+    `renders` scenes are drawn from every side, with at most `films` films each (defaults: `choose_amounts`); `progress`
+    gets the numbers of finished and of all scenes. `robot` is the arm of recordings of other robots than ours: a file,
+    or `menagerie:NAME`.
     """
     root = find_local_folder(dataset.path)
-    target = resolve_destination(dest, root)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}-", dir=target.parent) as scratch:
-        folder = Path(scratch) / "gallery"
-        for name in ("scenes", "pictures"):
-            (folder / name).mkdir(parents=True)
-        records = read_records(dataset)
-        renders, films = choose_amounts(len(records.done), renders, films)
-        address = dataset.path.rstrip("/") if root is None else str(root)
-        title = address.rpartition("/")[2] or "dataset"
-        drawn = min(renders, len(records.done))
-        site = Site(folder, title, address, len(records.done), len(records.lost), drawn)
-        cards = _write_scenes(site, records.done, films, jobs, progress, robot)
-        _write_index_pages(site, records, cards)
-        write_marker(folder, f"tableverse-factory {__version__}", records.entered)
-        replace_folder(folder, target, Path(scratch) / "replaced", str(dest))
+    folder = resolve_destination(dest, root)
+    records = read_records(dataset)
+    renders, films = choose_amounts(len(records.done), renders, films)
+    address = dataset.path.rstrip("/") if root is None else str(root)
+    title = address.rpartition("/")[2] or "dataset"
+    site = Site(folder, title, address, len(records.done), len(records.lost), min(renders, len(records.done)))
+    scene_jobs, options, pages = _list_jobs(site, records.done), make_options(films, robot), _list_page_names(records)
+    with lock_gallery(folder, site.named, str(dest)) as earlier:
+        possible = earlier.union(pages, *(list_possible_files(job.scene, job.render) for job in scene_jobs))
+        write_marker(folder, site.named, records.entered, possible)
+        cards = _draw_scenes(site, records, scene_jobs, options, jobs, progress)
+        check_gallery(folder, site.named, str(dest))
+        files = pages.union(*(card.files for card in cards))
+        remove_leftovers(folder, possible, keep=files)
+        write_marker(folder, site.named, records.entered, files)
     return dest.absolute() / "index.html"
 
 
-def _write_scenes(
-    site: Site,
-    done: Sequence[SceneRecord],
-    films: int,
-    jobs: int,
-    progress: Callable[[int, int], None] | None,
-    robot: str | None,
-) -> list[SceneCard]:
+def _list_jobs(site: Site, done: Sequence[SceneRecord]) -> list[SceneJob]:
     ids = ["", *(scene.scene_id for scene in done), ""]
-    scene_jobs = [
+    return [
         SceneJob(scene, position < site.n_rendered, ids[position], ids[position + 2], position // PAGE_SIZE + 1)
         for position, scene in enumerate(done)
     ]
+
+
+def _draw_scenes(
+    site: Site,
+    records: Records,
+    scene_jobs: Sequence[SceneJob],
+    options: DrawingOptions,
+    jobs: int,
+    progress: Callable[[int, int], None] | None,
+) -> list[SceneCard]:
+    """Write everything, with an index of what is drawn so far meanwhile."""
+    cards, n_new = {}, 0
+    for job in scene_jobs:
+        drawing = load_drawing(site.folder, job.scene.scene_id)
+        if drawing is not None:
+            cards[job.scene.scene_id] = make_card(job.scene.scene_id, drawing)
+        n_new += drawing is None or drawing.options != options.hash(job.render)
+    processes = min(jobs, n_new + len(scene_jobs) // _KEPT_PER_PROCESS)
+    renewal = _write_index_pages(site, records, cards)
     close_datasets()
-    work, cards = partial(write_scene, site, films, robot), []
-    for card in parallel_map(work, scene_jobs, jobs, "draws scenes", 1 if site.renders_all else _CHUNK):
-        cards.append(card)
-        if progress is not None:
-            progress(len(cards), len(done))
-    return cards
+    work, chunk = partial(write_scene, site, options), 1 if site.renders_all else _CHUNK
+    try:
+        for count, card in enumerate(parallel_map(work, scene_jobs, processes, "draws scenes", chunk), 1):
+            cards[card.scene_id] = card
+            if progress is not None:
+                progress(count, len(scene_jobs))
+            if time.monotonic() >= renewal:
+                renewal = _write_index_pages(site, records, cards)
+    finally:  # also where Ctrl-C stops it
+        _write_index_pages(site, records, cards)
+    return list(cards.values())
 
 
-def _write_index_pages(site: Site, records: Records, cards: Sequence[SceneCard]) -> None:
-    """Write everything but the pages of the scenes; index.html last."""
+def _list_page_names(records: Records) -> frozenset[str]:
+    """List the files of a gallery that are not of one scene."""
+    shown, lost = _split_pages(records.done, PAGE_SIZE) or [[]], _split_pages(records.lost, LOST_PAGE_SIZE)
+    return frozenset((*_STATIC, FILE_NAME, *_list_names(make_page_name, shown), *_list_names(make_lost_name, lost)))
+
+
+def _list_names(make_name: Callable[[int], str], pages: Sequence[object]) -> list[str]:
+    return [make_name(number) for number in range(1, len(pages) + 1)]
+
+
+def _write_index_pages(site: Site, records: Records, cards: Mapping[str, SceneCard]) -> float:
+    """Write everything but the pages of the scenes, index.html last; return when to renew it (`time.monotonic`)."""
+    started = time.monotonic()
+    static = resources.files("tableverse_factory.viz.gallery") / "static"
     for name in _STATIC:
-        (site.folder / name).write_bytes(files("tableverse_factory.viz.gallery").joinpath("static", name).read_bytes())
-    write_search_index(site.folder / FILE_NAME, records.done, cards, records.lost)
+        site.write_file(name, (static / name).read_bytes())
+    drawn = [(scene, cards[scene.scene_id]) for scene in records.done if scene.scene_id in cards]
+    site.write_file(FILE_NAME, encode_search_index(drawn, records.lost))
     lost = _split_pages(records.lost, LOST_PAGE_SIZE)
+    names = _list_names(make_lost_name, lost)
     for number, scenes in enumerate(lost, 1):
-        pager = {"page": number, "pages": len(lost), "names": [make_lost_name(n) for n in range(1, len(lost) + 1)]}
-        site.write(make_lost_name(number), "lost.html", scenes=scenes, pager=pager)
-    shown = _split_pages(list(zip(records.done, cards, strict=True)), PAGE_SIZE) or [[]]
-    names = [make_page_name(n) for n in range(1, len(shown) + 1)]
-    reasons = records.count_reasons([code for card in cards for code in card.reason_codes])
+        pager = {"page": number, "pages": len(lost), "names": names}
+        site.write(names[number - 1], "lost.html", scenes=scenes, pager=pager)
+    shown = _split_pages(drawn, PAGE_SIZE) or [[]]
+    names = _list_names(make_page_name, shown)
+    reasons = records.count_reasons([code for _, card in drawn for code in card.reason_codes])
     filtered = {"moves": records.has_trajectories, "reasons": reasons}
     for number, items in reversed(list(enumerate(shown, 1))):
         pager = {"page": number, "pages": len(shown), "names": names}
         template, figures = ("index.html", _summarize_records(records)) if number == 1 else ("page.html", {})
-        site.write(names[number - 1], template, items=items, pager=pager, **filtered, **figures)
+        site.write(names[number - 1], template, items=items, n_drawn=len(drawn), pager=pager, **filtered, **figures)
+    now = time.monotonic()
+    return now + max(_RENEWAL_S, 20 * (now - started))
 
 
 def _summarize_records(records: Records) -> dict[str, Any]:

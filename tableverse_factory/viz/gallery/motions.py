@@ -1,6 +1,6 @@
 """Films and plots of the trajectories of one scene."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from PIL import Image
 from schemas.identity import check_id
 from schemas.trajectories import Phase
 from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.trajectory import Trajectory
 from tableverse_factory.delivery.episodes.actors import ArmMeshes
@@ -19,6 +20,7 @@ from tableverse_factory.delivery.episodes.cameras import place_film_camera
 from tableverse_factory.delivery.episodes.film import choose_samples, encode_webp, render_frames
 from tableverse_factory.delivery.episodes.plot import plot_svg
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
+from tableverse_factory.viz.gallery.pictures import encode_jpeg
 
 WIDTH, HEIGHT = 320, 240
 FPS = 10.0
@@ -60,8 +62,18 @@ def choose_filmed_tasks(rows: Sequence[Mapping[str, Any]], most: int) -> frozens
     return frozenset([*first, *later][:most])
 
 
+def name_film(scene_id: str, task_id: object) -> str:
+    """Name the film of a trajectory, without suffix."""
+    return f"{scene_id}-{task_id}"
+
+
+def list_film_files(names: Iterable[str]) -> list[str]:
+    """List the files of films: each film and its still."""
+    return [name + suffix for name in names for suffix in (".webp", ".jpg")]
+
+
 def _write_motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bool, robot: str | None) -> MotionCard:
-    row, name = trajectory.row, f"{scene.scene_id}-{check_id(str(trajectory.row['task_id']))}"
+    row, name = trajectory.row, name_film(scene.scene_id, check_id(str(trajectory.row["task_id"])))
     if row["arrays"] is None:
         return MotionCard(row)
     try:
@@ -73,9 +85,10 @@ def _write_motion(scene: Scene, trajectory: Trajectory, folder: Path, filmed: bo
         arm_meshes = ArmMeshes(arm)
         samples, camera = choose_samples(recording, FPS), place_film_camera(recording, arm_meshes, WIDTH, HEIGHT)
         pictures = list(render_frames(scene, str(row["x_id"]), recording, arm_meshes, camera, samples))
-        (folder / f"{name}.webp").write_bytes(encode_webp(pictures, FPS))
         still = Image.fromarray(np.ascontiguousarray(pictures[_choose_still(recording.phase[samples])]))
-        still.save(folder / f"{name}.jpg", "JPEG", quality=_JPEG_QUALITY, optimize=True)
+        jpeg = encode_jpeg(still, _JPEG_QUALITY)
+        for file, data in zip(list_film_files([name]), (encode_webp(pictures, FPS), jpeg), strict=True):
+            write_atomic(folder / file, data)
         return MotionCard(row, name, plot)
     except (InputError, ConfigError, ValueError) as error:
         return MotionCard(row, problem=str(error)[:500])

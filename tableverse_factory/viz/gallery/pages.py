@@ -8,6 +8,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.core.version import __version__
 from tableverse_factory.viz.gallery.formatting import FILTERS
@@ -34,13 +35,23 @@ class Site:
         """Name of the dataset on pages: for a folder without its path, which differs for other readers."""
         return self.out if "://" in self.out else self.dataset
 
-    def write(self, name: str, template: str, **context: Any) -> None:
-        """Write one page."""
+    def render(self, name: str, template: str, **context: Any) -> bytes:
+        """Render the page that is to have this name."""
         root = "../" * name.count("/")
         page = _load_templates().get_template(template)
         html = page.render(site=self, root=root, version=__version__, lost_name=make_lost_name(1), **context)
         # JSON may hold lone surrogates, which UTF-8 cannot encode.
-        (self.folder / name).write_text(html, encoding="utf-8", errors="backslashreplace")
+        return html.encode("utf-8", errors="backslashreplace")
+
+    def write(self, name: str, template: str, **context: Any) -> None:
+        """Write one page."""
+        self.write_file(name, self.render(name, template, **context))
+
+    def write_file(self, name: str, data: bytes) -> None:
+        """Write a file, whole, unless it is already there with these bytes."""
+        path = self.folder / name
+        if not path.is_file() or path.read_bytes() != data:
+            write_atomic(path, data)
 
     def describe_error(self, error: Exception) -> str:
         """Describe an error without the path of the dataset; unexpected errors with their type."""
@@ -56,6 +67,11 @@ def make_page_name(number: int) -> str:
 def make_lost_name(number: int) -> str:
     """Make the file name of a page of lost scenes, counted from 1."""
     return "lost.html" if number == 1 else f"lost-{number:04d}.html"
+
+
+def name_scene_page(scene_id: str) -> str:
+    """Name the page of a scene."""
+    return f"scenes/{scene_id}.html"
 
 
 @cache

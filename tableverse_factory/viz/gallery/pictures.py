@@ -1,7 +1,8 @@
 """Pictures of one scene: the photograph, and renders of the twin before rectification and after export."""
 
+import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,6 +12,7 @@ from PIL import Image
 
 from schemas.geometry import Camera, Picture, Pose
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH, TALLEST, read_photograph
 from tableverse_factory.dataset.scene_meta import read_meta_pose
@@ -59,6 +61,24 @@ class PictureSet:
                 return shown
         return ()
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the files."""
+        large = [name for name in (self.photo, self.twin, self.before, self.front, self.top) if name]
+        small = [name for name in (self.photo, self.twin, self.front, self.top, self.sketch) if name]
+        return (*(f"{name}.jpg" for name in large), *(f"{name}-s.jpg" for name in small))
+
+
+def name_pictures(scene_id: str, kinds: Iterable[str]) -> dict[str, str]:
+    """Name pictures of a scene, without suffix, for the fields of its `PictureSet`."""
+    return {kind: f"{scene_id}-{kind}" for kind in kinds}
+
+
+def list_possible_pictures(scene_id: str, render: bool) -> tuple[str, ...]:
+    """List the files of all pictures that a scene may have."""
+    rendered = ("twin", "before", "front", "top") if render else ()
+    return PictureSet(**name_pictures(scene_id, ("photo", "sketch", *rendered)), photo_height=HEIGHT).files
+
 
 def write_pictures(scene: Scene, folder: Path, render: bool) -> PictureSet:
     """Write the pictures of a scene as JPEG, large and small; without `render` only the photograph or a sketch."""
@@ -66,11 +86,11 @@ def write_pictures(scene: Scene, folder: Path, render: bool) -> PictureSet:
     drawn: dict[str, Picture] = {} if photo is None else {"photo": photo}
     if render:
         drawn |= _render_views(scene)
-    names = {name: f"{scene.scene_id}-{name}" for name in drawn}
+    names = name_pictures(scene.scene_id, drawn)
     for name, picture in drawn.items():
         _save(picture, folder / names[name], thumb=name != "before")
     if not drawn:
-        names["sketch"] = f"{scene.scene_id}-sketch"
+        names = name_pictures(scene.scene_id, ["sketch"])
         _save_small(Image.fromarray(_draw_sketch(scene)), folder / names["sketch"])
     seen = drawn.get("photo", drawn.get("twin"))
     return PictureSet(**names, photo_height=HEIGHT if seen is None else seen.shape[0])
@@ -156,7 +176,7 @@ def _load_photo_camera(meta: Mapping[str, Any]) -> PosedCamera | None:
 
 def _save(picture: Picture, stem: Path, thumb: bool) -> None:
     image = Image.fromarray(np.ascontiguousarray(picture))
-    image.save(stem.with_name(stem.name + ".jpg"), "JPEG", quality=_JPEG_QUALITY, optimize=True)
+    write_atomic(stem.with_name(stem.name + ".jpg"), encode_jpeg(image, _JPEG_QUALITY))
     if thumb:
         _save_small(image, stem)
 
@@ -164,4 +184,11 @@ def _save(picture: Picture, stem: Path, thumb: bool) -> None:
 def _save_small(image: Image.Image, stem: Path) -> None:
     size = (THUMB_WIDTH, max(1, round(image.height * THUMB_WIDTH / image.width)))
     small = image if image.size == size else image.resize(size, Image.Resampling.BOX, reducing_gap=2.0)
-    small.save(stem.with_name(stem.name + "-s.jpg"), "JPEG", quality=_JPEG_QUALITY - 6, optimize=True)
+    write_atomic(stem.with_name(stem.name + "-s.jpg"), encode_jpeg(small, _JPEG_QUALITY - 6))
+
+
+def encode_jpeg(image: Image.Image, quality: int) -> bytes:
+    """Encode a picture as the bytes of a JPEG file."""
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=quality, optimize=True)
+    return file.getvalue()

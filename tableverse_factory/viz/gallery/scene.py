@@ -1,14 +1,17 @@
 """Page, pictures and films of one scene of a gallery, made in any process."""
 
 import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.viz.gallery.motions import MotionCard, write_motions
-from tableverse_factory.viz.gallery.pages import Site
-from tableverse_factory.viz.gallery.pictures import PictureSet, write_pictures
-from tableverse_factory.viz.gallery.records import SceneFacts, SceneRecord, read_scene_facts
+from tableverse_factory.viz.gallery.drawing import Drawing, DrawingOptions, draw_scene, name_drawing
+from tableverse_factory.viz.gallery.motions import MotionCard, list_film_files, name_film
+from tableverse_factory.viz.gallery.pages import Site, name_scene_page
+from tableverse_factory.viz.gallery.pictures import PictureSet, list_possible_pictures
+from tableverse_factory.viz.gallery.records import SceneFacts, SceneRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,32 +33,49 @@ class SceneCard:
     pictures: PictureSet | None  # None if they could not be made
     problem: str = ""  # why there are no pictures
     reason_codes: tuple[str, ...] = ()  # the judge's reasons why the scene is not usable
+    files: tuple[str, ...] = ()  # of the scene in the gallery
 
 
-def write_scene(site: Site, films: int, robot: str | None, job: SceneJob) -> SceneCard:
-    """Draw a scene and write its page, which states any problem with drawing or showing it."""
-    facts, pictures, motions, problem = _draw_scene(site, films, robot, job)
-    card = SceneCard(job.scene.scene_id, pictures, problem, facts.reason_codes)
-    name = f"scenes/{card.scene_id}.html"
-    listed = {"scene": job.scene, "job": job, "commands": list_commands(site.named, card.scene_id)}
-    try:
-        site.write(name, "scene.html", card=card, facts=facts, motions=motions, **listed)
-    except Exception as error:  # noqa: BLE001 - a bad scene must not stop the others
-        card = replace(card, problem=site.describe_error(error))
-        site.write(name, "unshown.html", card=card, **listed)
-    return card
+def list_possible_files(scene: SceneRecord, render: bool) -> list[str]:
+    """List all files that the gallery may have of a scene."""
+    films = list_film_files(name_film(scene.scene_id, row["task_id"]) for row in scene.trajectories if render)
+    pictures = [*list_possible_pictures(scene.scene_id, render), *films]
+    return _list_files(scene.scene_id, pictures)
 
 
-def _draw_scene(
-    site: Site, films: int, robot: str | None, job: SceneJob
-) -> tuple[SceneFacts, PictureSet | None, tuple[MotionCard, ...], str]:
-    folder, motions = site.folder / "pictures", tuple(map(MotionCard, job.scene.trajectories))
+def _list_files(scene_id: str, pictures: Iterable[str]) -> list[str]:
+    return [name_scene_page(scene_id), name_drawing(scene_id), *(f"pictures/{name}" for name in pictures)]
+
+
+def make_card(scene_id: str, drawing: Drawing) -> SceneCard:
+    """Make the card of a drawn scene."""
+    files = tuple(_list_files(scene_id, drawing.files))
+    return SceneCard(scene_id, drawing.pictures, "", drawing.facts.reason_codes, files)
+
+
+def write_scene(site: Site, options: DrawingOptions, job: SceneJob) -> SceneCard:
+    """Write the page of a scene, drawn now or before; the page states any problem with drawing or showing it."""
+    scene_id, rows = job.scene.scene_id, job.scene.trajectories
+    facts, motions, drawing = SceneFacts(), tuple(map(MotionCard, rows)), None
     try:
         scene = _open_dataset(site.out).scene_at(job.scene.row)
-        facts, pictures = read_scene_facts(scene.meta), write_pictures(scene, folder, job.render)
-        return facts, pictures, write_motions(scene, folder, films, robot) if job.render else motions, ""
+        drawing = draw_scene(scene, site.folder, options, job.render)
+        facts, motions, card = drawing.facts, drawing.make_cards(rows), make_card(scene_id, drawing)
+    except BuildError:  # the disk is full, say, for all scenes
+        raise
     except Exception as error:  # noqa: BLE001 - its files are untrusted; its page states the error
-        return SceneFacts(), None, (), site.describe_error(error)
+        drawing, card = None, SceneCard(scene_id, None, site.describe_error(error), files=(name_scene_page(scene_id),))
+    name, commands = name_scene_page(scene_id), list_commands(site.named, scene_id)
+    listed = {"scene": job.scene, "job": job, "commands": commands}
+    try:
+        page = site.render(name, "scene.html", card=card, facts=facts, motions=motions, **listed)
+    except Exception as error:  # noqa: BLE001 - a bad scene must not stop the others
+        card = replace(card, problem=site.describe_error(error))
+        page = site.render(name, "unshown.html", card=card, **listed)
+    site.write_file(name, page)
+    if drawing is not None:
+        site.write_file(name_drawing(scene_id), drawing.encode())
+    return card
 
 
 @cache

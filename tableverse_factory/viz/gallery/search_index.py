@@ -6,7 +6,6 @@ Twenty thousand scenes take some two megabytes, which a page loads at the first 
 import json
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from tableverse_factory.viz.gallery.pages import make_lost_name
@@ -18,25 +17,23 @@ LOST_PAGE_SIZE = 100
 MOST_LABELS = 500  # most labels that the filter lists; typing finds the others
 
 
-def write_search_index(
-    path: Path, done: Sequence[SceneRecord], cards: Sequence[SceneCard], lost: Sequence[SceneRecord]
-) -> None:
-    """Write the data, without markup: `<` and all but ASCII are escaped."""
-    names = Counter(name for scene in done for name in set(scene.labels))
+def encode_search_index(drawn: Sequence[tuple[SceneRecord, SceneCard]], lost: Sequence[SceneRecord]) -> bytes:
+    """Encode the data, without markup: `<` and all but ASCII are escaped."""
+    names = Counter(name for scene, _ in drawn for name in set(scene.labels))
     labels = sorted(names, key=lambda name: (-names[name], name))
     number = {name: index for index, name in enumerate(labels)}
     pages = [make_lost_name(position // LOST_PAGE_SIZE + 1) for position in range(len(lost))]
     index = {
         "labels": labels,
         "offered": min(MOST_LABELS, len(labels)),
-        "done": [_encode_done(scene, card, number) for scene, card in zip(done, cards, strict=True)],
+        "done": [_encode_done(scene, card, number) for scene, card in drawn],
         "lost": [
             [scene.scene_id, _encode_title(scene), str(scene.row["status"]), scene.reason, page]
             for scene, page in zip(lost, pages, strict=True)
         ],
     }
     text = json.dumps(index, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-    path.write_text(f"window.TABLEVERSE = {text};\n".replace("<", "\\u003c"), encoding="ascii")
+    return f"window.TABLEVERSE = {text};\n".replace("<", "\\u003c").encode("ascii")
 
 
 def _encode_done(scene: SceneRecord, card: SceneCard, number: dict[str, int]) -> list[Any]:

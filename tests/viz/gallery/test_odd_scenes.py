@@ -14,6 +14,7 @@ from PIL import Image
 
 from schemas.tables import TABLES
 from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.viz.gallery.drawing import DrawingOptions
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tableverse_factory.viz.gallery.pages import Site
 from tableverse_factory.viz.gallery.pictures import write_pictures
@@ -103,10 +104,8 @@ def test_numbers_that_are_none_and_half_characters_are_written_all_the_same(tmp_
 def test_a_page_that_cannot_be_made_says_so_in_its_place(tmp_path):
     out = write_dataset(tmp_path / "out", {"scene": LIGHT}, [])
     row = open_dataset(out).scenes.to_table().drop_columns(["drift_m"]).to_pylist()[0]
-    for name in ("scenes", "pictures"):
-        (tmp_path / name).mkdir()
     order = SceneJob(SceneRecord(row, (), (), ()), render=False, before="", after="", page=1)
-    card = write_scene(Site(tmp_path, "out", str(out), 1, 0, 0), 0, None, order)
+    card = write_scene(Site(tmp_path, "out", str(out), 1, 0, 0), DrawingOptions(0, None, None, ""), order)
     assert "drift_m" in card.problem
     page = text_of(tmp_path / "scenes" / "scene.html")
     assert "This scene could not be shown: UndefinedError: " in page
