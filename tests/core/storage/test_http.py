@@ -139,7 +139,7 @@ def test_what_is_not_finished_is_read_as_far_as_it_is(tmp_path):
         opened = open_dataset(server.address)
         assert opened.shards == (0, 2)
         assert opened.scenes.count_rows() == 4
-        with pytest.raises(InputError, match="s-1-0 is planned, and its shard is not committed yet"):
+        with pytest.raises(InputError, match="s-1-0 is planned and not there yet"):
             opened.scene("s-1-0")
         (out / "plan.parquet").unlink()
         with pytest.raises(StoreError, match=r"plan\.parquet is missing: HTTP lists no folders"):
