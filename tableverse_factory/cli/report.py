@@ -1,8 +1,11 @@
 """`tableverse report`: a gallery of a dataset as static HTML."""
 
+import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
@@ -46,10 +49,25 @@ def report(
     dataset = open_dataset(out)
     check_robot_option(out, robot, needed=False)
     dest, processes = dest or choose_destination(out, "gallery"), jobs or count_available_cpus()
-    with count_progress("scenes") as count:
+    with _unwind_on_sigterm(), count_progress("scenes") as count:
         index = write_gallery(dataset, dest, processes, count.update, renders=renders, films=films, robot=robot)
     _report_damage(out, dataset.shards)
     print(index)
+
+
+@contextmanager
+def _unwind_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM unwind the block as Ctrl-C does, once, so that the index shows what is drawn; it exits with 143."""
+
+    def leave(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # a second one would interrupt that
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _report_damage(out: str, shards: Iterable[int]) -> None:
