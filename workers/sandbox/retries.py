@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from schemas.outcome import Allowance, Failed
 from schemas.work import ScenePart, StageChain, StageChainReport, StageReport
 
-MAX_KILLS = 3  # times that a child may be killed from outside during one chain before the chain fails
+MAX_KILLS = 5  # times that a child may be killed from outside during one chain before the chain fails
 
 
 @dataclass(slots=True)
