@@ -10,6 +10,8 @@ from tableverse_factory.cli.options import AsJson
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.errors import ConfigError
 
+_MAX_PAYLOAD_BYTES = 10**9
+
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.factory import FactoryRun
     from tableverse_factory.evaluation.bench.query import QueryTimes
@@ -35,7 +37,7 @@ def bench_factory(
 
     from tableverse_factory.evaluation.bench.factory import bench_factory, compare_runs
 
-    asked = sorted({int(size) for size in sizes.split(",")})
+    asked = _parse_scenes(sizes)
     runs = []
     show = partial(print, end=" … ", file=sys.stderr, flush=True)
     for run in bench_factory(asked, workers, burning, _parse_size(payload), show):
@@ -66,12 +68,20 @@ def _show_runs(runs: list["FactoryRun"]) -> None:
     print("driver ms, KB: its CPU time, and what it reads, writes and exchanges with actors per scene while they flow")
 
 
+def _parse_scenes(text: str) -> list[int]:
+    """Parse numbers of scenes such as `300,1000`."""
+    if not re.fullmatch(r"[1-9]\d{0,6}(,[1-9]\d{0,6})*", text):
+        raise ConfigError(f"--sizes {text[:80]!r}: give numbers of scenes such as 300,1000")
+    return sorted(set(map(int, text.split(","))))
+
+
 def _parse_size(text: str) -> int:
-    """Parse a number of bytes such as `7MB`."""
-    match = re.fullmatch(r"(\d{1,9})\s*(k|M|G)?B?", text)
-    if match is None:
-        raise ConfigError(f"--payload {text[:80]!r}: give a number of bytes such as 7MB")
-    return int(match[1]) * {None: 1, "k": 10**3, "M": 10**6, "G": 10**9}[match[2]]
+    """Parse a number of bytes such as `7MB`, at most 1 GB."""
+    match = re.fullmatch(r"(\d{1,9})\s*([kM])?B?", text)
+    size = int(match[1]) * {None: 1, "k": 10**3, "M": 10**6}[match[2]] if match else -1
+    if not 0 <= size <= _MAX_PAYLOAD_BYTES:
+        raise ConfigError(f"--payload {text[:80]!r}: give a whole number of bytes up to 1000MB, such as 7MB")
+    return size
 
 
 def bench_query(

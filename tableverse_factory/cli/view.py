@@ -53,7 +53,7 @@ def view(
     scenes = SceneCache(load_scene_file(Path(out)) if single else open_dataset(out))
     first = scene_id or scenes.first()
     if first is None:
-        raise InputError(f"{out}: no scene is committed yet")
+        raise InputError(f"{out}: no scene is done yet")
     if single or scenes.find_dropped_row(first) is None:
         scenes.open(first)
     ended = threading.Event()

@@ -290,7 +290,7 @@ class Dataset:
 
     def _describe_unknown(self, scene_id: str) -> str:
         ids = list(self._shard_by_scene)
-        if scene_id in self._shard_by_scene:
+        if scene_id in self._shard_by_scene or scene_id in (self._read_plan() or ()):
             return f"scene {scene_id} is planned and not there yet"
         started = [known for known in ids if scene_id and known.startswith(scene_id)]
         nearest = started[:3] or difflib.get_close_matches(scene_id[:100], ids[:20_000], n=3, cutoff=0.5)

@@ -154,9 +154,12 @@ class Driver:
                     self._advance(self._running.pop(answer.rank), answer)
 
     def _publish(self, call: CommitCall, staged: StagedShard) -> None:
-        for rank in self._ledger.publish(call, staged):
-            self._todo.append(rank)
-        if not staged.damaged and not self._spec.keep:
+        again = self._ledger.publish(call, staged)
+        if again:
+            self._todo += again
+            self._tally.before -= len(again)  # they were accounted for, in this run or before
+            self._display.note(self._ledger.damaged[-1])
+        elif not self._spec.keep:
             self._checkpoints.delete(call.shard)
 
     def _settle_answers(self, answers: Sequence[JobResult]) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.dataset.journals import WORK
+from tableverse_factory.dataset.journals import WORK, journal_path, read_journal
 from tests.helpers.builds import Silent, build, digests, finish, kill, request, start, wait_until, write_manifest
 from workers.run import run_build
 
@@ -45,6 +45,8 @@ def test_scenes_are_there_before_their_shard_is(whole, tmp_path):
     assert [row["tar_offset"] for row in rows[4:]] == [-1, -1]
     assert growing.objects.count_rows() == final.objects.filter(pc.field("scene_id") < "scene_006").count_rows()
     with pytest.raises(InputError, match="no scene"):
+        growing.scene("scene_099")
+    with pytest.raises(InputError, match="scene_009 is planned and not there yet"):
         growing.scene("scene_009")
 
 
@@ -62,7 +64,7 @@ def test_a_scene_that_moves_to_its_shard_while_it_is_looked_at_is_found_there(wh
 def test_what_is_done_can_be_read_after_any_stop(tmp_path, how):
     manifest = write_manifest(tmp_path / "m.parquet", ["slow_0.1"] * 30)
     process = start(manifest, tmp_path / "out", shard_size=64)
-    wait_until(lambda: (tmp_path / "out" / WORK / "shard-00000.journal").exists())
+    wait_until(lambda: read_journal(journal_path(tmp_path / "out", 0)).results)
     if how == signal.SIGKILL:
         kill(process)
     else:
@@ -89,7 +91,10 @@ def test_parts_that_a_loss_of_power_took_are_made_again(whole, tmp_path, damage)
         data[len(data) // 2] ^= 1
         parts.write_bytes(data if damage == "flipped" else data[: len(data) // 2])
     assert open_dataset(out).scenes.count_rows() >= 4, "the others are still read"
-    build(manifest, out)
+    display = Silent()
+    summary = run_build(request(manifest, out), display)
+    assert summary.tally.accounted == len(NAMES), "no scene counts twice"
+    assert [note for note in display.notes if "finished scenes do not read" in note]
     assert digests(out) == digests(finished)
 
 
