@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.optimize import minimize
 
-from schemas.geometry import Matrix3, Pose, Vector3
+from schemas.geometry import Matrix3, Pose, Quaternion, Vector3
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
@@ -12,7 +12,7 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_from_matrix,
     rotation_matrix,
 )
-from tableverse_factory.stages.place.completion.box import MIN_SIDE_M, SolidBox
+from tableverse_factory.stages.place.completion.box import MAX_SIDE_M, MIN_SIDE_M, SolidBox
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -21,6 +21,7 @@ AGREE_COS = 0.965
 MIN_SECOND_SHARE = 0.08
 THICKNESS_M = 0.008  # initial length of a hidden side [m]
 SINK_WEIGHT = 0.2  # weight of corners below the support, against the misfit of rays
+MAX_SINK_M = 0.05  # from which a corner counts no more [m]
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
@@ -35,28 +36,32 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
     middle = (low + high) / 2 - toward * (size - (high - low)) / 2
     center = rotation @ middle
     base = quaternion_from_matrix(rotation)
+    base_axes = rotation_matrix(base)
     start = np.concatenate([center, np.log(size), np.zeros(3)])
     steps = np.array([0.005, 0.005, 0.005, 0.08, 0.08, 0.08, 0.05, 0.05, 0.05])
 
     def cost(x: Float64[np.ndarray, "9"]) -> float:
-        pose, half = _decode_box(x, base)
-        heights = pose.position[2] + (_CORNERS * half) @ rotation_matrix(pose.quaternion_wxyz)[2]
-        sunk = np.clip(view.support_z - heights, 0.0, 0.05).mean()
-        return compute_misfit(rays, intersect_box(rays, pose, half)) + SINK_WEIGHT * float(sunk)
+        half, axes = _decode_half_size(x), base_axes @ rotation_matrix(_decode_turn(x))
+        heights = x[2] + _CORNERS @ (half * axes[2])
+        sunk = np.minimum(np.maximum(view.support_z - heights, 0.0), MAX_SINK_M).mean()
+        return compute_misfit(rays, intersect_box(rays, x[:3], axes, half)) + SINK_WEIGHT * float(sunk)
 
     for scale, calls in ((1.0, 300), (0.4, 200)):
         simplex = np.vstack([start, start + np.diag(scale * steps)])
         options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 1e-6}
         start = minimize(cost, start, method="Nelder-Mead", options=options).x
-    pose, half = _decode_box(start, base)
-    return SolidBox(pose, half, cost(start))
+    turned = normalize_quaternion(multiply_quaternions(base, _decode_turn(start)))
+    return SolidBox(Pose(start[:3], turned), _decode_half_size(start), cost(start))
 
 
-def _decode_box(x: Float64[np.ndarray, "9"], base: Float64[np.ndarray, "4"]) -> tuple[Pose, Vector3]:
-    """Decode centre, logarithms of the sides and a small turn to a pose and half sizes."""
-    turn = normalize_quaternion(np.concatenate([[1.0], x[6:9] / 2]))
-    half = np.clip(np.exp(x[3:6]), MIN_SIDE_M, 2.0) / 2
-    return Pose(x[:3], normalize_quaternion(multiply_quaternions(base, turn))), half
+def _decode_turn(x: Float64[np.ndarray, "9"]) -> Quaternion:
+    """Decode the last three values, a small rotation vector, to a turn of the initial axes."""
+    return normalize_quaternion(np.concatenate([[1.0], x[6:9] / 2]))
+
+
+def _decode_half_size(x: Float64[np.ndarray, "9"]) -> Vector3:
+    """Decode the logarithms of the sides, which follow the centre."""
+    return np.minimum(np.maximum(np.exp(x[3:6]), MIN_SIDE_M), MAX_SIDE_M) / 2
 
 
 def _estimate_axes(view: ObjectView) -> Matrix3:
