@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
@@ -13,7 +14,7 @@ from tableverse_factory.stages.place.completion.extend_to_floor import extend_to
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
-from tableverse_factory.stages.place.completion.voxel_carving import carve_columns, carve_half_turn
+from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -23,6 +24,7 @@ HOLLOW_BONUS_M = 0.0012  # of a cavity seen [m]: a thin wall in noise must not l
 UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedom alone costs more is not tried
 
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
+SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
 
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
@@ -37,7 +39,7 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
         if best is not None and best[0] < freedom + UNAVOIDABLE_M:
             continue
         try:
-            shape = make(view, rays)
+            shape = make(view, rays, np.inf if best is None else best[0] - freedom)
         except GeometryError as error:
             reasons.append(str(error))
             continue
@@ -55,34 +57,43 @@ def _discount_box(box: SolidBox) -> Shape:
     return build_box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
 
 
-def _make_revolution(view: ObjectView, rays: RaySample) -> Shape | None:
+def _make_revolution(view: ObjectView, rays: RaySample, limit: float) -> Shape | None:  # noqa: ARG001
     if (fit := fit_revolution(view, rays)) is None:
         return None
     mesh, pose, cost, hollow = fit
     return mesh, pose, cost - (HOLLOW_BONUS_M if hollow else 0.0)
 
 
-def _make_half_turn(view: ObjectView, rays: RaySample) -> Shape:
-    mesh, pose = carve_half_turn(view)
+def _make_half_turn(view: ObjectView, rays: RaySample, limit: float) -> Shape | None:
+    if (shape := _simplify_carved(carve_half_turn(view), rays, limit)) is None:
+        return None
+    mesh, pose, misfit = shape
     try:
         hull = float(ConvexHull(mesh.vertices).area)
     except QhullError as error:
         raise GeometryError("what free space leaves is flat") from error
     raggedness = RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)  # torn by free space at an occluder
-    return mesh, pose, compute_mesh_misfit(rays, mesh, pose) + raggedness
+    return mesh, pose, misfit + raggedness
 
 
-def _make_columns(view: ObjectView, rays: RaySample) -> Shape:
-    mesh, pose = carve_columns(view)
-    return mesh, pose, compute_mesh_misfit(rays, mesh, pose)
+def _make_columns(view: ObjectView, rays: RaySample, limit: float) -> Shape | None:
+    return _simplify_carved(carve_columns(view), rays, limit)
+
+
+def _simplify_carved(carved: CarvedSurface, rays: RaySample, limit: float) -> Shape | None:
+    """Simplify a carved surface, which costs the most of it, unless as it is it cannot come below `limit` [m]."""
+    if compute_mesh_misfit(rays, carved.mesh, carved.pose) >= limit + SIMPLER_M:
+        return None
+    mesh = carved.simplify()
+    return mesh, carved.pose, compute_mesh_misfit(rays, mesh, carved.pose)
 
 
 # Name in the dataset, cost of its freedom to follow the picture [m] and best fit of each kind, in the order of trial:
-# the fewer freedoms a kind has, the earlier and the cheaper.
-KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Shape | None]], ...] = (
-    ("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
+# the fewer freedoms a kind has, the earlier and the cheaper. A fit may be None that cannot cost less than a limit [m].
+KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample, float], Shape | None]], ...] = (
+    ("carved/box", 0.0, lambda view, rays, _: _discount_box(fit_upright_box(view, rays))),
     ("carved/revolution", 1e-4, _make_revolution),
-    ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
+    ("carved/leaning_box", 3e-4, lambda view, rays, _: _discount_box(fit_leaning_box(view, rays))),
     ("carved/half_turn", 5e-4, _make_half_turn),
     ("carved/columns", 2.0e-3, _make_columns),
 )

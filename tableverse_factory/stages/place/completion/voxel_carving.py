@@ -4,13 +4,15 @@ Two priors: columns from the observed top down to the support, and a half turn a
 look much the same from behind). Both are carved by all free space.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import minimize
 
-from schemas.geometry import Pose, TriangleMesh, Vector3
+from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.planes import Rectangle, fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
@@ -40,6 +42,7 @@ CELLS_UP = 30
 PIXELS_A_CELL = 1.5
 EMPTY_M = 0.0005
 TORN_SHARE = 0.1  # least volume share of a second part that counts
+CRUMB_SHARE = 0.1  # number of cells of a crumb over that of the largest part
 MIN_STEP_M = 0.0008
 SMOOTHING_CELLS = 0.8
 MAX_FACES = 3000
@@ -48,7 +51,30 @@ WORST_TURN_M = 0.01
 SLACK = 0.05  # weight of distance from free space against depth in it, in the search for the axis of the half turn
 
 
-def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
+@dataclass(frozen=True, slots=True, eq=False)
+class CarvedSurface(Frozen):
+    """A surface as free space left it, its heights stretched: many triangles, and maybe more than one part."""
+
+    stretched: TriangleMesh
+    stretch: float
+    cell: float  # of the grid that it was carved in [m]
+    pose: Pose
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        """The whole surface in its own frame."""
+        return self._shrink(self.stretched)
+
+    def simplify(self) -> TriangleMesh:
+        """Reduce the largest part to at most `MAX_FACES`."""
+        solid = find_largest_part(to_manifold(self.stretched))
+        return self._shrink(from_manifold(simplify_solid(solid, MAX_FACES, 0.08 * self.cell)))
+
+    def _shrink(self, mesh: TriangleMesh) -> TriangleMesh:
+        return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, self.stretch]), mesh.faces)
+
+
+def carve_columns(view: ObjectView) -> CarvedSurface:
     """Carve the solid below the observed points by free space, down to the support or its underside."""
     rectangle = fit_min_rectangle(view.points[:, :2])
     pose, half = _place_frame(view, rectangle, rectangle.center)
@@ -58,11 +84,10 @@ def carve_columns(view: ObjectView) -> tuple[TriangleMesh, Pose]:
     field = np.minimum(_compute_column_field(view, pose, grid, stretch, free), free)
     if _is_torn(field):
         field = np.minimum(_compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
-    mesh = _extract_mesh(field, grid)
-    return TriangleMesh(mesh.vertices / np.array([1.0, 1.0, stretch]), mesh.faces), pose
+    return CarvedSurface(extract_surface(_drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 
-def carve_half_turn(view: ObjectView) -> tuple[TriangleMesh, Pose]:
+def carve_half_turn(view: ObjectView) -> CarvedSurface:
     """Carve the solid by free space, and by the same turned by half about a vertical axis for the hidden side."""
     center = _find_turn_center(view)
     turned = 2 * center - view.points[:, :2]
@@ -80,7 +105,8 @@ def carve_half_turn(view: ObjectView) -> tuple[TriangleMesh, Pose]:
     )
     reach = 2 * grid.cell
     field = np.clip(np.minimum(free.reshape(grid.shape), bounds), -reach, reach)
-    return _extract_mesh(ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest"), grid), pose
+    smooth = ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest")
+    return CarvedSurface(extract_surface(_drop_crumbs(smooth), grid), 1.0, cell, pose)
 
 
 def _place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndarray, "2"]) -> tuple[Pose, Vector3]:
@@ -90,9 +116,14 @@ def _place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndar
     return Pose(np.array([*center, view.support_z + half[2]]), quaternion_about_z(rectangle.yaw)), half
 
 
-def _extract_mesh(field: Field, grid: VoxelGrid) -> TriangleMesh:
-    solid = find_largest_part(to_manifold(extract_surface(field, grid)))
-    return from_manifold(simplify_solid(solid, MAX_FACES, 0.08 * grid.cell))
+def _drop_crumbs(field: Field) -> Field:
+    """Drop the small parts beside the solid, which cost more as surfaces than as cells; what is left is unchanged."""
+    labels, count = ndimage.label(field > 0.0, structure=np.ones((3, 3, 3)))  # parts that share no cube of the surface
+    if count < 2:
+        return field
+    sizes = np.bincount(labels.ravel())[1:]
+    crumbs = np.concatenate([[False], sizes < CRUMB_SHARE * sizes.max()])
+    return np.where(crumbs[labels], -np.abs(field), field)
 
 
 def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
