@@ -10,6 +10,7 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NEIGHBOURS = 5
 SOURCES = 8000
+LEAF_SIZE = 64  # points in a leaf of the tree: in seven dimensions half the time of the default
 NORMAL_M = 0.03  # half the extra distance of a surface that faces the opposite way [m]
 COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
 # Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame.
@@ -61,7 +62,7 @@ def _stack_features(points: Points, normals: Points, offset: float) -> Float64[n
 
 def _mix_colors(sources: Float64[np.ndarray, "n 7"], colors: Colors, targets: Float64[np.ndarray, "m 7"]) -> Colors:
     count = min(NEIGHBOURS, len(sources))
-    distance, index = cKDTree(sources).query(targets, k=count)
+    distance, index = cKDTree(sources, LEAF_SIZE).query(targets, k=count)
     distance, index = np.reshape(distance, (-1, count)), np.reshape(index, (-1, count))
     weight = 1.0 / (distance**2 + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)

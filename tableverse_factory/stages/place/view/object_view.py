@@ -17,6 +17,7 @@ from tableverse_factory.stages.place.view.object_pixels import (
     compute_pixel_normals,
     filter_depth,
     find_background_bleed,
+    find_bounds,
     find_denoised_pixels,
     find_free_pixels,
 )
@@ -162,11 +163,11 @@ def _project_columns(points: Points, to_camera: Pose, camera: Camera) -> tuple[D
 
 
 def _find_window(own: Mask) -> tuple[slice, slice]:
-    rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
-    if len(rows) == 0:
+    if not own.any():
         raise GeometryError("no pixel of the picture belongs to the object")
     height, width = own.shape
+    rows, columns = find_bounds(own)
     return (
-        slice(max(int(rows[0]) - WINDOW_MARGIN_PX, 0), min(int(rows[-1]) + WINDOW_MARGIN_PX + 1, height)),
-        slice(max(int(columns[0]) - WINDOW_MARGIN_PX, 0), min(int(columns[-1]) + WINDOW_MARGIN_PX + 1, width)),
+        slice(max(rows.start - WINDOW_MARGIN_PX, 0), min(rows.stop + WINDOW_MARGIN_PX, height)),
+        slice(max(columns.start - WINDOW_MARGIN_PX, 0), min(columns.stop + WINDOW_MARGIN_PX, width)),
     )

@@ -49,7 +49,10 @@ def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
             leaning[item.object_id] = _is_long(cloud)
             heights[item.object_id] = CONTAINER_FLOOR_M if leaning[item.object_id] else _guess_bottom(cloud)
             continue
-        below = {name: _find_top_below(cloud, other) for name, other in clouds.items() if name != item.object_id}
+        lowest = float(np.quantile(cloud[:, 2], 0.02))
+        below = {
+            name: _find_top_below(cloud, lowest, other) for name, other in clouds.items() if name != item.object_id
+        }
         carrier = max(below, key=lambda name: (below[name], name), default=None)
         if carrier is not None and below[carrier] > 0.0:
             heights[item.object_id] = below[carrier]
@@ -60,15 +63,16 @@ def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
     }
 
 
-def _find_top_below(own: Points, other: Points) -> float:
-    """Find the height of `other` where `own` stands on it [m], else 0.
+def _find_top_below(own: Points, lowest: float, other: Points) -> float:
+    """Find the height of `other` where `own`, whose foot is at the height `lowest`, stands on it [m], else 0.
 
     It is the support where its top, beside the footprint of `own`, lies about at the lowest points of `own`, and some
     of that footprint lies within its outline.
     """
-    lowest = float(np.quantile(own[:, 2], 0.02))
-    low, high = own[:, :2].min(axis=0) - NEAR_M, own[:, :2].max(axis=0) + NEAR_M
-    under = other[((other[:, :2] >= low) & (other[:, :2] <= high)).all(axis=1)]
+    within = np.ones(len(other), dtype=bool)
+    for k in range(2):  # an axis at a time: numpy is slow on rows of two
+        within &= (other[:, k] >= own[:, k].min() - NEAR_M) & (other[:, k] <= own[:, k].max() + NEAR_M)
+    under = other[within]
     if len(under) < MIN_POINTS:
         return 0.0
     top = float(np.quantile(under[:, 2], 0.9))
