@@ -83,14 +83,14 @@ def _refine_axis(points: Points, normals: Points, axis: Pose) -> tuple[Pose, flo
     side = np.linalg.norm(turned[:, :2], axis=1) > 0.5
     if side.sum() < 50:
         return axis, 0.0
-    local, turned = local[side], turned[side]
-    low, high = local[:, 2].min(), local[:, 2].max()
-    slices = np.minimum(((local[:, 2] - low) / max(high - low, 1e-6) * SLICES).astype(int), SLICES - 1)
+    (x, y, z), (towards_x, towards_y, _) = np.ascontiguousarray(local[side].T), np.ascontiguousarray(turned[side].T)
+    low, high = z.min(), z.max()
+    slices = np.minimum(((z - low) / max(high - low, 1e-6) * SLICES).astype(int), SLICES - 1)
 
     def spread(center: Float64[np.ndarray, "2"]) -> float:
-        offset = local[:, :2] - center
-        distance = np.linalg.norm(offset, axis=1)
-        outward = (offset * turned[:, :2]).sum(axis=1) > 0.0
+        across_x, across_y = x - center[0], y - center[1]
+        distance = np.sqrt(across_x**2 + across_y**2)
+        outward = across_x * towards_x + across_y * towards_y > 0.0
         group = 2 * slices + outward
         counts = np.maximum(np.bincount(group, minlength=2 * SLICES), 1)
         means = np.bincount(group, distance, minlength=2 * SLICES) / counts
