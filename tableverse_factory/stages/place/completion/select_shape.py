@@ -1,8 +1,8 @@
 """The mesh model `carved`: the simplest of five kinds of shape that explains the picture."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
-import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
@@ -30,70 +30,107 @@ SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible h
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
 
 
+class Draft(NamedTuple):
+    """A fit of one kind: the least cost that its shape can have [m], and how to make the shape."""
+
+    least: float
+    finish: Callable[[], Shape]
+
+
+class _Search:
+    """Drafts of several kinds, which are finished as late as possible, and the best shape so far."""
+
+    def __init__(self) -> None:
+        self.best: tuple[float, str, TriangleMesh, Pose] | None = None
+        self.reasons: list[str] = []
+        self._drafts: list[tuple[float, float, str, Draft]] = []
+
+    def add(self, method: str, freedom: float, draft: Draft) -> None:
+        """Add a draft of a kind whose freedom to follow the picture costs that much [m]."""
+        self._drafts.append((draft.least + freedom, freedom, method, draft))
+
+    def is_below(self, cost: float) -> bool:
+        """Whether the best shape costs less [m]; only drafts that may do so are finished."""
+        if any(least < cost for least, *_ in self._drafts):
+            self.finish()
+        return self.best is not None and self.best[0] < cost
+
+    def finish(self) -> None:
+        """Finish the drafts that may be the best."""
+        for least, freedom, method, draft in sorted(self._drafts, key=lambda entry: entry[0]):
+            if self.best is not None and self.best[0] <= least:
+                break
+            try:
+                mesh, pose, cost = draft.finish()
+            except GeometryError as error:
+                self.reasons.append(str(error))
+                continue
+            if self.best is None or cost + freedom < self.best[0]:
+                self.best = (cost + freedom, method, mesh, pose)
+        self._drafts = []
+
+
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
     """Fit boxes, a surface of revolution, a half-turn symmetric solid and columns, and select the best."""
     rays = sample_rays(view)
-    best: tuple[float, str, TriangleMesh, Pose] | None = None
-    reasons: list[str] = []
+    search = _Search()
     for method, freedom, make in KINDS:
-        if best is not None and best[0] < freedom + UNAVOIDABLE_M:
+        if search.is_below(freedom + UNAVOIDABLE_M):
             continue
         try:
-            shape = make(view, rays, np.inf if best is None else best[0] - freedom)
+            draft = make(view, rays)
         except GeometryError as error:
-            reasons.append(str(error))
+            search.reasons.append(str(error))
             continue
-        if shape is not None and (best is None or shape[2] + freedom < best[0]):
-            best = (shape[2] + freedom, method, shape[0], shape[1])
-    if best is None:
-        raise GeometryError("; ".join(dict.fromkeys(reasons)) or "no shape explains the points")
-    _, best_method, mesh, pose = best
+        if draft is not None:
+            search.add(method, freedom, draft)
+    search.finish()
+    if search.best is None:
+        raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
+    _, best_method, mesh, pose = search.best
     if view.support.leaning:
         mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
     return Completion(mesh, pose, best_method)
 
 
-def _discount_box(box: SolidBox) -> Shape:
-    return build_box_mesh(box), box.pose, box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
+def _discount_box(box: SolidBox) -> Draft:
+    cost = box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
+    return Draft(cost, lambda: (build_box_mesh(box), box.pose, cost))
 
 
-def _make_revolution(view: ObjectView, rays: RaySample, limit: float) -> Shape | None:  # noqa: ARG001
+def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
     if (fit := fit_revolution(view, rays)) is None:
         return None
-    mesh, pose, cost, hollow = fit
-    return mesh, pose, cost - (HOLLOW_BONUS_M if hollow else 0.0)
+    mesh, pose, misfit, hollow = fit
+    cost = misfit - (HOLLOW_BONUS_M if hollow else 0.0)
+    return Draft(cost, lambda: (mesh, pose, cost))
 
 
-def _make_half_turn(view: ObjectView, rays: RaySample, limit: float) -> Shape | None:
-    if (shape := _simplify_carved(carve_half_turn(view), rays, limit)) is None:
-        return None
-    mesh, pose, misfit = shape
+def _draft_carving(carved: CarvedSurface, rays: RaySample, price: Callable[[TriangleMesh], float]) -> Draft:
+    """Draft a carved shape, of which simplification costs the most: as it is it tells how well it can fit."""
+
+    def finish() -> Shape:
+        mesh = carved.simplify()
+        return mesh, carved.pose, compute_mesh_misfit(rays, mesh, carved.pose) + price(mesh)
+
+    return Draft(compute_mesh_misfit(rays, carved.mesh, carved.pose) - SIMPLER_M, finish)
+
+
+def _price_raggedness(mesh: TriangleMesh) -> float:
+    """Price a surface torn by free space at an occluder [m]."""
     try:
         hull = float(ConvexHull(mesh.vertices).area)
     except QhullError as error:
         raise GeometryError("what free space leaves is flat") from error
-    raggedness = RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)  # torn by free space at an occluder
-    return mesh, pose, misfit + raggedness
-
-
-def _make_columns(view: ObjectView, rays: RaySample, limit: float) -> Shape | None:
-    return _simplify_carved(carve_columns(view), rays, limit)
-
-
-def _simplify_carved(carved: CarvedSurface, rays: RaySample, limit: float) -> Shape | None:
-    """Simplify a carved surface, which costs the most of it, unless as it is it cannot come below `limit` [m]."""
-    if compute_mesh_misfit(rays, carved.mesh, carved.pose) >= limit + SIMPLER_M:
-        return None
-    mesh = carved.simplify()
-    return mesh, carved.pose, compute_mesh_misfit(rays, mesh, carved.pose)
+    return RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)
 
 
 # Name in the dataset, cost of its freedom to follow the picture [m] and best fit of each kind, in the order of trial:
-# the fewer freedoms a kind has, the earlier and the cheaper. A fit may be None that cannot cost less than a limit [m].
-KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample, float], Shape | None]], ...] = (
-    ("carved/box", 0.0, lambda view, rays, _: _discount_box(fit_upright_box(view, rays))),
-    ("carved/revolution", 1e-4, _make_revolution),
-    ("carved/leaning_box", 3e-4, lambda view, rays, _: _discount_box(fit_leaning_box(view, rays))),
-    ("carved/half_turn", 5e-4, _make_half_turn),
-    ("carved/columns", 2.0e-3, _make_columns),
+# the fewer freedoms a kind has, the earlier and the cheaper.
+KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
+    ("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
+    ("carved/revolution", 1e-4, _draft_revolution),
+    ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
+    ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    ("carved/columns", 2.0e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )
