@@ -43,7 +43,6 @@ def checkpoint_exported_scenes(
             known = records.index(shard) if chosen else {}
             named = [i for i, name in names.items() if shard in committed and i not in newer and name not in known]
             list(threads.map(partial(_write_tombstone, records, names), named))
-    records.close()
 
 
 def _write_tombstone(records: CheckpointStore, names: Mapping[str, str], scene_id: str) -> None:

@@ -145,10 +145,6 @@ class CheckpointStore:
             elif parse_stage(name) in stages:
                 remove(folder / name)
 
-    def close(self) -> None:
-        """Close the open packs."""
-        self._packs.close()
-
     def _read_with_parents(self, location: str, left: int) -> StoredRecord:
         """Read a record; `left` bounds the parents of damaged checkpoints, which could refer to each other."""
         message = self._read_message(location)

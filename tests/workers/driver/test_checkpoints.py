@@ -42,7 +42,6 @@ def test_an_unreadable_checkpoint_moves_the_scene_back(tmp_path, names):
     for name in names[:2]:
         store = CheckpointStore(tmp_path / ".stages")
         store.write(name, b"output")
-        store.close()
     index = CheckpointIndex(make_spec(tmp_path, make_rows(1)))
     scene = index.start(0)
     assert scene.position == 2
