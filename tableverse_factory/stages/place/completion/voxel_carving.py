@@ -84,7 +84,7 @@ def carve_columns(view: ObjectView) -> CarvedSurface:
     field = np.minimum(_compute_column_field(view, pose, grid, stretch, free), free)
     if _is_torn(field):
         field = np.minimum(_compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
-    return CarvedSurface(extract_surface(_drop_crumbs(field), grid), stretch, grid.cell, pose)
+    return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 
 def carve_half_turn(view: ObjectView) -> CarvedSurface:
@@ -106,7 +106,7 @@ def carve_half_turn(view: ObjectView) -> CarvedSurface:
     reach = 2 * grid.cell
     field = np.clip(np.minimum(free.reshape(grid.shape), bounds), -reach, reach)
     smooth = ndimage.gaussian_filter(field, SMOOTHING_CELLS, mode="nearest")
-    return CarvedSurface(extract_surface(_drop_crumbs(smooth), grid), 1.0, cell, pose)
+    return CarvedSurface(extract_surface(drop_crumbs(smooth), grid), 1.0, cell, pose)
 
 
 def _place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndarray, "2"]) -> tuple[Pose, Vector3]:
@@ -116,7 +116,7 @@ def _place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndar
     return Pose(np.array([*center, view.support_z + half[2]]), quaternion_about_z(rectangle.yaw)), half
 
 
-def _drop_crumbs(field: Field) -> Field:
+def drop_crumbs(field: Field) -> Field:
     """Drop the small parts beside the solid, which cost more as surfaces than as cells; what is left is unchanged."""
     labels, count = ndimage.label(field > 0.0, structure=np.ones((3, 3, 3)))  # parts that share no cube of the surface
     if count < 2:

@@ -5,7 +5,7 @@ import pytest
 
 from schemas.geometry import Camera
 from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
-from tableverse_factory.stages.place.view.object_pixels import find_foreign_colors
+from tableverse_factory.stages.place.view.object_pixels import NEAR, compute_color_share, find_foreign_colors
 
 RED, WOOD, BLACK = (190, 40, 45), (150, 115, 80), (12, 12, 14)
 CAMERA = Camera(300.0, 300.0, 40.0, 30.0, 80, 60)
@@ -68,3 +68,13 @@ def test_a_ramp_to_what_lies_behind_is_found_and_a_face_is_not():
     assert not found[22:38, 22:48].any()
     depth[20:40, 52:60] = 0.8 + 0.0012 * np.arange(8)
     assert not find_depth_ramps(depth, own, own, CAMERA)[22:38].any()
+
+
+def test_shares_of_alike_colours_are_those_of_all_pairs():
+    rng = np.random.default_rng(5)
+    colors, known = rng.uniform(-40.0, 40.0, (700, 3)), rng.uniform(-40.0, 40.0, (350, 3))
+    alike = np.linalg.norm(colors[:, None] - known, axis=2) <= NEAR
+    assert alike.any()
+    np.testing.assert_array_equal(compute_color_share(colors, known), alike.mean(axis=1))
+    assert compute_color_share(colors[:0], known).shape == (0,)
+    np.testing.assert_array_equal(compute_color_share(colors, known[:0]), np.zeros(700))

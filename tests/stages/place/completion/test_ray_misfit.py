@@ -1,0 +1,59 @@
+"""Rays against boxes: analytic intersections agree with ray casting, and misfits with what was rendered."""
+
+import numpy as np
+import pytest
+
+from schemas.geometry import Pose
+from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_matrix
+from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh
+from tableverse_factory.stages.place.completion.ray_misfit import (
+    MISS_M,
+    WORST_M,
+    RaySample,
+    compute_mesh_misfit,
+    compute_misfit,
+    intersect_box,
+)
+
+
+def make_rays(rng, own=40, past=60):
+    """Rays from a camera above the origin: the object's first, then those that see the background behind it."""
+    directions = np.vstack([rng.uniform(-0.15, 0.15, (2, own + past)), -np.ones(own + past)])
+    end = np.concatenate([rng.uniform(0.8, 1.0, own), np.full(past, 1.2)])
+    return RaySample(np.array([0.0, 0.0, 1.0]), directions, end, rng.uniform(0.3, 1.0, own))
+
+
+def make_box(rng):
+    pose = Pose(rng.uniform(-0.02, 0.02, 3), normalize_quaternion(rng.normal(size=4)))
+    return SolidBox(pose, rng.uniform(0.02, 0.1, 3), 0.0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_box_has_the_misfit_of_its_mesh(seed):
+    rng = np.random.default_rng(seed)
+    rays, box = make_rays(rng), make_box(rng)
+    hit = intersect_box(rays, box.pose.position, rotation_matrix(box.pose.quaternion_wxyz), box.half_size)
+    assert (hit < MISS_M).any()
+    assert (hit == MISS_M).any()
+    assert compute_misfit(rays, hit) == pytest.approx(
+        compute_mesh_misfit(rays, build_box_mesh(box), box.pose), abs=1e-6
+    )
+
+
+def test_rays_along_the_faces_of_a_box_meet_it():
+    rays = RaySample(np.array([0.0, 0.0, 1.0]), np.array([[0.0], [0.0], [-1.0]]), np.array([0.9]), np.array([1.0]))
+    hit = intersect_box(rays, np.zeros(3), np.eye(3), np.full(3, 0.1))
+    assert hit == pytest.approx([0.9])
+    assert compute_misfit(rays, hit) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_miss_costs_the_most_even_where_the_depth_is_unknown():
+    rays = RaySample(np.zeros(3), np.zeros((3, 2)), np.array([0.0, 0.5]), np.array([0.0, 1.0]))
+    assert compute_misfit(rays, np.array([MISS_M, MISS_M])) == pytest.approx(WORST_M)
+    assert compute_misfit(rays, np.array([0.3, 0.5])) == 0.0
+
+
+def test_a_shape_before_the_background_costs_and_one_behind_it_does_not():
+    rays = RaySample(np.zeros(3), np.zeros((3, 3)), np.array([0.5, 1.0, 1.0]), np.array([1.0]))
+    assert compute_misfit(rays, np.array([0.5, 0.8, 1.1])) == pytest.approx(WORST_M)
+    assert compute_misfit(rays, np.array([0.5, 1.1, MISS_M])) == 0.0
