@@ -11,7 +11,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import BuildError, GeometryError, InputError
 from tableverse_factory.core.storage.files import StoragePath, parse_path, write_atomic
-from tableverse_factory.core.storage.parquet import build_table, encode_parquet
+from tableverse_factory.core.storage.parquet import encode_rows
 from tableverse_factory.core.storage.untrusted import exists, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.mesh.meshes import read_mesh
@@ -100,7 +100,7 @@ def create_manifest(
 
 def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
     """Write the rows as Parquet: equal rows give equal bytes."""
-    data = encode_parquet(build_table((row.model_dump(mode="json") for row in rows), MANIFEST))
+    data = encode_rows((row.model_dump(mode="json") for row in rows), MANIFEST)
     try:
         write_atomic(path, data)
     except BuildError as error:

@@ -8,6 +8,7 @@ are waited for when the interpreter ends, and what is small is read without its 
 import atexit
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from typing import Any
 from weakref import WeakSet
 
@@ -37,6 +38,17 @@ def encode_parquet(table: pa.Table) -> bytes:
     """Encode a table as Parquet: the same bytes for the same rows and the same pyarrow."""
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, row_group_size=ROW_GROUP, **PARQUET_OPTIONS)
+    return bytes(sink.getvalue())
+
+
+def encode_rows(rows: Iterable[Mapping[str, Any]], schema: pa.Schema) -> bytes:
+    """Encode rows to the bytes of `encode_parquet(build_table(rows, schema))`, one row group in memory at a time."""
+    sink, rows = pa.BufferOutputStream(), iter(rows)
+    group = list(islice(rows, ROW_GROUP))
+    with pq.ParquetWriter(sink, schema, **PARQUET_OPTIONS) as writer:
+        writer.write_table(build_table(group, schema), row_group_size=ROW_GROUP)  # an empty one, too
+        while group := list(islice(rows, ROW_GROUP)):
+            writer.write_table(build_table(group, schema), row_group_size=ROW_GROUP)
     return bytes(sink.getvalue())
 
 
