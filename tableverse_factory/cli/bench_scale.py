@@ -10,7 +10,7 @@ from tableverse_factory.cli.options import AsJson
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.errors import ConfigError
 
-_MAX_PAYLOAD_BYTES = 10**9
+_MAX_SCENES, _MAX_PAYLOAD_BYTES = 1_000_000, 10**9
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.factory import FactoryRun
@@ -37,10 +37,9 @@ def bench_factory(
 
     from tableverse_factory.evaluation.bench.factory import bench_factory, compare_runs
 
-    asked = _parse_scenes(sizes)
-    runs = []
+    asked, payload_bytes, runs = _parse_sizes(sizes), _parse_bytes(payload), []
     show = partial(print, end=" … ", file=sys.stderr, flush=True)
-    for run in bench_factory(asked, workers, burning, _parse_size(payload), show):
+    for run in bench_factory(asked, workers, burning, payload_bytes, show):
         print(f"{run.rate:.0f} scenes/s, {run.total_cpu_ms:.2f} ms of CPU each", file=sys.stderr)
         runs.append(run)
     ratios = compare_runs(runs)
@@ -65,22 +64,25 @@ def _show_runs(runs: list["FactoryRun"]) -> None:
     figures = ("workers", "scenes", "scenes/s", "flowing", "CPU ms", "driver ms", "KB", "peak MB", "MB per 10,000")
     print_figures(("build", *figures), rows)
     print("flowing: after the first finished scenes; CPU ms: per scene over all processes, starts and imports included")
-    print("driver ms, KB: its CPU time, and what it reads, writes and exchanges with actors per scene while they flow")
+    print("driver ms, KB: its CPU time and traffic per scene while they flow: bytes read, written, sent and received")
+    print("(files, pipes, TCP, its own sandbox), and objects that it moves into Ray's object store or out of it")
 
 
-def _parse_scenes(text: str) -> list[int]:
-    """Parse numbers of scenes such as `300,1000`."""
-    if not re.fullmatch(r"[1-9]\d{0,6}(,[1-9]\d{0,6})*", text):
-        raise ConfigError(f"--sizes {text[:80]!r}: give numbers of scenes such as 300,1000")
-    return sorted(set(map(int, text.split(","))))
+def _parse_sizes(text: str) -> list[int]:
+    """Parse numbers of scenes such as `1000,10000`; return each once, ascending."""
+    parts = [part.strip() for part in text.split(",")]
+    for part in parts:
+        if not re.fullmatch(r"[0-9]{1,7}", part) or not 1 <= int(part) <= _MAX_SCENES:
+            raise ConfigError(f"--sizes {part[:80]!r}: give numbers from 1 to {_MAX_SCENES}, separated by commas")
+    return sorted(set(map(int, parts)))
 
 
-def _parse_size(text: str) -> int:
-    """Parse a number of bytes such as `7MB`, at most 1 GB."""
-    match = re.fullmatch(r"(\d{1,9})\s*([kM])?B?", text)
-    size = int(match[1]) * {None: 1, "k": 10**3, "M": 10**6}[match[2]] if match else -1
+def _parse_bytes(text: str) -> int:
+    """Parse a number of bytes such as `7MB`."""
+    match = re.fullmatch(r"([0-9]{1,10}) ?(k|M|G)?B?", text)
+    size = int(match[1]) * {None: 1, "k": 10**3, "M": 10**6, "G": 10**9}[match[2]] if match else -1
     if not 0 <= size <= _MAX_PAYLOAD_BYTES:
-        raise ConfigError(f"--payload {text[:80]!r}: give a whole number of bytes up to 1000MB, such as 7MB")
+        raise ConfigError(f"--payload {text[:80]!r}: give a number of bytes up to 1GB, such as 7MB")
     return size
 
 

@@ -1,9 +1,9 @@
 """A pipeline written with Ray Data, the baseline of `tableverse bench factory`.
 
-`python -m workers.bench.ray_data_baseline MANIFEST OUT WORKERS PIPELINE`. Every stage is one `map_batches` on bytes of
-the same codec, the last one writes a tar and the rows of objects and tasks per batch, and `write_parquet` those of
-scenes. Ray Data fuses the chain into one task per block. There is no sandbox, deadline, row for a failed scene, plan,
-resume or flush to the disk, and file names differ from run to run.
+`python -m workers.bench.ray_data_baseline MANIFEST OUT WORKERS PIPELINE BATCH`. Every stage is one `map_batches` on
+bytes of the same codec, the last one writes a tar and the rows of objects and tasks per batch, and `write_parquet`
+those of scenes. Ray Data fuses the chain into one task per block. There is no sandbox, deadline, row for a failed
+scene, plan, resume or flush to the disk, and file names differ from run to run.
 """
 
 import sys
@@ -30,16 +30,15 @@ from tableverse_factory.stage import Stage
 from workers.executors.ray_cluster import OBJECT_STORE_BYTES
 from workers.sandbox.child import load_pipelines
 
-BATCH = 64
 _BLOCKS_PER_WORKER = 8
 _ITEMS = pa.schema([("scene_id", pa.string()), ("item", pa.large_binary())])
 
 
 def main() -> None:
     """Run the pipeline; write the monotonic time and the number of scenes after the start of Ray and at the end."""
-    manifest, out, workers, pipeline = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
+    manifest, out, workers, pipeline, batch = sys.argv[1:]
     ray.init(
-        num_cpus=workers,
+        num_cpus=int(workers),
         include_dashboard=False,
         object_store_memory=OBJECT_STORE_BYTES,
         logging_level="ERROR",
@@ -47,19 +46,20 @@ def main() -> None:
     )
     ray.data.DataContext.get_current().enable_progress_bars = False
     _report(0)
-    scenes = run(manifest, out, workers, load_pipelines(pipeline)[SceneKind.CAPTURE])
+    scenes = run(manifest, Path(out), int(workers), load_pipelines(pipeline)[SceneKind.CAPTURE], int(batch))
     _report(scenes)
 
 
-def run(manifest: str, out: Path, workers: int, stages: Any) -> int:
-    """Run the pipeline on a manifest; return the number of scenes."""
+def run(manifest: str, out: Path, workers: int, stages: Any, batch: int) -> int:
+    """Run the pipeline on a manifest, `batch` scenes at a time; return the number of scenes."""
     for folder in ("mjcf", "objects", "tasks"):
         (out / folder).mkdir(parents=True)
     rows = ray.data.read_parquet(manifest, override_num_blocks=_BLOCKS_PER_WORKER * workers)
-    items = rows.map_batches(_read_items, batch_size=BATCH, batch_format="pyarrow")
+    batches: Any = {"batch_size": batch, "batch_format": "pyarrow"}
+    items = rows.map_batches(_read_items, **batches)
     for stage in stages:
-        items = items.map_batches(_make_step(stage), batch_size=BATCH, batch_format="pyarrow")
-    items.map_batches(_make_writer(out), batch_size=BATCH, batch_format="pyarrow").write_parquet(str(out / "scenes"))
+        items = items.map_batches(_make_step(stage), **batches)
+    items.map_batches(_make_writer(out), **batches).write_parquet(str(out / "scenes"))
     return sum(pq.read_metadata(path).num_rows for path in (out / "scenes").glob("*.parquet"))
 
 

@@ -2,7 +2,7 @@
 
 `python -m workers.bench.run_build MANIFEST OUT EXECUTOR WORKERS PIPELINE` writes a line `seconds scenes cpu_s bytes`
 about once a second, and one at the end: seconds of the monotonic clock, which all processes of a machine share,
-finished scenes, CPU time of the driver, and bytes that it read, wrote and exchanged with actors.
+finished scenes, CPU time of the driver, and bytes that passed through it. Exit code 1 if a scene is not done.
 """
 
 import sys
@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from schemas.config import Config
+from workers.bench.traffic import TrafficMeter
 from workers.driver.signals import StopSignals
 from workers.progress.tally import Tally
 from workers.run import BuildRequest, run_build
@@ -20,7 +21,8 @@ _EVERY_S = 1.0
 class StdoutProgress:
     """Progress display that writes lines of time and number of finished scenes."""
 
-    def __init__(self) -> None:
+    def __init__(self, meter: TrafficMeter) -> None:
+        self._meter = meter
         self._next = 0.0
         self._written = -1
 
@@ -38,15 +40,9 @@ class StdoutProgress:
     def write(self, tally: Tally) -> None:
         """Write a line."""
         self._written = tally.accounted
-        moved = tally.bytes_exchanged + _count_io()
-        sys.stdout.write(f"{time.monotonic():.3f} {tally.accounted} {time.process_time():.3f} {moved}\n")
+        figures = (f"{time.monotonic():.3f}", tally.accounted, f"{time.process_time():.3f}", self._meter.count())
+        sys.stdout.write(" ".join(map(str, figures)) + "\n")
         sys.stdout.flush()
-
-
-def _count_io() -> int:
-    """Count the bytes that this process has read and written."""
-    counters = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
-    return int(counters["rchar"]) + int(counters["wchar"])
 
 
 def main() -> None:
@@ -61,10 +57,13 @@ def main() -> None:
         workers=int(workers) if executor == "ray" else None,
         pipeline=pipeline,
     )
-    progress = StdoutProgress()
+    progress = StdoutProgress(TrafficMeter(with_ray=executor == "ray"))
     summary = run_build(request, progress, StopSignals())
     progress.write(summary.tally)
-    sys.exit(128 + summary.signal if summary.signal else 0)
+    if summary.signal:
+        sys.exit(128 + summary.signal)
+    if summary.tally.count("done") < summary.tally.total:
+        sys.exit(str(summary))
 
 
 if __name__ == "__main__":

@@ -17,11 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.bench import noop_pipeline
 from tableverse_factory.evaluation.bench.process_meter import CommandMeasurement, measure_command
 from tableverse_factory.sources.manifest import write_manifest
 
 NOOP, BURNING = f"{noop_pipeline.__name__}:NOOP_PIPELINES", f"{noop_pipeline.__name__}:BURNING_PIPELINES"
+_COPIES = 3  # of a payload on the disk: in its scene, in checkpoints, and in the shard while it is assembled
+_BATCH, _BATCH_BYTES = 64, 64_000_000  # most scenes and bytes that Ray Data handles at once
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 _KINDS = {"workers.sandbox.child": "sandboxes", "ray::": "actors"}
 
@@ -37,7 +40,7 @@ class FactoryRun:
     steady_s: float  # from the first finished scenes to the last commit [s]
     steady_scenes: int  # scenes finished in that time
     driver_ms: float  # CPU time of the driver per scene in that time
-    driver_kb: float  # what the driver reads, writes and exchanges with actors per scene in that time
+    driver_kb: float  # bytes that pass through the driver per scene in that time (`workers.bench.traffic`) [kB]
     cpu_ms: Mapping[str, float]  # CPU time per scene by kind of process, imports and the start of Ray included
     peak_mb: float  # peak resident memory of the driver
     growth_mb: float  # growth of the driver's memory per 10,000 scenes over the second half of the build
@@ -77,7 +80,7 @@ def bench_factory(
         sizes: Scenes of the builds on Ray and on Ray Data, ascending; the two smallest also run with one worker.
         workers: Ray workers in each pool.
         burning: Scenes of the builds whose stages burn CPU; 0 for none.
-        payload: Size of the files of each scene [bytes].
+        payload: Size of the files of each scene, except where stages burn CPU [bytes].
         show: Called with a description before each build.
     """
     plan = [("ray", workers, n, NOOP) for n in sizes]
@@ -86,6 +89,7 @@ def bench_factory(
     if importlib.util.find_spec("pandas"):  # without it Ray Data cannot be imported
         plan += [("ray data", workers, n, NOOP) for n in sizes]
     with tempfile.TemporaryDirectory(prefix="tableverse-bench-") as folder:
+        _check_free_space(Path(folder), payload * max(sizes))
         for what, with_workers, scenes, line in plan:
             show(f"{what}: {scenes} scenes, {with_workers} workers")
             yield _run_once(what, with_workers, scenes, line, Path(folder), payload)
@@ -107,13 +111,27 @@ def compare_runs(runs: Sequence[FactoryRun]) -> FactoryComparison:
     )
 
 
+def _check_free_space(folder: Path, payload: int) -> None:
+    """Refuse payloads that do not fit on the disk together with the checkpoints that hold them."""
+    free, needed = shutil.disk_usage(folder).free, _COPIES * payload
+    if needed > free:
+        raise InputError(
+            f"{folder.parent} has {free / 1e9:.0f} GB free and the largest build needs {needed / 1e9:.0f}: give fewer "
+            "scenes or a smaller payload, or another folder in TMPDIR"
+        )
+
+
 def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path, payload: int) -> FactoryRun:
     manifest, out = folder / f"{scenes}.parquet", folder / "out"
     if not manifest.exists():
         write_manifest(manifest, (_make_row(number, payload) for number in range(scenes)))
-    executor = () if what == "ray data" else ("local",) if what == "local" else ("ray",)
-    module = "workers.bench.run_build" if executor else "workers.bench.ray_data_baseline"
-    command = (sys.executable, "-m", module, manifest, out, *executor, workers, line)
+    if what == "ray data":
+        batch = max(1, min(_BATCH, _BATCH_BYTES // max(1, payload)))
+        arguments: tuple[object, ...] = ("workers.bench.ray_data_baseline", manifest, out, workers, line, batch)
+    else:
+        executor = "local" if what == "local" else "ray"
+        arguments = ("workers.bench.run_build", manifest, out, executor, workers, line)
+    command = (sys.executable, "-m", *arguments)
     try:
         measured = measure_command([str(part) for part in command], _QUIET, _classify_process)
         return _summarize_run(what, workers, scenes, measured)
