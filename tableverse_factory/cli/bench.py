@@ -8,6 +8,7 @@ import typer
 from tableverse_factory.cli.bench_cpu_time import bench_stages, bench_trajectories
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
+from tableverse_factory.cli.bench_soak import bench_soak
 from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.cache_dir import get_cache_dir
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 bench = typer.Typer(name="bench", help="Measure the parts of the factory on your own data.", no_args_is_help=True)
 bench.command("layout")(bench_stages)
 bench.command("factory")(bench_factory)
+bench.command("soak")(bench_soak)
 bench.command("query")(bench_query)
 bench.command("trajectories")(bench_trajectories)
 bench.command("perception")(bench_perception)

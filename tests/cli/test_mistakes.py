@@ -95,6 +95,12 @@ def home(tmp_path_factory) -> Path:
         ("textures make marbel-3 --out t.png", 1, ["'marbel-3'", "did you mean marble?"]),
         ("config --config note.txt", 1, ["note.txt", "sections with keys"]),
         ("bench lcr layouts", 2, ["'lcr'", "'lccr'"]),
+        ("bench factory --sizes 10,many", 1, ["--sizes 'many'", "1000000"]),
+        ("bench factory --sizes 2000000", 1, ["--sizes '2000000'", "1000000"]),
+        ("bench factory --payload 7XB", 1, ["--payload '7XB'", "7MB"]),
+        ("bench factory --payload 2GB", 1, ["--payload '2GB'", "up to 1GB"]),
+        ("bench soak out", 1, ["out", "new or empty folder"]),
+        ("bench soak new --kill-every 1", 2, ["--kill-every", "5"]),
         ("evaluate collisions nowhere", 1, ["nowhere: no such file or folder"]),
     ],
 )
