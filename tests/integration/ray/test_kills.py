@@ -2,12 +2,15 @@
 
 import random
 import time
+from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
 from tableverse_factory.dataset.journals import WORK
+from tableverse_factory.evaluation.bench.build_family import DRIVER, choose_victim, list_family
 from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
 from tests.helpers.processes import command_of, is_alive
 from workers.progress.build_state import read_build_state
@@ -45,13 +48,13 @@ def test_whatever_kills_the_driver_and_however_often_the_bytes_are_the_same(tmp_
 def test_twenty_killed_actors_and_sandboxes_cost_nothing_but_time(tmp_path):
     n_scenes, kills = 200, 20
     manifest, expected = _whole(tmp_path, n_scenes)
-    out, rng = tmp_path / "out", random.Random(kills)
+    out, rng, hits = tmp_path / "out", np.random.default_rng(kills), Counter()
     process = start(manifest, out, "ray", 2, **RUN)
-    for moment in sorted(rng.sample(range(n_scenes - 20), kills)):
+    for number in range(kills):
+        moment = 9 * number + rng.integers(5)  # between two kills other scenes end, so none is hit each time
         wait_until(lambda moment=moment: _accounted(out) >= moment, LIMIT_S)
         time.sleep(rng.uniform(0.0, 0.05))
-        wait_until(lambda: _workers(process.pid), LIMIT_S)
-        rng.choice(_workers(process.pid)).kill()
+        wait_until(lambda: _kill_worker(process.pid, hits, rng), LIMIT_S)
     code, errors = finish(process, LIMIT_S)
     assert code == 0, errors
     _same(out, expected, n_scenes)
@@ -96,10 +99,10 @@ def _same(out: Path, expected: dict[str, str], n_scenes: int) -> None:
     assert digests(out) == expected
 
 
-def _workers(driver: int) -> list[psutil.Process]:
-    """Actors, and the children of their sandboxes, oldest first."""
-    family = psutil.Process(driver).children(recursive=True)
-    return [p for p in family if any(word in command_of(p) for word in ("ray::StageActor", "workers.sandbox.child"))]
+def _kill_worker(driver: int, hits: Counter[int], rng: np.random.Generator) -> bool:
+    """Kills an actor, or the child of its sandbox; False if there was none."""
+    victim = choose_victim([member for member in list_family(driver) if member.kind != DRIVER], hits, rng)
+    return victim is not None and victim.kill()
 
 
 def _accounted(out: Path) -> int:
