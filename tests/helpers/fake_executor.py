@@ -89,8 +89,6 @@ class FakeExecutor:
         runs: How often each stage ran, by (scene_id, position).
     """
 
-    bytes_exchanged = 0
-
     def __init__(
         self, folder: Path, script: Mapping[tuple[str, int], Sequence[Action]] | None = None, workers: int = 1
     ) -> None:

@@ -238,5 +238,5 @@ class Driver:
         alive = self._workers.alive
         self._tally.actors = {pool: Actors(alive[pool], size) for pool, size in self._workers.sizes.items()}
         self._tally.committed, self._tally.bytes_committed = self._ledger.committed, self._ledger.bytes_committed
-        self._tally.restarts, self._tally.bytes_exchanged = self._workers.restarts, self._executor.bytes_exchanged
+        self._tally.restarts = self._workers.restarts
         self._display.show(self._tally)

@@ -15,8 +15,6 @@ POOL = "local"
 class LocalExecutor:
     """One worker for all pools; it runs inside `wait`."""
 
-    bytes_exchanged = 0
-
     def __init__(self, setup: SandboxSetup, watch: Callable[[], None]) -> None:
         """Create the sandbox; `watch` is called every few milliseconds and ends the call by raising."""
         self._sandbox = Sandbox(setup)

@@ -62,8 +62,6 @@ Event = WorkerReady | CallFinished | ShardStaged | WorkerLost
 class Executor(Protocol):
     """Workers in pools, one call in flight per worker."""
 
-    bytes_exchanged: int  # sent to workers and got from them, where that is another process
-
     @property
     def limits(self) -> ScheduleLimits:
         """Limits of the pools at present."""

@@ -81,7 +81,6 @@ class RayExecutor:
         self._attempts = setup.attempts
         self._classes = {name: _make_actor_class(spec) for name, spec in specs.items()}
         self._numbers = itertools.count()
-        self.bytes_exchanged = 0
         self._actors: dict[int, Any] = {}
         self._starting: dict[Any, int] = {}
         self._running: dict[Any, _Call] = {}
@@ -107,12 +106,12 @@ class RayExecutor:
 
     def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
         """Call the actor."""
-        reference = self._actors[worker].run.remote(self._encode(tuple(job.chain for job in jobs)))
+        reference = self._actors[worker].run.remote(encode(tuple(job.chain for job in jobs)))
         self._running[reference] = _Call(worker, jobs, time.monotonic() + self._compute_deadline_s(jobs))
 
     def stage_shard(self, worker: int, call: CommitCall) -> None:
         """Call the actor; a store may be slow, so only its loss ends the call."""
-        self._running[self._actors[worker].stage_shard.remote(self._encode(call))] = _Call(worker, call, math.inf)
+        self._running[self._actors[worker].stage_shard.remote(encode(call))] = _Call(worker, call, math.inf)
 
     def wait(self, timeout_s: float) -> list[Event]:
         """Return started actors and finished calls; an actor that died or exceeds its deadline is killed."""
@@ -173,17 +172,11 @@ class RayExecutor:
             raise BuildError(str(getattr(error, "cause", error))) from None
         except ray.exceptions.RayError as error:
             return self._drop_worker(reference, describe_loss(error))
-        self.bytes_exchanged += len(data)
         running, answer = self._running.pop(reference), decode(data)
         if isinstance(running.work, CommitCall):
             return ShardStaged(running.worker, running.work, answer)
         results = zip(running.work, answer, strict=True)
         return CallFinished(running.worker, tuple(JobResult(job.rank, report) for job, report in results))
-
-    def _encode(self, message: Any) -> bytes:
-        data = encode(message)
-        self.bytes_exchanged += len(data)
-        return data
 
     def _drop_worker(self, reference: Any, why: str) -> WorkerLost:
         """Drop a worker after killing it: otherwise it could share a CPU and a scene with its successor."""

@@ -78,7 +78,6 @@ class Tally:
     target: int | None = None  # scenes that will be accounted for when this run ends; None for all of the plan
     committed: int = 0  # shards that are whole
     bytes_committed: int = 0  # bytes of the shards that this run committed
-    bytes_exchanged: int = 0  # bytes that the driver sent to its workers and got from them
     losses: int = 0  # lost workers and inputs of this run
     restarts: int = 0  # workers started in place of a lost or recycled one
     postponed: int = 0  # scenes left for a later run because a model did not answer

@@ -113,6 +113,6 @@ def test_a_build_under_kills_is_accounted_for_verified_and_the_same(tmp_path):
     report = soak.run_soak(plan, lines.append)
     assert report.problems == ()
     assert report.builds >= 1
-    assert sum(report.kills.values()) == sum(line.startswith("killed: ") for line in lines) >= 3
+    assert sum(report.kills.values()) == sum(line.startswith("killed: ") for line in lines) >= 1
     assert {kind.kind for kind in report.memory} == {ACTOR, DRIVER, SANDBOX}
     assert all(30.0 < kind.peak_mb < 2000.0 for kind in report.memory)

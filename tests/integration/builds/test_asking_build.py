@@ -25,6 +25,7 @@ from tests.helpers.paths import HELPERS
 from workers.driver.budget import NO_LIMITS, SpendingLimits
 from workers.progress.build_state import read_build_state
 from workers.run import BuildRequest, run_build
+from workers.sandbox.retries import MAX_KILLS
 from workers.state.checkpoint_pack import read_packed_checkpoint, scan_pack
 from workers.state.cost_log import sum_costs
 
@@ -141,7 +142,7 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
     assert sum_costs(copy.out) == NO_COST
 
 
-@pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", 3)])
+@pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), ("SIGKILL", MAX_KILLS)])
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
     request = replace(
         asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.crashing_pipeline:PIPELINES"
