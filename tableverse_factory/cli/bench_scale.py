@@ -1,5 +1,6 @@
 """`tableverse bench factory` and `bench query`: overhead of builds, and query times of datasets."""
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -47,11 +48,15 @@ def bench_factory(
         print_json({"runs": runs, "ratios": ratios})
         return
     _show_runs(runs)
-    print(f"marginal CPU time per scene, larger builds over smaller ones: {ratios.linear:.2f}")
-    print(
-        f"Ray adds {ratios.ray_ms:.2f} ms of CPU per scene; {workers} workers burn {ratios.speed_up:.2f} times as fast"
+    told = (
+        (ratios.linear, f"marginal CPU time per scene, larger builds over smaller ones: {ratios.linear:.2f}"),
+        (ratios.ray_ms, f"CPU time that Ray adds per scene: {ratios.ray_ms:.2f} ms"),
+        (ratios.speed_up, f"speed of {workers} workers that burn CPU over that of one: {ratios.speed_up:.2f}"),
+        (ratios.to_ray_data, f"marginal rate of the factory over that of Ray Data: {ratios.to_ray_data:.2f}"),
     )
-    print(f"marginal rate of the factory over that of Ray Data: {ratios.to_ray_data:.2f}")
+    for ratio, line in told:
+        if not math.isnan(ratio):
+            print(line)
 
 
 def _show_runs(runs: list["FactoryRun"]) -> None:

@@ -64,6 +64,10 @@ def build(
 
     Example: `tableverse build images.parquet out --workers 2 --set run.seed=7`
     """
+    import signal
+
+    # Until the build handles signals, one ends the process: native code that imports modules drops KeyboardInterrupt.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     from workers.api import build as run
     from workers.driver.signals import StopSignals
 

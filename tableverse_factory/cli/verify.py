@@ -11,7 +11,7 @@ from tableverse_factory.cli.arm import check_robot_option
 from tableverse_factory.cli.options import AsJson, Jobs, Robot
 from tableverse_factory.cli.tables import print_json
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.scene_audit import SceneAudit
@@ -71,12 +71,13 @@ def verify(
         audits.append(audit)
         if not as_json:
             _print_audit(audit, first=len(audits) == 1)
-    good = sum(audit.ok for audit in audits)
+    good, rest = sum(audit.ok for audit in audits), _count_not_built(path) if _is_dataset(path) else 0
     if as_json:
         scenes = [{"scene_id": a.scene_id, "ok": a.ok, "problems": a.problems, **a.measured} for a in audits]
-        print_json({"ok": good == len(audits), "verified": good, "scenes": scenes}, indent=1)
+        print_json({"ok": good == len(audits), "verified": good, "not_built": rest, "scenes": scenes}, indent=1)
     else:
-        print(f"{good} of {len(audits)} scenes verified")
+        later = f"; {pluralize(rest, 'scene')} not built yet" if rest else ""
+        print(f"{good} of {pluralize(len(audits), 'scene')} verified{later}")
     if good < len(audits):
         raise typer.Exit(1)
 
@@ -84,6 +85,17 @@ def verify(
 def _is_dataset(path: str) -> bool:
     folder = Path(path)
     return "://" in path or (folder / "run.json").is_file() or any(folder.glob("scenes/shard-*.parquet"))
+
+
+def _count_not_built(path: str) -> int:
+    """Count the scenes that a dataset's build has still to account for; 0 if others selected the scenes."""
+    from tableverse_factory.dataset.dataset import open_dataset
+
+    dataset = open_dataset(path)
+    run = dataset.record() or {}
+    manifest = {} if "published" in run else run.get("manifest")
+    planned = manifest.get("scenes") if isinstance(manifest, dict) else None
+    return max(0, planned - dataset.scenes.count_rows()) if isinstance(planned, int) else 0
 
 
 def _run_audits(

@@ -100,7 +100,7 @@ def test_verify_fails_on_a_dataset_that_lies(scene: ExportedScene, tmp_path: Pat
     result = CliRunner().invoke(app, ["verify", str(tmp_path / "out")])
     assert result.exit_code == 1
     assert "scenes/ says 0.01" in result.stdout
-    assert "0 of 1 scenes verified" in result.stdout
+    assert "0 of 1 scene verified" in result.stdout
 
 
 @pytest.mark.parametrize("table", ["objects", "tasks"])
@@ -119,7 +119,7 @@ def test_verify_reads_an_extracted_folder(scene: ExportedScene, tmp_path: Path) 
         (tmp_path / name).write_bytes(data)
     result = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert "1 of 1 scenes verified" in result.stdout
+    assert "1 of 1 scene verified" in result.stdout
 
 
 @pytest.mark.parametrize(("height", "code"), [(0.0299, 0), (0.025, 1), (0.5, 1)])
@@ -167,11 +167,11 @@ def test_scenes_of_one_folder_may_share_their_meshes(tmp_path: Path) -> None:
     trimesh.creation.box((0.04, 0.04, 0.04)).export(tmp_path / "meshes" / "m.obj")
     (tmp_path / "one").mkdir()
     (tmp_path / "one" / "scene.xml").write_text(text)
-    assert "1 of 1 scenes verified" in CliRunner().invoke(app, ["verify", str(tmp_path)]).stdout
+    assert "1 of 1 scene verified" in CliRunner().invoke(app, ["verify", str(tmp_path)]).stdout
     alone = CliRunner().invoke(app, ["verify", str(tmp_path / "one")])
     assert (alone.exit_code, "lies outside" in alone.stdout) == (1, True)
     wider = ["verify", str(tmp_path / "one" / "scene.xml"), "--root", str(tmp_path)]
-    assert "1 of 1 scenes verified" in CliRunner().invoke(app, wider).stdout
+    assert "1 of 1 scene verified" in CliRunner().invoke(app, wider).stdout
 
 
 @pytest.mark.parametrize("scenes", ["a folder", "a file"])
@@ -187,7 +187,7 @@ def test_an_entry_called_scenes_makes_no_dataset(tmp_path: Path, scenes: str) ->
         '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body pos="0 0 .0299"><freejoint/>'
         '<geom type="box" size=".03 .03 .03"/></body></worldbody></mujoco>'
     )
-    assert "1 of 1 scenes verified" in CliRunner().invoke(app, ["verify", str(tmp_path)]).stdout
+    assert "1 of 1 scene verified" in CliRunner().invoke(app, ["verify", str(tmp_path)]).stdout
 
 
 def test_a_folder_is_read_within_bounds(scene: ExportedScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,6 +32,14 @@ def test_any_number_of_processes_finds_the_same(dataset, run) -> None:
     assert len(json.loads(alone[1])["scenes"]) == 5
 
 
+def test_scenes_that_are_not_built_yet_are_counted(tmp_path, run) -> None:
+    out = write_learnable_dataset(tmp_path / "out", scenes=1)
+    for known, rest, said in (({"scenes": 3}, 2, "; 2 scenes not built yet"), ({"scenes": "many"}, 0, ""), (7, 0, "")):
+        (out / "run.json").write_text(json.dumps({"manifest": known}))
+        assert json.loads(run("verify", out, "--json")[1])["not_built"] == rest
+        assert run("verify", out)[1].endswith(f" of 1 scene verified{said}\n")
+
+
 def test_a_robot_that_is_none_is_said_before_any_scene(dataset, run) -> None:
     code, out, err = run("verify", dataset, "--trajectories", "--jobs", "2", "--robot", "nobody.xml")
     assert (code, out) == (1, "")
