@@ -1,6 +1,6 @@
 """Input of a finished dataset, restored from the dataset alone: its configuration and its manifest's rows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -12,6 +12,7 @@ from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.dataset.committed_rows import read_shard
+from tableverse_factory.dataset.image_rows import ImageRows
 from tableverse_factory.dataset.shard_plan import Plan, digest_manifest
 from tableverse_factory.dataset.shards import committed_shards, shard_path
 
@@ -41,7 +42,7 @@ def config_from_run(run: Mapping[str, Any], section: str, overrides: Sequence[st
         return build_config({name: tree[name] for name in ("run", section) if name in tree}, overrides, "run.json: ")
 
 
-def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) -> list[ImageRow]:
+def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) -> ImageRows:
     """Restore the manifest rows that a finished dataset was built from, in the plan's order.
 
     The digest in run.json verifies them. A dataset written by `tableverse export` holds only what may be passed on: its
@@ -53,18 +54,27 @@ def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) 
             f"{out} is not finished: {len(missing)} of {plan.n_shards} shards are missing, so not all rows of its "
             "manifest are known: go on with `tableverse build MANIFEST OUT`, with --stages +trajectories for both"
         )
-    rows = {row.scene_id: row for shard in range(plan.n_shards) for row in _read_manifest_rows(out, shard)}
-    lacking = [scene_id for scene_id in plan.scene_ids if scene_id not in rows]
-    ordered = [rows[scene_id] for scene_id in plan.scene_ids if scene_id in rows]
-    proven = "published" in run or digest_manifest(ordered) == run["manifest"]["sha256"]
-    if lacking or not proven:
-        others = "the rows of scenes/ are not those that run.json was written for"
-        why = f"{lacking[0]} has no row" if lacking else others
-        raise BuildError(
-            f"{out}: the manifest cannot be restored ({why}): give it, with `tableverse build MANIFEST OUT --stages "
-            "+trajectories` and what the dataset was built with"
-        )
-    return ordered
+    rows = ImageRows.from_rows(_iterate_rows(out, plan))
+    if "published" not in run and digest_manifest(rows) != run["manifest"]["sha256"]:
+        raise _make_restore_error(out, "the rows of scenes/ are not those that run.json was written for")
+    return rows
+
+
+def _iterate_rows(out: StoragePath, plan: Plan) -> Iterator[ImageRow]:
+    """Read the rows of one shard after the other, each in the plan's order."""
+    for shard, ranks in enumerate(plan.members()):
+        rows = {row.scene_id: row for row in _read_manifest_rows(out, shard)}
+        for scene_id in plan.scene_ids[ranks.start : ranks.stop]:
+            if scene_id not in rows:
+                raise _make_restore_error(out, f"{scene_id} has no row")
+            yield rows[scene_id]
+
+
+def _make_restore_error(out: StoragePath, why: str) -> BuildError:
+    return BuildError(
+        f"{out}: the manifest cannot be restored ({why}): give it, with `tableverse build MANIFEST OUT --stages "
+        "+trajectories` and what the dataset was built with"
+    )
 
 
 def _read_manifest_rows(out: StoragePath, shard: int) -> list[ImageRow]:
