@@ -238,6 +238,6 @@ def make_write_error(path: StoragePath, error: OSError) -> BuildError:
     if isinstance(error, StoreError):
         return BuildError(str(error))
     return BuildError(
-        f"cannot write {path}: {error.strerror or error}: make room or fix the permissions, then run the same command, "
-        "which goes on from what is finished"
+        f"cannot write {path}: {error.strerror or error}: make room or fix the permissions, then run the same command "
+        "to go on"
     )

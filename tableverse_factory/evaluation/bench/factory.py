@@ -39,7 +39,7 @@ class FactoryRun:
     working_s: float  # from the start of the driver's work to the last commit, start of workers included [s]
     steady_s: float  # from the first finished scenes to the last commit [s]
     steady_scenes: int  # scenes finished in that time
-    driver_ms: float  # CPU time of the driver per scene in that time
+    driver_ms: float  # CPU time of the driver per scene in that time; nan for a build too short to tell, as driver_kb
     driver_kb: float  # bytes that pass through the driver per scene in that time (`workers.bench.traffic`) [kB]
     cpu_ms: Mapping[str, float]  # CPU time per scene by kind of process, imports and the start of Ray included
     peak_mb: float  # peak resident memory of the driver
@@ -142,7 +142,7 @@ def _run_once(what: str, workers: int, scenes: int, line: str, folder: Path, pay
 def _summarize_run(what: str, workers: int, scenes: int, seen: CommandMeasurement) -> FactoryRun:
     times, counts, *driver = np.array(seen.lines).T  # with its CPU time and traffic, which Ray Data does not tell
     flowing, ended = int(np.argmax(counts > 0)), int(np.argmax(counts == counts[-1]))
-    steady = max(1.0, counts[-1] - counts[flowing])
+    steady = counts[-1] - counts[flowing] or math.nan
     driver_s, driver_bytes = [(its[ended] - its[flowing]) / steady for its in driver] or (math.nan, math.nan)
     at = np.array(seen.memory)
     late = at[at[:, 0] > (times[0] + times[-1]) / 2]
