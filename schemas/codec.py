@@ -19,6 +19,7 @@ from pydantic import BaseModel
 from schemas import geometry, objects, observation, outcome, scene, trajectories, work
 from schemas.curation import Assessment
 from schemas.detection import DetectionRecord, Detections
+from schemas.known_length import KNOWN_LENGTHS
 from schemas.manifest import ImageRow
 
 _MODULES = (geometry, objects, observation, outcome, scene, trajectories, work)
@@ -27,7 +28,7 @@ RECORD_TYPES: dict[str, type[Any]] = {  # the dataclasses that flow between stag
     kind.__name__: kind
     for kind in (
         *(kind for module in _MODULES for kind in vars(module).values() if isinstance(kind, type)),
-        *(Assessment, DetectionRecord, Detections, ImageRow),
+        *(Assessment, DetectionRecord, Detections, ImageRow, *KNOWN_LENGTHS),
     )
     if is_dataclass(kind) or issubclass(kind, BaseModel)
 }

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from schemas.identity import SafeId
+from schemas.known_length import KnownLengthText
 
 
 class SceneKind(StrEnum):
@@ -25,6 +26,7 @@ class ImageRow(BaseModel):
         name: The entry's own name, for people; untrusted text.
         content_sha256: Hash of the bytes that the row was made from; empty if they could not be read.
         url: Address that the picture was fetched from, without user, query and fragment; empty for a local file.
+        known_length: A length that is known in the picture, as JSON (`schemas.known_length`); else empty.
         rejected: Empty, or the code of the reason why the entry cannot enter (`unreadable_color`, …).
     """
 
@@ -38,5 +40,6 @@ class ImageRow(BaseModel):
     url: Annotated[str, Field(max_length=4096)] = ""
     source: Annotated[str, Field(max_length=2048)] = ""
     licence: Annotated[str, Field(max_length=512)] = ""
+    known_length: KnownLengthText = ""
     rejected: Annotated[str, Field(max_length=80, pattern=r"^[a-z0-9_]*$")] = ""
     rejected_detail: Annotated[str, Field(max_length=2000)] = ""

@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from schemas.detection import DetectionRecord
 from schemas.geometry import Camera, Colors, Frozen, IdImage, Points, Pose, TriangleMesh
-from schemas.observation import Observation
+from schemas.observation import IntrinsicsSource, Observation, ScaleSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,6 +132,7 @@ class Evidence(Frozen):
         masks_png: Instance ids as found in the picture, a 16-bit PNG file (0 background).
         object_pixels: Value in `masks_png` of each object, in the order of the objects.
         camera_to_table: Pose of the camera in the table frame.
+        scale_source: What metres come from, with `scale_sigma` and `intrinsics_source` as in `Observation`.
     """
 
     color_jpg: bytes
@@ -139,6 +140,9 @@ class Evidence(Frozen):
     object_pixels: tuple[int, ...]
     camera: Camera
     camera_to_table: Pose
+    scale_source: ScaleSource = "sensor"
+    scale_sigma: float = 0.0
+    intrinsics_source: IntrinsicsSource = "capture"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,9 +1,16 @@
 """Observation of a scene: a picture, its depth and its camera."""
 
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 from schemas.detection import Detections
 from schemas.geometry import Camera, DepthImage, Frozen, IdImage, Picture, TriangleMesh
+from schemas.known_length import KnownLength
+
+ScaleSource: TypeAlias = Literal["sensor", "estimated", "measured", "given"]
+"""What metres come from: a depth sensor, a depth model, a known length, or the file of a layout."""
+IntrinsicsSource: TypeAlias = Literal["capture", "exif", "model", "assumed"]
+"""What the camera comes from: its file, the picture's EXIF, the depth model, or the configuration and defaults."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,6 +25,8 @@ class Observation(Frozen):
         recorded_meshes: Instance id and mesh, of the capture's own `meshes/`; read if `place.mesh_model` is replay.
         bend: Share of the distance by which the depth may be bent smoothly over the picture, as a model's is; 0 of a
             sensor, whose noise is known.
+        scale_sigma: Standard deviation of the logarithm of the scale; 0 of a sensor, and where nothing tells it.
+        known_length: From which the scale is to be measured, its pixels those of `color`; None if none is known.
     """
 
     scene_id: str
@@ -28,3 +37,7 @@ class Observation(Frozen):
     recorded_ids: IdImage | None = None
     recorded_meshes: tuple[tuple[int, TriangleMesh], ...] = ()
     bend: float = 0.0
+    scale_sigma: float = 0.0
+    scale_source: ScaleSource = "sensor"
+    intrinsics_source: IntrinsicsSource = "capture"
+    known_length: KnownLength | None = None

@@ -26,6 +26,10 @@ SCENES = pa.schema(
         ("error_kind", pa.string()),  # kind of a failure
         ("detail", pa.string()),  # one line for people, of a drop or a failure
         ("attempts", pa.int32()),
+        ("known_length", pa.string()),  # of the manifest
+        ("scale_source", pa.string()),  # sensor | estimated | measured | given
+        ("scale_sigma", pa.float64()),  # relative standard deviation; null for layouts, and where nothing tells it
+        ("intrinsics_source", pa.string()),  # capture | exif | model | assumed; null for layouts
         ("perception", pa.string()),
         ("judge", pa.string()),
         ("mesh_licences", pa.list_(pa.string())),  # of the objects' meshes, each once; null where no model made any

@@ -18,7 +18,7 @@ from tableverse_factory.dataset.shards import committed_shards, shard_path
 
 MANIFEST_STAGE = "manifest"
 _COLUMNS = (
-    *("scene_id", "kind", "uri", "name", "content_sha256", "url", "source", "licence"),
+    *("scene_id", "kind", "uri", "name", "content_sha256", "url", "source", "licence", "known_length"),
     *("stage", "reason", "detail"),
 )
 

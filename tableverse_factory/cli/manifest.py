@@ -66,6 +66,13 @@ def manifest(
     near_bits: Annotated[
         int | None, _filtering(min=-1, max=7, metavar="N", help="Of 64, for repeated pictures; 6, -1 for none.")
     ] = None,
+    known_length: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JSON",
+            help="Of bare pictures that have none of their own, see docs/captures.md: a camera's height, say.",
+        ),
+    ] = None,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
@@ -81,10 +88,12 @@ def manifest(
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.sources.known_length import read_known_length
     from tableverse_factory.sources.manifest import create_manifest
     from tableverse_factory.sources.urls.lists import is_list
 
     place, bounds = parse_path(out), load_config(config, overrides or []).observe
+    known = None if known_length is None else read_known_length(known_length, "--known-length")
     lists = [path for path in paths if is_list(path)]
     criteria = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}
     criteria |= {"min_sharpness": min_sharpness, "near_bits": near_bits}
@@ -94,7 +103,7 @@ def manifest(
     gathered = _fetch_lists(lists, _choose_folder(lists, pictures, place), fetching, bounds)
     with count_progress("entries checked") as count:
         folders = [path for path in paths if not is_list(path)]
-        made = create_manifest(folders, out, bounds, gathered, image_filter, count.update)
+        made = create_manifest(folders, out, bounds, gathered, image_filter, count.update, known)
     if as_json:
         fetched = {"fetched": {"now": gathered.fetched, "earlier": gathered.earlier}} if lists else {}
         print_json({"counts": _count_rows(made), "ignored": made.ignored, **fetched}, indent=None)

@@ -17,7 +17,8 @@ from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, JudgeSum
 from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
 from tableverse_factory.dataset.trajectory_summary import TrajectorySummary, summarize_trajectories
 
-_ORIGINS = ("source", "licence", "licence_verdict", "mesh_licences", "perception")
+_SCALES = ("scale_source", "intrinsics_source")
+_ORIGINS = ("source", "licence", "licence_verdict", "mesh_licences", "perception", *_SCALES)
 _LOSSES = ("status", "stage", "reason", "error_kind")
 _COLUMNS = tuple(dict.fromkeys((*_ORIGINS, *_LOSSES, *JUDGEMENT_COLUMNS, *COST_COLUMNS)))
 _MAX_ROWS = 40
@@ -61,6 +62,8 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
         _format_licences(done),
         "## Sources",
         _format_sources(done),
+        "## Scale",
+        _format_scales(done),
         "## Models",
         _format_models(done, summarize_judgements(scenes), sum_model_costs(scenes)),
         "## Reading it",
@@ -116,6 +119,15 @@ def _format_licences(done: pa.Table) -> str:
 
 def _format_sources(done: pa.Table) -> str:
     return _format_table(("source", "done scenes"), _count_values(done, "source", "not stated"))
+
+
+def _format_scales(done: pa.Table) -> str:
+    """Count scenes by where their metres and their camera come from (docs/formats.md)."""
+    counts = Counter[tuple[str, ...]]()
+    for values, count in count_groups(done, _SCALES).items():
+        counts[tuple(value or "–" for value in values)] += count
+    rows = [(*key, count) for key, count in _sort_by_count(counts)]
+    return _format_table(("metres", "camera", "done scenes"), rows)
 
 
 def _format_models(done: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, ModelCost]) -> str:

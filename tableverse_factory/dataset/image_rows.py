@@ -14,6 +14,7 @@ from tableverse_factory.dataset.columns import TextColumn
 
 BATCH_ROWS = 64 * 1024  # of a table that is read
 _LINES = 4096  # rows that are in Python or JSON at once
+_LATER = ("known_length", "url")  # columns that finished datasets may lack: a row without them is hashed as in these
 _ESCAPED = r"[^ !#-\[\]-~]"  # characters that JSON in ASCII escapes
 
 
@@ -62,7 +63,7 @@ class ImageRows(Sequence[ImageRow]):
         return TextColumn(self._columns[name])
 
     def encode_lines(self) -> Iterator[memoryview]:
-        """Encode the rows in parts of many lines: each row as JSON with sorted keys, without `url` if that is empty."""
+        """Encode the rows in parts of many lines: each row as JSON with sorted keys, less empty ones of `_LATER`."""
         for batch in self._table.to_batches(_LINES):
             yield from _encode_lines(batch)
 
@@ -73,10 +74,12 @@ def as_image_rows(rows: Sequence[ImageRow]) -> ImageRows:
 
 
 def find_valid(columns: Mapping[str, pa.Array]) -> pa.BooleanArray:
-    """Find rows that satisfy `ImageRow`, from columns of text by name; null stands for a missing value."""
+    """Find rows that plainly satisfy `ImageRow`, from columns of text by name; null stands for a missing value."""
     valid = pc.is_in(columns["kind"], pa.array([kind.value for kind in SceneKind]))
     checks = [pc.match_substring_regex(columns["scene_id"], f"^(?:{SAFE_ID.pattern})$")]
     checks += [pc.invert(pc.match_substring(columns["scene_id"], "..")), pc.is_valid(columns["uri"])]
+    if "known_length" in columns:  # `ImageRow` parses it
+        checks.append(pc.equal(columns["known_length"], "").fill_null(True))
     for name, column in columns.items():
         for bound in ImageRow.model_fields[name].metadata:
             if (longest := getattr(bound, "max_length", None)) is not None:
@@ -100,9 +103,9 @@ def _encode_lines(batch: pa.RecordBatch) -> Iterator[memoryview]:
     for name in sorted(batch.schema.names):
         odd = pc.or_(odd, pc.match_substring_regex(batch[name], _ESCAPED))
         begin = f'{", " if parts else "{"}"{name}": "'
-        if name == "url":
-            with_url = pc.binary_join_element_wise(begin, batch[name], '"', "")
-            parts.append(pc.if_else(pc.equal(batch[name], ""), "", with_url))
+        if name in _LATER:
+            told = pc.binary_join_element_wise(begin, batch[name], '"', "")
+            parts.append(pc.if_else(pc.equal(batch[name], ""), "", told))
         else:
             parts += [begin, batch[name], '"']
     lines = pc.binary_join_element_wise(*parts, "}\n", "")
@@ -115,4 +118,4 @@ def _encode_lines(batch: pa.RecordBatch) -> Iterator[memoryview]:
 
 
 def _encode_line(row: Mapping[str, str]) -> str:
-    return json.dumps({name: row[name] for name in row if name != "url" or row[name]}, sort_keys=True) + "\n"
+    return json.dumps({name: row[name] for name in row if name not in _LATER or row[name]}, sort_keys=True) + "\n"

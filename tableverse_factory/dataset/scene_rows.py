@@ -7,7 +7,7 @@ from tableverse_factory.dataset.licences import scene_license
 from tableverse_factory.dataset.model_costs import make_cost_columns
 from tableverse_factory.dataset.parts import SceneRows
 
-_OF_MANIFEST = ("name", "url", "source", "licence", "content_sha256")
+_OF_MANIFEST = ("name", "url", "source", "licence", "content_sha256", "known_length")
 
 
 def complete_rows(result: SceneResult, own: SceneRows | None, shard: int, place: tuple[int, int] | None) -> SceneRows:

@@ -112,7 +112,7 @@ def check_shards(shards: Collection[int] | None, n_scenes: int, shard_size: int)
 def digest_manifest(rows: Sequence[ImageRow]) -> str:
     """Hash the content of the rows, in order: the same for the same rows in another Parquet file.
 
-    `url` is newer than some finished datasets: a row without one is hashed as in these.
+    Columns that are newer than some finished datasets count only where they hold something.
     """
     digest = hashlib.sha256()
     for lines in as_image_rows(rows).encode_lines():

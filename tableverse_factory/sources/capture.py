@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from schemas.config import ObserveConfig
 from schemas.detection import Detections
 from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
+from schemas.observation import IntrinsicsSource, ScaleSource
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.untrusted import (
     decode_image,
@@ -47,6 +48,7 @@ class Capture:
         depth: Shape (h, w) float32 [m], 0 where there is no reading or it lies beyond `observe.max_depth_m`.
         ids: Of `masks.png`, shape (h, w), 0 background; or None.
         bend: Share of the distance by which the depth may be bent smoothly; 0 of a sensor.
+        scale_sigma: With `scale_source` and `intrinsics_source` as in `schemas.observation.Observation`.
     """
 
     color: Picture
@@ -55,6 +57,9 @@ class Capture:
     detections: Detections | None
     ids: IdImage | None
     bend: float = 0.0
+    scale_sigma: float = 0.0
+    scale_source: ScaleSource = "sensor"
+    intrinsics_source: IntrinsicsSource = "capture"
 
 
 def read_capture(folder_uri: str, bounds: ObserveConfig) -> Capture:

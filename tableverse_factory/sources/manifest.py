@@ -1,24 +1,28 @@
 """Image manifest: a row per entry with an id from its content, also for entries that cannot be used."""
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
 from schemas.identity import content_hash
+from schemas.known_length import KnownLength, encode_known_length
 from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import BuildError, GeometryError, InputError
 from tableverse_factory.core.storage.files import StoragePath, parse_path, write_atomic
 from tableverse_factory.core.storage.parquet import encode_rows
-from tableverse_factory.core.storage.untrusted import exists, parse_json, read_bytes
+from tableverse_factory.core.storage.untrusted import exists, open_image, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.sources.capture import read_capture
 from tableverse_factory.sources.content_hash import hash_entry
 from tableverse_factory.sources.discovery import ManifestEntry, discover_entries
-from tableverse_factory.sources.image_file import read_image
+from tableverse_factory.sources.focal import read_exif_focal
+from tableverse_factory.sources.image_file import decode_upright
+from tableverse_factory.sources.known_length import REASON, check_pixels, read_known_length
 from tableverse_factory.sources.layout_file import read_layout_file, resolve_mesh_uri
 from tableverse_factory.sources.urls.fetch_lists import NO_LISTS, NO_ORIGIN, FetchedLists, Origin
 from tableverse_factory.sources.urls.image_filter import FilterCriteria, ImageStats, filter_rows, measure_image
@@ -29,7 +33,7 @@ _SLUG_CHARS = 40
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Rows of folders by uri, then of lists in their order, and numbers of ignored files and columns by kind."""
+    """Rows of folders by uri, then of lists in their order, and numbers of ignored files, columns and tags by kind."""
 
     rows: tuple[ImageRow, ...]
     ignored: dict[str, int]
@@ -41,14 +45,16 @@ def make_manifest(
     listed: FetchedLists = NO_LISTS,
     criteria: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
+    known_length: KnownLength | None = None,
 ) -> Manifest:
     """Make a manifest of `paths` and `listed`: every entry is decoded, and a bad one becomes a row that says why.
 
     `criteria` are for bare pictures; None accepts all that decode. `on_checked` gets how many are done, of how many.
+    `known_length` is of bare pictures that have none of their own.
     """
     found = discover_entries(paths)
     entries = [*((entry, NO_ORIGIN) for entry in found.entries), *listed.entries]
-    checks = _EntryChecker(bounds)
+    checks = _EntryChecker(bounds, known_length)
     rows, measured = [], []
     for number, (entry, origin) in enumerate(entries):
         row, stats = checks.make_row(entry, origin, criteria is not None)
@@ -59,7 +65,7 @@ def make_manifest(
     if criteria is not None:
         stats_by_id = {row.scene_id: stats for row, stats in zip(unique, measured, strict=True) if stats is not None}
         unique = filter_rows(unique, stats_by_id, criteria)
-    return Manifest(unique, {**found.ignored, **listed.ignored})
+    return Manifest(unique, {**found.ignored, **listed.ignored, **checks.ignored})
 
 
 def create_manifest(
@@ -69,6 +75,7 @@ def create_manifest(
     listed: FetchedLists = NO_LISTS,
     criteria: FilterCriteria | None = None,
     on_checked: Callable[[int, int], None] = lambda _done, _all: None,
+    known_length: KnownLength | None = None,
 ) -> Manifest:
     """Make the image manifest of folders and files, with rows for rejected ones, and write it as Parquet.
 
@@ -79,6 +86,7 @@ def create_manifest(
         listed: Entries of lists of addresses.
         criteria: Criteria for bare pictures; None accepts all that decode.
         on_checked: Called with the number of checked entries and of all entries.
+        known_length: Of bare pictures that have none of their own, such as the camera's height on a fixed stand.
 
     Raises:
         InputError: if a path does not exist, nothing is found, or `out` cannot be written.
@@ -88,7 +96,8 @@ def create_manifest(
         >>> manifest = create_manifest(["captures"], "images.parquet")
         >>> sum(not row.rejected for row in manifest.rows)
     """
-    made = make_manifest(paths, ObserveConfig() if bounds is None else bounds, listed, criteria, on_checked)
+    bounds = ObserveConfig() if bounds is None else bounds
+    made = make_manifest(paths, bounds, listed, criteria, on_checked, known_length)
     if not made.rows:
         raise InputError(
             f"nothing found in {', '.join(sanitize_line(path) for path in paths)[:500]}: a capture is a folder with "
@@ -110,27 +119,33 @@ def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:
 class _EntryChecker:
     """Checks of entries, with results for files that several entries name."""
 
-    def __init__(self, bounds: ObserveConfig) -> None:
+    def __init__(self, bounds: ObserveConfig, known_length: KnownLength | None) -> None:
         self.bounds = bounds
+        self.known_length = known_length
+        self.ignored: Counter[str] = Counter()
         self.digests: dict[str, str] = {}
         self.refused: dict[str, str] = {}
 
     def make_row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
         digest, source, licence = "", origin.source, origin.licence
         reason, detail = "", ""
-        stats = None
+        stats, known = None, self.known_length if entry.kind is SceneKind.IMAGE else None
         try:
             if entry.problem is not None:
                 raise InputError(entry.problem[1], entry.problem[0])
             digest = hash_entry(entry.kind, entry.uri, self.bounds, self.digests)
             picture = self._decode(entry)
-            if origin is NO_ORIGIN:
-                source, licence = _read_provenance(entry)
-            stats = measure_image(picture) if measure and picture is not None else None
+            source, licence, own = _read_provenance(entry, origin)
+            known = own or known
+            if picture is not None and known is not None:
+                check_pixels(known, picture.shape[1], picture.shape[0])
+            if picture is not None and measure and entry.kind is SceneKind.IMAGE:
+                stats = measure_image(picture)
         except InputError as error:
             reason, detail = error.reason, sanitize_line(str(error), 1000)
+        text, identity = encode_known_length(known), digest or content_hash(entry.uri.encode())
         row = ImageRow(
-            scene_id=_make_scene_id(entry, digest or content_hash(entry.uri.encode())),
+            scene_id=_make_scene_id(entry, content_hash(identity.encode(), text.encode()) if text else identity),
             kind=entry.kind,
             uri=entry.uri,
             name=entry.name,
@@ -138,18 +153,23 @@ class _EntryChecker:
             url=origin.url,
             source=source,
             licence=licence,
+            known_length=text,
             rejected=reason,
             rejected_detail=detail,
         )
         return row, stats
 
     def _decode(self, entry: ManifestEntry) -> Picture | None:
-        """Decode everything that belongs to an entry; returns the pixels of a bare picture."""
+        """Decode everything that belongs to an entry; returns the picture's pixels, None for a layout."""
         if entry.kind is SceneKind.IMAGE:
-            return read_image(entry.uri, self.bounds)
+            data = read_bytes(entry.uri, self.bounds.max_file_bytes, "unreadable_color")
+            name = entry.uri.rsplit("/", 1)[-1]
+            picture = decode_upright(data, name, self.bounds)
+            if ignored := read_exif_focal(open_image(data, name, self.bounds, "unreadable_color")).ignored:
+                self.ignored[ignored] += 1
+            return picture
         if entry.kind is SceneKind.CAPTURE:
-            read_capture(entry.uri, self.bounds)
-            return None
+            return read_capture(entry.uri, self.bounds).color
         for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
             uri = resolve_mesh_uri(entry.uri, mesh)
             if uri not in self.refused:
@@ -169,12 +189,17 @@ def _make_scene_id(entry: ManifestEntry, digest: str) -> str:
     return f"{slug or entry.kind.value}-{digest[:12]}"
 
 
-def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:
-    """Read source and licence from a sidecar: `source.json` in a capture; `NAME.source.json` or it beside a file.
+def _read_provenance(entry: ManifestEntry, origin: Origin) -> tuple[str, str, KnownLength | None]:
+    """Read source, licence and known length of a list's entry, or else from a sidecar.
+
+    It is `source.json` in a capture; `NAME.source.json` or it beside a file.
 
     Raises:
-        InputError: `bad_source`: a licence that cannot be read is not taken for none.
+        InputError: `bad_source`: a licence that cannot be read is not taken for none; `bad_known_length`.
     """
+    if origin is not NO_ORIGIN:
+        known = read_known_length(origin.known_length, "known_length") if origin.known_length else None
+        return origin.source, origin.licence, known
     folder, _, name = entry.uri.rpartition("/")
     if entry.kind is SceneKind.CAPTURE:
         candidates = [f"{entry.uri}/source.json"]
@@ -182,7 +207,7 @@ def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:
         candidates = [f"{folder}/{name.rpartition('.')[0]}.source.json", f"{folder}/source.json"]
     uri = next((candidate for candidate in candidates if exists(candidate)), None)
     if uri is None:
-        return "", ""
+        return "", "", None
     value = parse_json(read_bytes(uri, MAX_SIDECAR_BYTES, "bad_source"), "source.json", "bad_source")
     texts = []
     for key, limit in (("source", 2048), ("licence", 512)):
@@ -190,7 +215,10 @@ def _read_provenance(entry: ManifestEntry) -> tuple[str, str]:
         if not isinstance(text, str) or len(text) > limit:
             raise InputError(f'source.json: give {{"{key}": text of at most {limit} characters}}', "bad_source")
         texts.append(sanitize_line(text, limit))
-    return texts[0], texts[1]
+    given = value.get("known_length")
+    if given is not None and entry.kind is SceneKind.LAYOUT:
+        raise InputError("source.json: a layout is given in metres, so known_length has no use: leave it out", REASON)
+    return texts[0], texts[1], None if given is None else read_known_length(given, "source.json: known_length")
 
 
 def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:

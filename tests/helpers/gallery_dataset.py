@@ -27,6 +27,7 @@ HOSTILE = (
 )
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 EYE = look_at(np.array([0.0, -0.6, 0.45]), np.array([0.0, 0.0, 0.0]))
+MEASURED = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif"}
 RED, GREEN = (210, 30, 30), (30, 160, 40)
 
 
@@ -105,6 +106,7 @@ def _done_row(scene_id: str, offset: int, size: int) -> dict[str, Any]:
         "status": "done",
         "stage": "export",
         "attempts": 1,
+        **(MEASURED if scene_id == "photo" else {"scale_source": "given"}),
         "perception": "geometric",
         "judge": "rules",
         "n_objects": 2,

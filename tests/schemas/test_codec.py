@@ -15,6 +15,7 @@ from schemas.codec import RECORD_TYPES, decode, decode_stored, encode, encode_st
 from schemas.curation import AnswerOrigin, Assessment, ObjectAssessment, TaskAssessment
 from schemas.detection import Composite, Container, Content, Detection, DetectionRecord, DetectionRemark, Detections
 from schemas.geometry import Camera, ConvexPieces, Pose, Texture, TriangleMesh
+from schemas.known_length import KnownCameraHeight, KnownDistance, KnownHeight, KnownSheet
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import (
     Evidence,
@@ -73,7 +74,14 @@ def examples(seed: int) -> dict[str, object]:
     record = DetectionRecord(origin=AnswerOrigin(model="m", rounds=2), answer=detections, remarks=(remark,))
     color = rng.integers(0, 256, (6, 8, 3)).astype(np.uint8)
     ids = rng.integers(-1, 5, (6, 8)).astype(np.int32)
-    observation = Observation("a-1", color, floats(6, 8).astype(np.float32), camera, detections, ids)
+    lengths = (
+        KnownDistance(kind="distance", length_m=float(rng.uniform(0.01, 10)), pixels=((0.1, 2.0), (9.0, 3.0))),
+        KnownSheet(kind="a4", pixels=((0.0, 0.0), (9.0, 0.0), (9.0, 9.0), (0.0, float(9 + rng.random())))),
+        KnownHeight(kind="height", length_m=float(rng.uniform(0.01, 2)), label="mug"),
+        KnownCameraHeight(kind="camera_height", length_m=float(rng.uniform(0.1, 5))),
+    )
+    metric = (0.015, float(rng.random()), "measured", "exif", lengths[0])
+    observation = Observation("a-1", color, floats(6, 8).astype(np.float32), camera, detections, ids, (), *metric)
     perceived = PerceivedObject("obj_000", 2, HARD_TEXT, 0.5, floats(4, 3), color.reshape(-1, 3)[:4], "obj_001", 3)
     table = Table(floats(2), floats(2), float(floats()), (1, 2, 3), 0.001)
     texture = Texture(color, floats(2, 3, 2))
@@ -145,6 +153,7 @@ def examples(seed: int) -> dict[str, object]:
         StageTiming("place", 0.1, 0.2),
         table,
         mesh(True),
+        *lengths,
     )
     return {type(record).__name__: record for record in found}
 

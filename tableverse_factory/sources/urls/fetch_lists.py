@@ -26,6 +26,7 @@ class Origin:
     url: str
     source: str
     licence: str
+    known_length: str = ""  # JSON, not validated
 
 
 NO_ORIGIN = Origin("", "", "")  # Origin of entries from folders: a sidecar may state another
@@ -62,7 +63,7 @@ def fetch_lists(
             ignored[f"column of {name}: {summarize_names(found.ignored)}"] += len(found.ignored)
     urls = dict.fromkeys(row.url for row in rows if row.problem is None)
     done = download_images(list(urls), ImageStore(pictures), fetching, bounds, on_done)
-    entries = tuple((_make_entry(row, done), Origin(redact_url(row.url), row.source, row.licence)) for row in rows)
+    entries = tuple((_make_entry(row, done), _make_origin(row)) for row in rows)
     return FetchedLists(entries, dict(ignored), done.fetched, len(done.paths) - done.fetched)
 
 
@@ -72,6 +73,10 @@ def _make_entry(row: ListRow, done: DownloadResult) -> ManifestEntry:
     if row.problem is None and path is not None:
         return ManifestEntry(SceneKind.IMAGE, str(path), name)
     return ManifestEntry(SceneKind.IMAGE, redact_url(row.url), name, row.problem or done.refused[row.url])
+
+
+def _make_origin(row: ListRow) -> Origin:
+    return Origin(redact_url(row.url), row.source, row.licence, row.known_length)
 
 
 def _display_name(url: str) -> str:

@@ -1,7 +1,8 @@
-"""Lists of addresses: CSV, JSON lines or Parquet with the columns url, source and licence; all untrusted."""
+"""Lists of addresses: CSV, JSON lines or Parquet with url, source, licence and known_length; all untrusted."""
 
 import csv
 import io
+import json
 import os
 import posixpath
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,6 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from schemas.known_length import MAX_CHARS as MAX_KNOWN_LENGTH_CHARS
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.untrusted import parse_json, read_bytes
@@ -23,11 +25,18 @@ MAX_LIST_BYTES = 512 * 1024 * 1024
 MAX_ROWS = 1_000_000
 MAX_SOURCE_CHARS = 2048
 MAX_LICENCE_CHARS = 512
-_COLUMN_ALIASES = {"url": "url", "source": "source", "licence": "licence", "license": "licence"}
+_COLUMN_ALIASES = {name: name for name in ("url", "source", "licence", "known_length")} | {"license": "licence"}
 """Columns by their lower-case names."""
 
 _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
-_LIMITS = {"url": MAX_URL_CHARS, "source": MAX_SOURCE_CHARS, "licence": MAX_LICENCE_CHARS}
+_LIMITS = {
+    "url": MAX_URL_CHARS,
+    "source": MAX_SOURCE_CHARS,
+    "licence": MAX_LICENCE_CHARS,
+    "known_length": MAX_KNOWN_LENGTH_CHARS,
+}
+_OBJECTS = ("known_length",)  # JSON lines hold them as they are
+_REASONS = {"url": "bad_url", "known_length": "bad_known_length"}
 _MAX_SHOWN_NAMES, _NAME_CHARS = 20, 60
 _BATCH_ROWS = 4096
 
@@ -46,6 +55,7 @@ class ListRow:
     url: str
     source: str = ""
     licence: str = ""
+    known_length: str = ""
     problem: tuple[str, str] | None = None
 
 
@@ -176,7 +186,7 @@ def _match_columns(name: str, header: list[str]) -> dict[str, str]:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:
         columns = summarize_names(sanitize_line(given, _NAME_CHARS) for given in header) or "no columns"
-        remedy = "a list has url, and source and licence where they are known"
+        remedy = "a list has url, and source, licence and known_length where they are known"
         raise InputError(f"{name} has no column url: it has {columns}; {remedy}", "unreadable_list")
     return known
 
@@ -196,16 +206,16 @@ def _make_row(cells: Mapping[str, Any]) -> ListRow:
     """Make a row; a cell that is no text within its bound becomes the row's problem."""
     texts: dict[str, str] = {}
     for column, value in cells.items():
-        text = "" if value is None else value
+        text = "" if value is None else json.dumps(value) if column in _OBJECTS and isinstance(value, dict) else value
         if not isinstance(text, str) or len(text) > _LIMITS[column]:
             is_text = isinstance(text, str)
             actual = f"{len(text)} characters" if is_text else f"no text but of the type {type(text).__name__}"
             detail = f"{column} is {actual}; give text of at most {_LIMITS[column]} characters"
-            return ListRow(texts.get("url", ""), problem=("bad_url" if column == "url" else "bad_source", detail))
+            return ListRow(texts.get("url", ""), problem=(_REASONS.get(column, "bad_source"), detail))
         texts[column] = text.strip() if column == "url" else sanitize_line(text.strip(), _LIMITS[column])
     if not texts.get("url"):
         return ListRow("", problem=("bad_url", "there is no address"))
-    return ListRow(texts["url"], texts.get("source", ""), texts.get("licence", ""))
+    return ListRow(texts["url"], texts.get("source", ""), texts.get("licence", ""), texts.get("known_length", ""))
 
 
 def _too_many_rows_error(name: str) -> InputError:

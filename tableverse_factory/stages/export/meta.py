@@ -14,6 +14,7 @@ from schemas.objects import PlacedObjects
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.dataset.scene_meta import FORMAT
 from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
+from tableverse_factory.stages.export.rows import describe_metric
 
 
 def build_meta_json(
@@ -32,6 +33,7 @@ def build_meta_json(
         "table": placed.table,
         "camera": None if evidence is None else evidence.camera,
         "camera_to_table": None if evidence is None else evidence.camera_to_table,
+        **({"metric": describe_metric(evidence)} if evidence and evidence.scale_source != "sensor" else {}),
         "perception": placed.perception,
         "detection": None if placed.detection is None else placed.detection.model_dump(mode="json"),
         "judge": scene.judge,

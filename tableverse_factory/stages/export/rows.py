@@ -8,7 +8,7 @@ import numpy as np
 from schemas.curation import Assessment, ObjectAssessment
 from schemas.detection import DetectionRecord
 from schemas.geometry import ConvexPieces
-from schemas.objects import PlacedObject
+from schemas.objects import Evidence, PlacedObject
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.physics.mjcf.spec import SceneBody
@@ -33,6 +33,7 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, 
     placed = scene.settled.rectified.placed
     return {
         "scene_id": scene.scene_id,
+        **describe_metric(placed.evidence),
         "perception": placed.perception,
         "judge": scene.judge,
         "mesh_licences": sorted({item.mesh_licence for item in placed.objects if item.mesh_licence}) or None,
@@ -75,6 +76,15 @@ def _describe_judge(verdict: Assessment) -> dict[str, Any]:
             "rules_shared_tasks": agreement.shared_tasks,
         }
     return columns
+
+
+def describe_metric(evidence: Evidence | None) -> dict[str, Any]:
+    """Describe where metres and camera come from; a layout was given in metres, without a camera."""
+    if evidence is None:
+        return {"scale_source": "given"}
+    is_known = evidence.scale_sigma > 0.0 or evidence.scale_source == "sensor"  # a model may tell no uncertainty
+    sigma = evidence.scale_sigma if is_known else None
+    return {**_pick(evidence, "scale_source", "intrinsics_source"), "scale_sigma": sigma}
 
 
 def build_object_rows(

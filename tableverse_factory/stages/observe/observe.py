@@ -6,6 +6,7 @@ import numpy as np
 
 from schemas.config import Config
 from schemas.geometry import Pose, TriangleMesh
+from schemas.known_length import KnownLength, parse_known_length
 from schemas.layout import LayoutObject
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PlacedObject, PlacedObjects, Table
@@ -18,6 +19,8 @@ from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import Capture, read_capture, read_recorded_meshes
 from tableverse_factory.sources.content_hash import verify_content_hash
+from tableverse_factory.sources.image_file import read_image
+from tableverse_factory.sources.known_length import check_pixels, rescale_pixels
 from tableverse_factory.sources.layout_file import read_layout_file, read_layout_meshes
 from tableverse_factory.stages.observe.depth.depth_anything_2 import estimate_depth_anything_2
 from tableverse_factory.stages.observe.depth.depth_anything_3 import (
@@ -70,10 +73,23 @@ def observe(item: ImageRow, config: Config, rng: np.random.Generator, services: 
         capture = DEPTH_MODELS["sensor" if item.kind is SceneKind.CAPTURE else config.observe.depth](item, config)
         is_replay = config.place.mesh_model == "replay"
         meshes = read_recorded_meshes(item.uri, capture.ids, config.observe) if is_replay else ()
+        known = _read_known_length(item, capture, config)
     except (InputError, AnswerInvalidError) as error:
         return Dropped(error.reason, str(error))
     fields = (capture.color, capture.depth, capture.camera, capture.detections, capture.ids)
-    return Done(Observation(item.scene_id, *fields, meshes, capture.bend))
+    origin = (capture.scale_sigma, capture.scale_source, capture.intrinsics_source)
+    return Done(Observation(item.scene_id, *fields, meshes, capture.bend, *origin, known))
+
+
+def _read_known_length(item: ImageRow, capture: Capture, config: Config) -> KnownLength | None:
+    """Read the known length of a row, with its pixels in the size of the observation's picture."""
+    if not item.known_length:
+        return None
+    known = parse_known_length(item.known_length)
+    height, width = capture.color.shape[:2]
+    file = read_image(item.uri, config.observe) if item.kind is SceneKind.IMAGE and known.pixels else capture.color
+    check_pixels(known, file.shape[1], file.shape[0])
+    return rescale_pixels(known, (file.shape[1], file.shape[0]), (width, height))
 
 
 def read_layout(item: ImageRow, config: Config, rng: np.random.Generator, services: Services) -> Outcome[PlacedObjects]:  # noqa: ARG001

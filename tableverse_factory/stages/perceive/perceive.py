@@ -16,9 +16,9 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
+from tableverse_factory.stages.perceive.scale.known_length import find_scaled_table, scale_by_object
 from tableverse_factory.stages.perceive.table import (
     compute_camera_to_table,
-    find_table,
     fit_table_rectangle,
     refit_table_to_box,
     refit_table_to_mask,
@@ -36,7 +36,7 @@ def perceive(
     item: Observation, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[PerceivedObjects]:
     """Find the table and the objects on it; their points are denoised, in the camera frame."""
-    view = find_table(item, rng)
+    view = find_scaled_table(item, rng)
     if isinstance(view, Dropped):
         return view
     name = choose_detector(item, config.perceive)
@@ -50,6 +50,10 @@ def perceive(
         ids = segment_boxes(view, found, config)
         candidates = tuple(replace(candidate, instance=k) for k, candidate in enumerate(candidates, start=1))
         view = refit_table_to_mask(view, ids == TABLE_ID, rng)
+    scaled = scale_by_object(view, candidates, ids)
+    if isinstance(scaled, Dropped):
+        return scaled
+    view = scaled
     objects, left_out = _build_objects(view, candidates, ids, config.perceive)
     if not objects:
         return Dropped(
@@ -61,7 +65,8 @@ def perceive(
     pose = compute_camera_to_table(view, points)
     table = fit_table_rectangle(view, pose, points, item.color)
     kept = _paint_ids(view, candidates, ids, objects)
-    return Done(PerceivedObjects(item.scene_id, item, pose, table, kept, objects, name, left_out, found.record))
+    seen = view.observation
+    return Done(PerceivedObjects(item.scene_id, seen, pose, table, kept, objects, name, left_out, found.record))
 
 
 def choose_detector(item: Observation, config: PerceiveConfig) -> str:

@@ -136,4 +136,7 @@ def _encode_evidence(scene: PerceivedObjects, objects: Sequence[PerceivedObject]
         object_pixels=tuple(o.instance_id for o in objects),
         camera=scene.observation.camera,
         camera_to_table=scene.camera_to_table,
+        scale_source=scene.observation.scale_source,
+        scale_sigma=scene.observation.scale_sigma,
+        intrinsics_source=scene.observation.intrinsics_source,
     )

@@ -1,7 +1,7 @@
 """Formatting of figures and codes for pages; unknown values become a dash. Templates use them as filters."""
 
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 DASH = "–"
@@ -16,6 +16,10 @@ _EXPLANATIONS = {
     "depth_size_differs": "depth and colour have different sizes: register the depth to the colour image",
     "content_changed": "the files are not those that the manifest recorded: make the manifest again, for another OUT",
     "bad_intrinsics": "the camera intrinsics are invalid",
+    "bad_known_length": "the known length of the picture is not in the expected form",
+    "known_length_unmeasured": "the known length cannot be measured in the depth",
+    "scale_implausible": "the known length contradicts the depth model by a factor beyond 0.2 to 5",
+    "scale_contradicts_sensor": "the known length contradicts the depth of the sensor",
     "bad_detections": "detections.json is not in the expected form",
     "bad_masks": "masks.png does not fit the picture",
     "bad_layout": "the layout file is not in the expected form",
@@ -28,7 +32,6 @@ _EXPLANATIONS = {
     "no_objects": "nothing stands on the table",
     "nothing_placed": "no object could be placed",
     "no_depth_model": "a picture without depth needs a depth model: set observe.depth",
-    "no_focal_length": "the focal length is unknown: set observe.focal_px, or a depth model that estimates it",
     "no_recorded_depth": "there is no recorded depth beside the picture",
     "unusable_mesh": "a mesh cannot be simulated",
     "not_at_rest": "the objects did not come to rest",
@@ -89,6 +92,32 @@ def format_confidence(value: float | None) -> str:
     return DASH if value is None else f"{value:.2f}"
 
 
+SCALE_NAMES = {  # of `schemas.observation.ScaleSource`
+    "sensor": "by a depth sensor",
+    "measured": "measured by a known length",
+    "estimated": "estimated by a depth model",
+    "given": "given by the layout",
+}
+CAMERA_NAMES = {  # of `schemas.observation.IntrinsicsSource`
+    "capture": "from its file",
+    "exif": "from EXIF",
+    "model": "by the depth model",
+    "assumed": "assumed",
+}
+
+
+def format_scale(row: Mapping[str, Any]) -> str:
+    """Format where the metres of a scene come from, and how sure they are."""
+    source, sigma = row.get("scale_source"), row.get("scale_sigma")
+    name = SCALE_NAMES.get(str(source), DASH)
+    return f"{name}, ±{100 * sigma:.1f} %" if isinstance(sigma, float) and sigma > 0.0 else name
+
+
+def format_camera(row: Mapping[str, Any]) -> str:
+    """Format where the intrinsics of a scene's camera come from."""
+    return CAMERA_NAMES.get(str(row.get("intrinsics_source")), DASH)
+
+
 def format_code(text: str | None) -> str:
     """Format a reason code as words."""
     return DASH if text is None else text.replace("_", " ")
@@ -130,6 +159,8 @@ FILTERS: dict[str, Callable[..., str]] = {
     "size": format_size,
     "share": format_confidence,
     "code": format_code,
+    "scale": format_scale,
+    "camera": format_camera,
     "changes": format_perturbations,
     "phase": format_phase,
     "grasp_stage": format_grasp_stage,

@@ -160,7 +160,7 @@ def _write_index_pages(site: Site, records: Records, cards: Mapping[str, SceneCa
     shown = _split_pages(drawn, PAGE_SIZE) or [[]]
     names = _list_names(make_page_name, shown)
     reasons = records.count_reasons([code for _, card in drawn for code in card.reason_codes])
-    filtered = {"moves": records.has_trajectories, "reasons": reasons}
+    filtered = {"moves": records.has_trajectories, "reasons": reasons, "scales": records.list_scale_sources()}
     for number, items in reversed(list(enumerate(shown, 1))):
         pager = {"page": number, "pages": len(shown), "names": names}
         template, figures = ("index.html", _summarize_records(records)) if number == 1 else ("page.html", {})

@@ -9,6 +9,7 @@ from schemas.identity import check_id
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.viz.funnel import SceneLoss
+from tableverse_factory.viz.gallery.formatting import SCALE_NAMES
 
 Row = Mapping[str, Any]
 
@@ -130,6 +131,11 @@ class Records:
         """Count the reasons of lost scenes and the judge's codes of finished ones, the most frequent first."""
         counts = Counter([*(scene.reason for scene in self.lost if scene.reason), *unusable])
         return tuple(sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:_MOST_REASONS])
+
+    def list_scale_sources(self) -> list[tuple[str, str]]:
+        """List where the metres of the finished scenes come from, each once, with its words."""
+        there = {scene.row["scale_source"] for scene in self.done}
+        return [(source, words) for source, words in SCALE_NAMES.items() if source in there]
 
     def list_losses(self) -> list[SceneLoss]:
         """List the losses by stage, status and reason, the largest first."""

@@ -53,6 +53,7 @@ def _encode_done(scene: SceneRecord, card: SceneCard, number: dict[str, int]) ->
         scene.n_succeeded,
         len(scene.trajectories),
         [caption for _, caption in card.pictures.thumbs] if card.pictures else [],
+        row["scale_source"] or "",
     ]
 
 

@@ -9,9 +9,11 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.viz.gallery.formatting import (
     DASH,
     explain_reason,
+    format_camera,
     format_degrees,
     format_mass,
     format_millimetres,
+    format_scale,
 )
 
 MAX_ROWS = 100  # most objects and tasks that are listed
@@ -64,6 +66,8 @@ def format_facts(row: Row, meta: Row, objects: Sequence[Row], tasks: Sequence[Ro
     lines = [(name, write(_parse_number(figures.get(key)))) for name, key, write in _CERTIFICATE]
     kept = [(name, text) for name, text in lines if text != DASH]
     source = [(name, escape_text(row[name])) for name in ("source", "licence") if row.get(name)]
+    metric = [("scale", escape_text(format_scale(row))), ("camera", escape_text(format_camera(row)))]
+    source += [(name, text) for name, text in metric if text != DASH]
     score = [("quality", f"{escape_text(row['quality_score'])} of 10")] if row.get("quality_score") is not None else []
     parts = [
         _format_table("Certificate", kept),

@@ -86,7 +86,6 @@ AFTERWARDS = (
 """What this build says when it is asked for more."""
 
 ELSEWHERE = {
-    "no_focal_length": "tests/stages/observe/depth/test_focal.py",
     "picture_too_narrow": "tests/stages/observe/depth/test_depth_models.py",
     "no_recorded_depth": "tests/stages/observe/depth/test_rgb_image.py",
     "bad_mesh": "tests/sources/test_mesh_file.py",

@@ -48,7 +48,7 @@ def test_scenes_that_are_not_drawn_have_picture_page_and_the_command_that_draws_
     assert "This gallery draws" not in Page(folder / "scenes" / "a-photo.html").text
     shown = [image["src"] for image in Page(folder / "index.html").all("img")]
     assert shown == [f"pictures/{name}-s.jpg" for name in ("a-photo-photo", "b-photo-photo", "c-layout-sketch")]
-    assert [entry[-1] for entry in index_of(folder)["done"]] == [["photograph", "twin"], ["photograph"], ["sketch"]]
+    assert [entry[-2] for entry in index_of(folder)["done"]] == [["photograph", "twin"], ["photograph"], ["sketch"]]
     sketch = np.asarray(Image.open(folder / "pictures" / "c-layout-sketch-s.jpg")).astype(int)
     assert (sketch[..., 0] > sketch[..., 1] + 60).sum() > 500, "the red box"
 

@@ -149,6 +149,17 @@ def test_reasons_and_figures_are_told(pages):
     assert "1 refused" in shown["photo"]
 
 
+def test_where_metres_come_from_is_told_and_filtered_by(pages, gallery):
+    shown = {page.path.stem: " ".join(page.text.split()) for page in pages}
+    assert "scalemeasured by a known length, ±1.3 % camerafrom EXIF" in shown["photo"]
+    assert "scalegiven by the layout camera–" in shown["layout"]
+    assert [entry[-1] for entry in index_of(gallery)["done"]] == ["measured", "given", "given"]
+    (index,) = [page for page in pages if page.path.stem == "index"]
+    options = {attributes.get("value") for attributes in index.all("option")}
+    assert {"measured", "given"} <= options
+    assert "sensor" not in options, "only what is there"
+
+
 def test_the_twin_is_seen_by_the_camera_of_the_photograph(gallery):
     """The red box and the green box appear where the photograph's camera projects them."""
     twin = np.asarray(Image.open(gallery / "pictures" / "photo-twin.jpg")).astype(int)

@@ -311,6 +311,15 @@ def test_foreign_text_stays_text():
     assert len(escape_text("x" * 10_000)) == 120
 
 
+def test_the_panel_tells_where_metres_come_from():
+    row = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif"}
+    html = format_facts(row, {}, [], [], "")
+    assert "measured by a known length, ±1.3 %" in html
+    assert "from EXIF" in html
+    odd = {"scale_source": HOSTILE, "scale_sigma": HOSTILE, "intrinsics_source": HOSTILE}
+    assert "camera" not in format_facts(odd, {}, [], [], "")
+
+
 def test_long_lists_are_cut():
     objects = [{"object_id": f"obj_{number:03d}", "label": "mug"} for number in range(5000)]
     html = format_facts({}, {}, objects, [], "")

@@ -13,6 +13,7 @@ from tableverse_factory.dataset import image_rows
 from workers.plan import read_manifest as module
 from workers.plan.read_manifest import read_manifest
 
+CAMERA = '{"kind":"camera_height","length_m":0.6}'
 TEXTS = {
     "scene_id": ["a", "b", "c.d-e_f", "", ".a", "a..b", "a" * 80, "a" * 81, "ä", "a\n", "duplicate-0", "invalid-0"],
     "kind": ["image", "capture", "layout", "Image", "picture", ""],
@@ -22,6 +23,7 @@ TEXTS = {
     "url": ["", "https://example.org/a", "u" * 4097],
     "source": ["", "s" * 2048, "s" * 2049],
     "licence": ["", "CC0-1.0", "l" * 513],
+    "known_length": ["", CAMERA, CAMERA.replace("0.6", "6e-1"), CAMERA.replace("0.6", "NaN"), "{}", "k" * 1001],
     "rejected": ["", "too_dark", "Too dark", "r" * 81, "\n"],
     "rejected_detail": ["", "d" * 2000, "d" * 2001],
 }

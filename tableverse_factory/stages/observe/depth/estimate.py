@@ -6,6 +6,7 @@ import numpy as np
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Camera, DepthImage, Frozen, Picture
+from schemas.observation import IntrinsicsSource, ScaleSource
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.resample import resample_depth
@@ -18,12 +19,14 @@ _IMPLAUSIBLE_M = 100.0  # A depth map entirely beyond this is probably in anothe
 class DepthEstimate(Frozen):
     """Depth along the optical axis [m], 0, negative or not finite where unknown, and the camera for its size.
 
-    `bend` is the share of the distance by which the depth may be bent smoothly; 0 for a sensor.
+    `bend` is the share of the distance by which the depth may be bent smoothly; 0 for a sensor, which measures
+    the scale too.
     """
 
     depth: DepthImage
     camera: Camera
     bend: float = MODEL_BEND
+    intrinsics_source: IntrinsicsSource = "model"
 
 
 def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -68,4 +71,14 @@ def build_capture(
         )
     depth = resample_depth(np.where(is_valid, estimate.depth, 0.0), width, height, smeared=estimate.bend > 0.0)
     camera = rescale_camera(estimate.camera, width, height)
-    return Capture(color, depth, camera, None, None, estimate.bend)
+    scale_source: ScaleSource = "estimated" if estimate.bend > 0.0 else "sensor"
+    return Capture(
+        color,
+        depth,
+        camera,
+        None,
+        None,
+        estimate.bend,
+        scale_source=scale_source,
+        intrinsics_source=estimate.intrinsics_source,
+    )

@@ -39,9 +39,8 @@ def read_recorded_depth(item: ImageRow, config: Config) -> Capture:
     _check_aspect("the depth", depth.shape[1], depth.shape[0], width, height)
     _check_aspect("the camera", camera.width, camera.height, width, height)
     at_depth = rescale_camera(camera, depth.shape[1], depth.shape[0])
-    return build_capture(
-        photo.color, DepthEstimate(depth, at_depth, bend), config.observe, _get_file_name(there[DEPTH_SUFFIX])
-    )
+    estimate = DepthEstimate(depth, at_depth, bend, intrinsics_source="capture")
+    return build_capture(photo.color, estimate, config.observe, _get_file_name(there[DEPTH_SUFFIX]))
 
 
 def read_depth_array(uri: str, bounds: ObserveConfig) -> DepthImage:

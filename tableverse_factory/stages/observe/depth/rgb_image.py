@@ -1,5 +1,6 @@
 """Picture without depth: upright pixels and the focal length from its file."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,12 +8,14 @@ from PIL import Image
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Frozen, Picture
+from schemas.observation import IntrinsicsSource
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import open_image, read_bytes
+from tableverse_factory.sources.focal import read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
-from tableverse_factory.stages.observe.depth.focal import read_exif_focal
 
 MAX_SIDE_PX = 2048  # larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest
+USUAL_FIELD_DEG = 58.0  # angle over the longer side where nothing tells it: between phones and web cameras
 MAX_ASPECT = 8.0  # maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures
 
 
@@ -24,18 +27,18 @@ class RgbImage(Frozen):
     exif_px: float | None
     scale: float
 
+    @property
+    def intrinsics_source(self) -> IntrinsicsSource:
+        """Origin of the focal length."""
+        return "assumed" if self.exif_px is None else "exif"
+
     def get_focal_px(self, configured: float | None) -> float:
-        """Return the focal length for `color` [px], from EXIF or else as configured for the size of the file."""
+        """Return the focal length for `color` [px]: from EXIF, as configured for the file's size, or the usual one."""
         if self.exif_px is not None:
             return self.exif_px
         if configured is not None:
             return configured * self.scale
-        raise InputError(
-            "this depth model does not estimate the focal length, and the picture's EXIF holds none that fits it "
-            "(FocalLengthIn35mmFilm, or FocalLength with FocalPlaneXResolution): set observe.focal_px, the focal "
-            "length of these pictures in pixels, or use depth_anything_3_nested or moge_2, which estimate it",
-            "no_focal_length",
-        )
+        return max(self.color.shape[:2]) / (2.0 * math.tan(math.radians(USUAL_FIELD_DEG) / 2.0))
 
 
 def read_rgb_image(uri: str, bounds: ObserveConfig) -> RgbImage:
@@ -43,7 +46,7 @@ def read_rgb_image(uri: str, bounds: ObserveConfig) -> RgbImage:
     name = uri.rsplit("/", 1)[-1]
     data = read_bytes(uri, bounds.max_file_bytes, "unreadable_color")
     color = decode_upright(data, name, bounds)
-    focal = read_exif_focal(open_image(data, name, bounds, "unreadable_color"))
+    focal = read_exif_focal(open_image(data, name, bounds, "unreadable_color")).px
     height, width = color.shape[:2]
     if max(width, height) > MAX_ASPECT * min(width, height):
         raise InputError(

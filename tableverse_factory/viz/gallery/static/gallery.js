@@ -73,8 +73,8 @@
   list.classList.toggle("small", small);
 
   // The order of the fields is that of viz/gallery/search_index.py.
-  const doneScene = (labels) => ([id, title, score, usable, codes, depth, drift, names, objects, tasks, good, tried, pictures]) => ({
-    id, title: title || id, status: "done", score, usable: usable === 1, codes, depth, drift, objects, tasks, good, tried, pictures,
+  const doneScene = (labels) => ([id, title, score, usable, codes, depth, drift, names, objects, tasks, good, tried, pictures, scale]) => ({
+    id, title: title || id, status: "done", score, usable: usable === 1, codes, depth, drift, objects, tasks, good, tried, pictures, scale,
     names: names.map((name) => labels[name]), href: `${root}scenes/${id}.html`,
   });
   const lostScene = ([id, title, state, why, page]) => ({
@@ -157,6 +157,7 @@
     score: (value) => (scene) => scene.score !== null && (value > 0 ? scene.score >= Number(value) : scene.score < -value),
     depth: (value) => (scene) => within(scene.depth, Number(value)),
     drift: (value) => (scene) => within(scene.drift, Number(value)),
+    scale: (value) => (scene) => scene.scale === value,
     motions: (value) => moves[value] || (() => true),
   };
   const orders = new Set(["score", "depth", "drift"]);

@@ -108,13 +108,6 @@ def test_every_model_that_is_on_git_alone_says_where():
             import_git_package(f"{module}.api")
 
 
-@pytest.mark.parametrize("name", ["depth_anything_3", "depth_anything_2"])
-def test_a_model_that_tells_no_focal_length_needs_one(tmp_path, name):
-    outcome = observed(photo(tmp_path / "a.png"), depth=name)
-    assert isinstance(outcome, Dropped)
-    assert outcome.reason == "no_focal_length"
-
-
 @given(st.integers(1, 5000), st.integers(1, 5000))
 def test_the_size_for_the_model_is_whole_patches_near_the_pictures_aspect(height, width):
     rows, columns = compute_input_size(height, width, 14)

@@ -1,4 +1,4 @@
-"""The focal length of a bare picture: by its EXIF where that can be believed, else as configured, else a reason."""
+"""The focal length of a bare picture: by its EXIF where it can be believed, else as configured, else the usual one."""
 
 import io
 import struct
@@ -11,8 +11,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from schemas.config import ObserveConfig
-from tableverse_factory.core.errors import InputError
-from tableverse_factory.stages.observe.depth.focal import LONGEST, SHORTEST, read_exif_focal
+from tableverse_factory.sources.focal import LONGEST, SHORTEST, read_exif_focal
+from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.stages.observe.depth.rgb_image import MAX_SIDE_PX, read_rgb_image
 
 BOUNDS = ObserveConfig()
@@ -34,7 +34,13 @@ def jpeg(size=(400, 300), orientation=None, **tags):
 
 
 def focal(**given):
-    return read_exif_focal(Image.open(io.BytesIO(jpeg(**given))))
+    return read_exif_focal(Image.open(io.BytesIO(jpeg(**given)))).px
+
+
+def ignored(**given):
+    found = read_exif_focal(Image.open(io.BytesIO(jpeg(**given))))
+    assert found.px is None
+    return found.ignored
 
 
 def test_by_the_equivalent_on_film():
@@ -49,23 +55,42 @@ def test_by_millimetres_and_the_sensor_at_the_size_it_was_taken_and_any_smaller(
     assert focal(size=(300, 400), **taken) == pytest.approx(200.0), "turned by whoever made it smaller"
 
 
+SENSOR = {"per_unit": 5000.0, "unit": 3, "width": 4000, "height": 3000}
+
+
 @pytest.mark.parametrize(
     "told",
     [
-        {},
         {"mm": 4.0},
-        {"mm_35": 0},
         {"mm_35": 60000},
         {"mm_35": 1},
-        {"mm_35": 26, "width": 4000, "height": 2000},
         {"mm": 4.0, "per_unit": 500.0, "unit": 3},
-        {"mm": 4.0, "per_unit": 500.0, "unit": 9, "width": 4000, "height": 3000},
-        {"mm": IFDRational(4, 0), "per_unit": 500.0, "unit": 3, "width": 4000, "height": 3000},
+        {"mm": 4.0, **SENSOR, "unit": 9},
+        {"mm": 4.0, **SENSOR, "per_unit": 0.0},
+        {"mm": 4.0, **SENSOR, "per_unit": -500.0},
+        {"mm": IFDRational(4, 0), **SENSOR},
+        {"mm": IFDRational(0, 1), **SENSOR},
+        {"mm": -4.0, **SENSOR},
+        {"mm": float("nan"), **SENSOR},
+        {"mm": 1e9, **SENSOR},
     ],
     ids=str,
 )
-def test_what_cannot_be_believed_is_not(told):
-    assert focal(**told) is None
+def test_what_cannot_be_believed_is_ignored_with_a_note(told):
+    assert ignored(**told) == "EXIF focal length that cannot be used"
+
+
+@pytest.mark.parametrize("told", [{}, {"mm_35": 0}, SENSOR], ids=str)
+def test_a_picture_that_tells_no_focal_length_has_nothing_to_note(told):
+    assert not ignored(**told)
+
+
+def test_the_focal_length_of_what_was_cropped_since_is_ignored():
+    assert ignored(mm_35=26, width=4000, height=2000) == "EXIF focal length of a picture that was cropped since"
+
+
+def test_an_absurd_equivalent_leaves_the_sensors_own_length():
+    assert focal(mm_35=60000, mm=4.0, **SENSOR) == pytest.approx(200.0)
 
 
 def with_exif(exif, kind="PNG"):
@@ -92,7 +117,7 @@ BROKEN = {
 def test_whatever_pillow_raises_about_broken_exif_is_no_focal_length(raised, data):
     with pytest.raises(raised):
         Image.open(io.BytesIO(data)).getexif().get_ifd(EXIF_IFD)
-    assert read_exif_focal(Image.open(io.BytesIO(data))) is None
+    assert read_exif_focal(Image.open(io.BytesIO(data))).px is None
 
 
 def exif_of(told) -> bytes:
@@ -112,7 +137,7 @@ def test_exif_that_was_changed_or_cut_gives_a_believable_length_or_none(changes,
     exif = bytearray(SOUND)
     for place, value in changes:
         exif[place] = value
-    found = read_exif_focal(Image.open(io.BytesIO(with_exif(b"Exif\0\0" + bytes(exif[:kept]), kind))))
+    found = read_exif_focal(Image.open(io.BytesIO(with_exif(b"Exif\0\0" + bytes(exif[:kept]), kind)))).px
     assert found is None or SHORTEST * 40 <= found <= LONGEST * 40
     if not changes and kept == len(SOUND):
         assert found == pytest.approx(26 * 50 / 43.2666, rel=1e-4)
@@ -137,13 +162,27 @@ def test_a_large_picture_is_made_smaller_and_its_focal_length_with_it(tmp_path):
     assert read_rgb_image(str(path), BOUNDS).get_focal_px(3000.0) == pytest.approx(1500.0)
 
 
-def test_exif_goes_before_what_is_configured_for_all_and_none_is_a_reason(tmp_path):
+def test_exif_goes_before_what_is_configured_for_all_and_that_before_the_usual_angle(tmp_path):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg(mm_35=26))
-    assert read_rgb_image(str(path), BOUNDS).get_focal_px(1234.0) == pytest.approx(300.46, rel=1e-3)
+    photo = read_rgb_image(str(path), BOUNDS)
+    assert (photo.get_focal_px(1234.0), photo.intrinsics_source) == (pytest.approx(300.46, rel=1e-3), "exif")
     path.write_bytes(jpeg())
-    assert read_rgb_image(str(path), BOUNDS).get_focal_px(1234.0) == 1234.0
-    with pytest.raises(InputError) as refused:
-        read_rgb_image(str(path), BOUNDS).get_focal_px(None)
-    assert refused.value.reason == "no_focal_length"
-    assert "observe.focal_px" in str(refused.value)
+    photo = read_rgb_image(str(path), BOUNDS)
+    assert (photo.get_focal_px(1234.0), photo.intrinsics_source) == (1234.0, "assumed")
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_without_any_focal_length_the_longer_side_shows_58_degrees(tmp_path, orientation):
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(jpeg(orientation=orientation))
+    focal_px = read_rgb_image(str(path), BOUNDS).get_focal_px(None)
+    assert np.degrees(2 * np.arctan(200.0 / focal_px)) == pytest.approx(58.0)
+
+
+def test_the_manifest_counts_the_focal_lengths_that_it_ignores(tmp_path):
+    for name, told in (("a", {"mm_35": 26}), ("b", {"mm_35": 60000}), ("c", {"mm": float("nan"), **SENSOR}), ("d", {})):
+        (tmp_path / f"{name}.jpg").write_bytes(jpeg(**told))
+    made = make_manifest([str(tmp_path)], BOUNDS)
+    assert [row.rejected for row in made.rows] == [""] * 4
+    assert made.ignored == {"EXIF focal length that cannot be used": 2}

@@ -3,6 +3,7 @@
 import math
 import struct
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 from PIL import Image
@@ -17,17 +18,34 @@ _SENSOR_PER_UNIT, _SENSOR_UNIT = 0xA20E, 0xA210
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
-def read_exif_focal(image: Image.Image) -> float | None:
-    """Read the focal length from EXIF [px]; None if it is missing, implausible, or of a picture cropped since."""
+@dataclass(frozen=True, slots=True)
+class ExifFocal:
+    """Focal length that the EXIF data gives.
+
+    Attributes:
+        px: For the picture's own size [px]; None if there is none that can be believed.
+        ignored: What is there and cannot be used, for people; else empty.
+    """
+
+    px: float | None = None
+    ignored: str = ""
+
+
+def read_exif_focal(image: Image.Image) -> ExifFocal:
+    """Read the focal length from EXIF; one that is implausible, or of a picture cropped since, is ignored."""
     tags = _read_tags(image)
     longer, shorter = max(image.size), min(image.size)
     taken = sorted(number for tag in (_WIDTH, _HEIGHT) if (number := _parse_positive(tags.get(tag))) is not None)
+    if not tags.get(_FOCAL_35MM) and tags.get(_FOCAL_MM) is None:  # 0 of 35 mm stands for unknown
+        return ExifFocal()
     if len(taken) == 2 and abs(taken[0] / taken[1] - shorter / longer) > MAX_ASPECT_CHANGE * shorter / longer:
-        return None
+        return ExifFocal(ignored="EXIF focal length of a picture that was cropped since")
     equivalent = _parse_positive(tags.get(_FOCAL_35MM))
     from_film = None if equivalent is None else equivalent * math.hypot(*image.size) / DIAGONAL_35MM
-    focal = from_film or _compute_from_sensor(tags, longer, taken)
-    return focal if focal is not None and SHORTEST * longer <= focal <= LONGEST * longer else None
+    for px in (from_film, _compute_from_sensor(tags, longer, taken)):
+        if px is not None and SHORTEST * longer <= px <= LONGEST * longer:
+            return ExifFocal(px)
+    return ExifFocal(ignored="EXIF focal length that cannot be used")
 
 
 def _read_tags(image: Image.Image) -> dict[int, Any]:
