@@ -268,6 +268,8 @@ class ExportConfig(StageSection):
     """Pairs deeper than this collide, and the scene is dropped [m]."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     """JPEG quality of `observation/color.jpg`, from which the textures are made too."""
+    surroundings: Literal["plain", "photograph"] = "plain"
+    """`photograph` shows the picture's table and background without its objects; `plain` a table of its colour."""
 
 
 class TrajectoriesConfig(StageSection):

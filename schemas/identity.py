@@ -9,7 +9,7 @@ from pydantic import AfterValidator
 
 MAX_LABEL_CHARS = 120
 MAX_STEM_CHARS = 80
-RESERVED_IDS = ("scene", "sky", "table", "world")  # names of a scene's own parts, which no object can have
+RESERVED_IDS = ("backdrop", "scene", "sky", "table", "world")  # names of a scene's own parts, which no object can have
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
 

@@ -10,14 +10,13 @@ from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
-from tableverse_factory.physics.mjcf.scenery import Rgb, make_geom_box, read_geom_color, read_geom_mesh
+from tableverse_factory.physics.mjcf.scenery import Rgb, make_geom_box, make_geom_plane, read_geom_color, read_geom_mesh
 from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.model_solids import body_name, make_geom_mesh
 
 # Lowercase names of supports, which are never taken for objects
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})
 HIDDEN_GROUP = 3  # geoms of this group and above are hidden in MuJoCo's viewer: usually shapes that only collide
-UNBOUNDED_PLANE_M = 1.0  # half the side drawn for an infinite plane [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,18 +95,12 @@ def _load_visual(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Po
     makers = {
         mujoco.mjtGeom.mjGEOM_MESH: read_geom_mesh,
         mujoco.mjtGeom.mjGEOM_BOX: make_geom_box,
-        mujoco.mjtGeom.mjGEOM_PLANE: _make_plane,
+        mujoco.mjtGeom.mjGEOM_PLANE: make_geom_plane,
     }
     shape = makers.get(mujoco.mjtGeom(model.geom_type[geom]), make_geom_mesh)(model, geom)
     if shape is None:
         return None
     return VisualMesh(_to_object_frame(shape, data, geom, pose), read_geom_color(model, geom))
-
-
-def _make_plane(model: mujoco.MjModel, geom: int) -> TriangleMesh:
-    x, y = (float(half) if half > 0.0 else UNBOUNDED_PLANE_M for half in model.geom_size[geom, :2])
-    corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
 
 
 def _compute_hull(model: mujoco.MjModel, data: mujoco.MjData, geom: int, pose: Pose) -> TriangleMesh | None:

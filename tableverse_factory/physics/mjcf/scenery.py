@@ -11,6 +11,7 @@ from schemas.geometry import Frozen, Texture, TriangleMesh
 from tableverse_factory.physics.mjcf.slab import THICKNESS_M, Slab
 
 Rgb = tuple[int, int, int]
+UNBOUNDED_PLANE_M = 1.0  # half the side drawn for an infinite plane [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,16 +74,28 @@ def _place_geom(
 
 
 def make_geom_box(model: mujoco.MjModel, geom: int) -> TriangleMesh:
-    """Make the geom's box in its own frame; its texture repeats as in MuJoCo, from the left edge and the far one."""
+    """Make the geom's box in its own frame, with its texture."""
     half = np.array(model.geom_size[geom])
-    box, picture = make_box_mesh(half), _read_texture(model, geom)
+    return _cover(make_box_mesh(half), half[:2], model, geom)
+
+
+def make_geom_plane(model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """Make the geom's plane in its own frame, with its texture; an infinite one is drawn as a rectangle."""
+    half = np.array([side if side > 0.0 else UNBOUNDED_PLANE_M for side in model.geom_size[geom, :2]])
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0.0]
+    sheet = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+    return _cover(sheet, half, model, geom)
+
+
+def _cover(mesh: TriangleMesh, half: np.ndarray, model: mujoco.MjModel, geom: int) -> TriangleMesh:
+    """Give a mesh the geom's texture, which repeats as in MuJoCo, from the left edge and the far one."""
+    picture, material = _read_texture(model, geom), int(model.geom_matid[geom])
     if picture is None:
-        return box
-    material = int(model.geom_matid[geom])
-    repeat = np.array(model.mat_texrepeat[material]) * (half[:2] if model.mat_texuniform[material] else 1.0)
-    share = (1.0 + box.vertices[:, :2] / half[:2] * [1.0, -1.0]) / 2
+        return mesh
+    repeat = np.array(model.mat_texrepeat[material]) * (half if model.mat_texuniform[material] else 1.0)
+    share = (1.0 + mesh.vertices[:, :2] / half * [1.0, -1.0]) / 2
     uv = share * repeat * [1.0, -1.0] + [0.0, 1.0]
-    return replace(box, texture=Texture(picture, uv[box.faces]))
+    return replace(mesh, texture=Texture(picture, uv[mesh.faces]))
 
 
 def read_geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh:

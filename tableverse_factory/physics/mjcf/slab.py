@@ -29,6 +29,10 @@ class Slab(Frozen):
         """Whether each point lies over or under the rectangle. Shape (n,)."""
         return (np.abs(_rotate_to_slab(points[:, :2] - self.center_xy, self.yaw)) <= self.half_size_xy).all(axis=1)
 
+    def to_table(self, along: Float64[np.ndarray, "n 2"]) -> Points:
+        """Points of the top in the table frame, from coordinates along the slab's own axes from its middle [m]."""
+        return np.column_stack([_rotate_to_slab(along, -self.yaw) + self.center_xy, np.zeros(len(along))])
+
 
 def fit_slab(table: Table, meshes: Sequence[TriangleMesh], poses: Sequence[Pose], scales: Sequence[float]) -> Slab:
     """Widen the table's rectangle until every object stands `OBJECT_MARGIN_M` inside its edges."""

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
+from jaxtyping import Float64
 
-from schemas.geometry import Frozen, Pose, TriangleMesh
+from schemas.geometry import Frozen, Pose, Quaternion, TriangleMesh, Vector3
 from schemas.identity import make_file_stem
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.geometry.math.camera import PosedCamera
@@ -23,7 +24,7 @@ from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import THICKNESS_M, Slab
 
 ASSETS = "assets"
-TABLE = "table"
+TABLE, BACKDROP = "table", "backdrop"
 VISUAL_GROUP, COLLISION_GROUP, TABLE_GROUP = 2, 3, 1
 TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
 TABLE_FRICTION = 0.8
@@ -32,6 +33,11 @@ TABLE_ROLLING_FRICTION = 1e-4  # a contact takes the larger of two frictions: th
 # to two steps. Objects at rest sink in by 0.02 mm instead of 0.4 mm at MuJoCo's defaults, and drift less.
 CONTACT_TIME_S = 0.005
 IMPEDANCE = (0.95, 0.99, 0.001)
+
+# Lamp over the table's middle, of the strength of the viewer's own lamp and of what comes from everywhere.
+LIGHT, TO_LIGHT = 0.45, np.array([-0.6, -0.8, 1.7])
+
+_PIXEL_M = 5e-6  # MuJoCo wants the size of a camera's sensor for its focal length and principal point in pixels
 
 _TETRAHEDRON_OBJ = (
     b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"
@@ -66,10 +72,22 @@ class SceneBody(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class TableTexture:
-    """A picture without a seam, repeated over the table every `tile_m` [m]."""
+    """A picture repeated over the table, its rows against the slab's y axis; `tile_m` along x and y [m]."""
 
     texture_png: bytes
-    tile_m: float
+    tile_m: tuple[float, float]
+    tint: float = 1.0  # factor of the texture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Backdrop(Frozen):
+    """A picture that stands behind the table and touches nothing; pose in the table frame, axes of a camera's image."""
+
+    texture_png: bytes
+    center: Vector3
+    quaternion_wxyz: Quaternion
+    half_size_xy: Float64[np.ndarray, "2"]
+    tint: float  # factor of the texture
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +126,14 @@ def make_scene_files(
     timestep_s: float = 0.002,
     view: PosedCamera | None = None,
     tabletop: TableTexture | None = None,
+    backdrop: Backdrop | None = None,
 ) -> SceneFiles:
     """Make MJCF text with its assets, visual meshes and textures included."""
     spec, assets = make_scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
     if tabletop is not None:
         _cover_table(spec, slab, tabletop, assets)
+    if backdrop is not None:
+        _add_backdrop(spec, backdrop, assets)
     if view is not None:
         _add_camera(spec, view)
     # MuJoCo writes the XML of compiled models only, and only the names of files: placeholders compile at once.
@@ -122,6 +143,12 @@ def make_scene_files(
     spec.compiler.usethread = True  # the XML does not bind its readers
     exact = {body.object_id: (quantize_pose(body.pose), body.properties) for body in bodies}
     return SceneFiles(make_portable_xml(spec.to_xml(), exact), assets)
+
+
+def compute_irradiance(normal: Vector3, to_eye: Vector3) -> float:
+    """Compute by which factor a texture is lit on the table's middle, for unit vectors."""
+    to_light = TO_LIGHT / np.linalg.norm(TO_LIGHT)
+    return LIGHT * (1.0 + max(float(normal @ to_eye), 0.0) + max(float(normal @ to_light), 0.0))
 
 
 def make_scene_spec(
@@ -165,7 +192,7 @@ def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     collision.solref[0] = max(CONTACT_TIME_S, 2 * timestep_s)
     collision.solimp[:3] = IMPEDANCE
     light = spec.visual.headlight
-    light.ambient, light.diffuse, light.specular = [0.45, 0.45, 0.45], [0.45, 0.45, 0.45], [0.1, 0.1, 0.1]
+    light.ambient, light.diffuse, light.specular = [LIGHT] * 3, [LIGHT] * 3, [0.1, 0.1, 0.1]
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
     sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=128, height=768)
     sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.93, 0.95, 0.98], [0.55, 0.6, 0.68]
@@ -182,28 +209,48 @@ def _add_table(spec: mujoco.MjSpec, slab: Slab) -> None:
     top.rgba = [*(np.array(slab.color) / 255.0), 1.0]
     # A spot: MuJoCo 3.3 and 4 name directional lights differently.
     light = spec.worldbody.add_light(name="key")
-    to_light = np.array([-0.6, -0.8, 1.7]) * max(1.0, float(np.linalg.norm(slab.half_size_xy)))
+    to_light = TO_LIGHT * max(1.0, float(np.linalg.norm(slab.half_size_xy)))
     light.pos, light.dir = np.array([*slab.center_xy, 0.0]) + to_light, -to_light
-    light.diffuse, light.specular, light.cutoff, light.exponent = [0.45, 0.45, 0.43], [0.1, 0.1, 0.1], 60.0, 1.0
+    light.diffuse, light.specular, light.cutoff, light.exponent = [LIGHT, LIGHT, 0.43], [0.1, 0.1, 0.1], 60.0, 1.0
 
 
 def _cover_table(spec: mujoco.MjSpec, slab: Slab, tabletop: TableTexture, assets: dict[str, bytes]) -> None:
-    assets[f"{ASSETS}/{TABLE}.png"] = tabletop.texture_png
-    spec.add_texture(name=TABLE, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{TABLE}.png")
-    material = spec.add_material(name=TABLE, specular=0.15, shininess=0.3)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = TABLE
+    material = _add_textured_material(spec, TABLE, tabletop.texture_png, assets)
+    material.specular, material.shininess = 0.15, 0.3
     material.texrepeat = 2 * slab.half_size_xy / tabletop.tile_m
-    spec.assets = assets
     top = spec.geom(TABLE)
-    top.material, top.rgba = TABLE, [1.0, 1.0, 1.0, 1.0]
+    top.material, top.rgba = TABLE, [tabletop.tint] * 3 + [1.0]
+
+
+def _add_backdrop(spec: mujoco.MjSpec, backdrop: Backdrop, assets: dict[str, bytes]) -> None:
+    material = _add_textured_material(spec, BACKDROP, backdrop.texture_png, assets)
+    material.specular = 0.0
+    body = spec.worldbody.add_body(name=BACKDROP, pos=backdrop.center)
+    body.quat = multiply_quaternions(backdrop.quaternion_wxyz, OPENCV_TO_OPENGL)
+    sheet = body.add_geom(spec.find_default("visual"), name=BACKDROP, type=mujoco.mjtGeom.mjGEOM_PLANE)
+    sheet.size, sheet.material = [*backdrop.half_size_xy, 1.0], BACKDROP
+    sheet.rgba = [backdrop.tint] * 3 + [1.0]
+
+
+def _add_textured_material(
+    spec: mujoco.MjSpec, name: str, texture_png: bytes, assets: dict[str, bytes]
+) -> mujoco.MjsMaterial:
+    assets[f"{ASSETS}/{name}.png"] = texture_png
+    spec.assets = assets
+    spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
+    material = spec.add_material(name=name)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    return material
 
 
 def _add_camera(spec: mujoco.MjSpec, view: PosedCamera) -> None:
     camera, pose = view.camera, view.camera_to_table
     eye = spec.worldbody.add_camera(name="observation")
     eye.pos, eye.quat = pose.position, multiply_quaternions(pose.quaternion_wxyz, OPENCV_TO_OPENGL)
-    eye.fovy = float(np.degrees(2 * np.arctan(camera.height / (2 * camera.fy))))
     eye.resolution = [camera.width, camera.height]
+    eye.sensor_size = [camera.width * _PIXEL_M, camera.height * _PIXEL_M]
+    eye.focal_pixel = [camera.fx, camera.fy]
+    eye.principal_pixel = [(camera.width - 1) / 2 - camera.cx, (camera.height - 1) / 2 - camera.cy]
 
 
 def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) -> mujoco.MjsBody:
@@ -227,10 +274,8 @@ def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, asse
     if body.appearance is None:
         geom.rgba = [*(np.array(body.color) / 255.0), 1.0]
         return
-    assets[f"{ASSETS}/{name}.png"] = body.appearance.texture_png
-    spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
-    material = spec.add_material(name=name, specular=0.2, shininess=0.3)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    material = _add_textured_material(spec, name, body.appearance.texture_png, assets)
+    material.specular, material.shininess = 0.2, 0.3
     geom.material = name
 
 

@@ -141,8 +141,9 @@ def _move_camera(root: ET.Element, rng: np.random.Generator) -> None:
         before = np.array(_numbers(eye.get("quat", "")) or [1.0, 0.0, 0.0, 0.0])
         small = normalize_quaternion(np.array([1.0, *(turn / 2)]))
         eye.set("quat", _text(multiply_quaternions(normalize_quaternion(before), small)))
-    if "fovy" in eye.attrib:
-        eye.set("fovy", _text(zoom * np.array(_numbers(eye.get("fovy", "")))))
+    for angle_or_focal, factor in (("fovy", zoom), ("focalpixel", 1 / zoom)):
+        if angle_or_focal in eye.attrib:
+            eye.set(angle_or_focal, _text(factor * np.array(_numbers(eye.get(angle_or_focal, "")))))
 
 
 def _add_camera(root: ET.Element, world: ET.Element, rng: np.random.Generator) -> None:

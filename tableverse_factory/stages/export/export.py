@@ -17,13 +17,21 @@ from tableverse_factory.physics.bodies.materials import estimate_mass_kg
 from tableverse_factory.physics.bodies.prior_mass import apply_material_friction
 from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, SceneFiles, TableTexture, make_scene_body, make_scene_files
+from tableverse_factory.physics.mjcf.spec import (
+    Backdrop,
+    SceneBody,
+    SceneFiles,
+    TableTexture,
+    make_scene_body,
+    make_scene_files,
+)
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, increase_rolling_friction, move_bodies
 from tableverse_factory.sources.textures.catalogue import TILE_M
 from tableverse_factory.stages.export.meta import build_meta_json
 from tableverse_factory.stages.export.projected_color import ColorProjector, load_projectors
 from tableverse_factory.stages.export.rows import build_object_rows, build_scene_row, build_task_rows
+from tableverse_factory.stages.export.surroundings import photograph_backdrop, photograph_table
 from tableverse_factory.stages.export.tabletop import draw_tabletop_texture
 from tableverse_factory.stages.export.texture import bake_texture
 
@@ -51,11 +59,25 @@ def export(
         return Dropped("unusable_mesh", str(error))
     objects = layout.placed.objects
     slab = fit_slab(layout.placed.table, [o.mesh for o in objects], layout.poses, [o.scale for o in objects])
-    tabletop = TableTexture(draw_tabletop_texture(rng, slab.color), TILE_M)
-    written = _settle_and_certify(scene, bodies, slab, tabletop, config)
+    written = _settle_and_certify(scene, bodies, slab, _dress(scene, slab, config, rng), config)
     if (reason := _explain_refusal(written, config.export.epsilon_m)) is not None:
         return reason
     return Done(_assemble(scene, written))
+
+
+@dataclass(frozen=True, slots=True)
+class _Scenery:
+    """Looks of what is not an object."""
+
+    tabletop: TableTexture
+    backdrop: Backdrop | None = None
+
+
+def _dress(scene: CuratedScene, slab: Slab, config: Config, rng: np.random.Generator) -> _Scenery:
+    evidence = scene.settled.rectified.placed.evidence
+    if config.export.surroundings == "photograph" and evidence is not None:
+        return _Scenery(photograph_table(evidence, slab), photograph_backdrop(evidence, slab))
+    return _Scenery(TableTexture(draw_tabletop_texture(rng, slab.color), (TILE_M, TILE_M)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +109,7 @@ def _build_bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
 
 
 def _settle_and_certify(
-    scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, tabletop: TableTexture, config: Config
+    scene: CuratedScene, bodies: Sequence[SceneBody], slab: Slab, scenery: _Scenery, config: Config
 ) -> _CertifiedFiles:
     """Write the scene and settle it until the certificate finds it at rest, at most `SETTLINGS` times."""
     layout, step, limit = scene.settled.rectified, config.settle.timestep_s, config.settle.max_time_s
@@ -97,7 +119,14 @@ def _settle_and_certify(
     for attempt in range(SETTLINGS):
         if not rests:
             bodies, _ = bring_to_rest(bodies, slab, timestep_s=step, max_time_s=limit, gentle=attempt > 0)
-        files = make_scene_files(bodies, slab, model_name=scene.scene_id, timestep_s=step, view=view, tabletop=tabletop)
+        files = make_scene_files(
+            *(bodies, slab),
+            model_name=scene.scene_id,
+            timestep_s=step,
+            view=view,
+            tabletop=scenery.tabletop,
+            backdrop=scenery.backdrop,
+        )
         certificate, measured = certify(files.model(), history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break

@@ -90,7 +90,7 @@ class PhotographedMesh:
 
     def sample_colors(self, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
         """Sample the picture's sRGB at pixels."""
-        return _sample_bilinear(self._photograph.color, pixels)
+        return sample_bilinear(self._photograph.color, pixels)
 
     @property
     def texels_per_metre(self) -> float:
@@ -98,7 +98,8 @@ class PhotographedMesh:
         return self._photograph.texels_per_metre
 
 
-def _sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+def sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    """Sample sRGB at pixels (u, v), which are clipped to the picture."""
     height, width = picture.shape[:2]
     u, v = np.clip(pixels, 0, [width - 1, height - 1]).T
     left, top = np.minimum(u.astype(np.int64), width - 2), np.minimum(v.astype(np.int64), height - 2)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from schemas.geometry import Camera, Pose, TriangleMesh
 from schemas.identity import find_name_clashes
-from tableverse_factory.geometry.math.camera import PosedCamera
+from tableverse_factory.geometry.math.camera import PosedCamera, project
 from tableverse_factory.geometry.math.transforms import (
     identity_pose,
     normalize_quaternion,
@@ -137,7 +137,7 @@ def test_an_open_mesh_and_a_sliver_load() -> None:
         (["table", "world", "mug"], ["table", "world"]),
         (["mug", "mug_piece_00"], ["mug_piece_00"]),
         (["Mug", "mug"], ["mug"]),
-        (["sky", "Scene", "Table"], ["sky", "Scene", "Table"]),
+        (["sky", "Scene", "Table", "backdrop"], ["sky", "Scene", "Table", "backdrop"]),
     ],
 )
 def test_ids_that_cannot_share_a_scene(ids: list[str], bad: list[str]) -> None:
@@ -152,7 +152,7 @@ def test_the_longest_id_still_fits_a_tar() -> None:
 
 
 def test_the_pictures_camera_sees_what_the_picture_saw() -> None:
-    camera = Camera(600.0, 600.0, 320.0, 240.0, 640, 480)
+    camera = Camera(600.0, 620.0, 300.5, 251.0, 640, 480)
     # In the table frame: half a metre up, looking straight down, x of the picture along x of the table.
     looking_down = Pose(np.array([0.0, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]))
     files = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB, view=PosedCamera(camera, looking_down))
@@ -160,7 +160,15 @@ def test_the_pictures_camera_sees_what_the_picture_saw() -> None:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.cam_xmat[0].reshape(3, 3), np.eye(3), atol=1e-9)  # MuJoCo's cameras look along -z
-    assert model.cam_fovy[0] == pytest.approx(np.degrees(2 * np.arctan(240 / 600)))
+    drawn, eye = mujoco.MjvScene(model, 100), mujoco.MjvCamera()
+    eye.type, eye.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, eye, mujoco.mjtCatBit.mjCAT_ALL, drawn)
+    lens = drawn.camera[0]
+    point = np.array([[0.11, -0.07, 0.4]])  # before the camera [m]
+    x, y = point[0, :2] / point[0, 2] * lens.frustum_near
+    u = 320 * (1 + (x - lens.frustum_center) / lens.frustum_width) - 0.5
+    v = 480 * (lens.frustum_top + y) / (lens.frustum_top - lens.frustum_bottom) - 0.5
+    np.testing.assert_allclose([[u, v]], project(point, camera), atol=1e-2)
 
 
 @given(st.floats(-0.7, 0.7), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
