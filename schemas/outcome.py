@@ -1,11 +1,15 @@
 """Outcome of a stage: the next record, a reason to drop the scene, or an error; and the cost of its model requests."""
 
 from dataclasses import astuple, dataclass
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
+
+from pydantic import ConfigDict
 
 T = TypeVar("T", covariant=True)
 
 MAX_DETAIL_CHARS = 2000
+CHECKED = ConfigDict(revalidate_instances="always", strict=True)
+"""Configuration of records in files that may come from elsewhere: pydantic checks their fields (`dataset.journals`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +56,8 @@ Outcome = Done[T] | Dropped | Failed
 @dataclass(frozen=True, slots=True)
 class ModelCost:
     """Cost of requests with retries: tokens as servers counted them, or 0; the configured price [USD]."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = CHECKED
 
     calls: int = 0
     input_tokens: int = 0

@@ -1,10 +1,12 @@
 """Messages between executors: a call of a stage, its report, and the finished result of a scene."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import ConfigDict, Field, NonNegativeInt
 
 from schemas.manifest import ImageRow
-from schemas.outcome import NO_COST, UNLIMITED, Allowance, Dropped, Failed, ModelCost
+from schemas.outcome import CHECKED, NO_COST, UNLIMITED, Allowance, Dropped, Failed, ModelCost
 
 Status = Literal["done", "dropped", "failed"]
 
@@ -61,10 +63,12 @@ class StageReport:
 class ScenePart:
     """Place of a finished scene until its shard is committed (see `dataset.parts`)."""
 
-    file: str  # in the shard's folder of parts
-    offset: int  # of the frame of its rows; that of its files follows [bytes]
-    rows_size: int  # of the encoded rows [bytes]
-    files_size: int  # of its files as members of a tar [bytes]
+    __pydantic_config__: ClassVar[ConfigDict] = CHECKED
+
+    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]  # in the shard's folder of parts
+    offset: NonNegativeInt  # of the frame of its rows; that of its files follows [bytes]
+    rows_size: NonNegativeInt  # of the encoded rows [bytes]
+    files_size: NonNegativeInt  # of its files as members of a tar [bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +86,8 @@ class StageChainReport:
 class StageTiming:
     """Time of one stage on one scene [s]."""
 
+    __pydantic_config__: ClassVar[ConfigDict] = CHECKED
+
     stage: str
     cpu_s: float
     wall_s: float
@@ -90,6 +96,8 @@ class StageTiming:
 @dataclass(frozen=True, slots=True)
 class SceneResult:
     """Result of a scene, as the journal keeps it until its shard is committed."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = CHECKED
 
     row: ImageRow
     status: Status

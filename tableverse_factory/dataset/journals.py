@@ -12,18 +12,22 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import BinaryIO
 
+from pydantic import TypeAdapter
 from upath import UPath
 
 from schemas.codec import decode
 from schemas.work import SceneResult
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import scan_frames
 from tableverse_factory.core.storage.files import StoragePath, list_names, list_sizes, read_range, read_whole
+from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.dataset.shards import shard_stem
 
 WORK = ".work"  # folder in OUT of what a build needs until it is complete
 SUFFIX = ".journal"
 RESULT, REOPEN = b"+", b"-"  # first byte of a frame's label; the scene id follows
 _NAME = re.compile(rf"shard-(\d{{5,9}}){re.escape(SUFFIX)}")
+_RESULT = TypeAdapter(SceneResult)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +82,7 @@ def read_journal(path: StoragePath, start: int = 0) -> JournalState:
 def read_result(path: StoragePath, entry: JournalEntry) -> SceneResult:
     """Read the result at `entry`; FileNotFoundError if the journal is gone, because its shard was committed."""
     source = path / segment_name(entry.segment) if isinstance(path, UPath) else path
-    result: SceneResult = decode(read_range(source, entry.offset - entry.segment, entry.size))
-    return result
+    return _decode_result(path, read_range(source, entry.offset - entry.segment, entry.size))
 
 
 def read_results(path: StoragePath) -> dict[str, SceneResult]:
@@ -90,7 +93,7 @@ def read_results(path: StoragePath) -> dict[str, SceneResult]:
             found.pop(scene_id, None)
             if kind == RESULT:
                 found[scene_id] = data[entry.offset - first :][: entry.size]
-    return {scene_id: decode(data) for scene_id, data in found.items()}
+    return {scene_id: _decode_result(path, data) for scene_id, data in found.items()}
 
 
 def find_journal_end(path: StoragePath) -> int:
@@ -103,6 +106,17 @@ def find_journal_end(path: StoragePath) -> int:
 def segment_name(start: int) -> str:
     """Name of the object of a journal that begins at `start` [bytes]."""
     return f"{start:015d}"
+
+
+def _decode_result(path: StoragePath, data: bytes) -> SceneResult:
+    """Decode and check a result: a dataset from elsewhere may have a journal that no build wrote."""
+    try:
+        return _RESULT.validate_python(decode(data))
+    except ValueError as error:
+        why = sanitize_line(describe_error(error))
+        raise BuildError(
+            f"{path} is no journal of a build ({why}): delete it, and the next run computes its scenes again"
+        ) from error
 
 
 def _read_segments(path: StoragePath, start: int = 0) -> Iterator[tuple[int, bytes]]:
@@ -127,7 +141,7 @@ def _read_objects(folder: UPath, start: int) -> JournalState:
 def _scan_frames(stream: BinaryIO, start: int, base: int = 0) -> Iterator[_Frame]:
     """Read the whole frames of a file or object up to the first torn one; `base` is where it begins in the journal."""
     for span in scan_frames(stream, start):
-        yield span.label[:1], span.label[1:].decode(), JournalEntry(base + span.offset, span.size, base)
+        yield span.label[:1], span.label[1:].decode(errors="replace"), JournalEntry(base + span.offset, span.size, base)
 
 
 def _fold_frames(frames: Iterable[_Frame], end: int) -> JournalState:

@@ -18,11 +18,12 @@ from schemas.codec import decode, encode
 from schemas.scene import ExportedScene
 from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES, normalize_row
 from schemas.work import ScenePart
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import HEADER_BYTES, FrameError, encode_header, read_frame
 from tableverse_factory.core.storage.append_files import AppendFiles
 from tableverse_factory.core.storage.files import StoragePath, read_range, write_atomic
 from tableverse_factory.dataset.journals import WORK
-from tableverse_factory.dataset.shards import TarShard, shard_stem
+from tableverse_factory.dataset.shards import TarShard, check_rows, shard_stem
 
 _SUFFIX = ".parts"
 _NAME = re.compile(rf"shard-(\d{{5,9}}){re.escape(_SUFFIX)}")
@@ -71,12 +72,12 @@ def read_part_rows(out: StoragePath, shard: int, part: ScenePart) -> SceneRows:
     """Read the rows that the scene itself determines; FrameError if they are damaged, FileNotFoundError if gone."""
     data = _read_frame(out, shard, part, part.offset, _LABELS[0], part.rows_size)
     try:
-        tables = decode(data)
-        return {
-            name: [normalize_row(row, schema) for row in rows]
-            for (name, schema), rows in zip(_SCHEMAS.items(), tables, strict=True)
-        }
-    except (AttributeError, TypeError, ValueError) as error:
+        rows = dict(zip(_SCHEMAS, decode(data), strict=True))
+        (_,) = rows["scenes"]
+        for name, schema in _SCHEMAS.items():
+            check_rows(name, schema, rows[name])
+        return {name: [normalize_row(row, schema) for row in rows[name]] for name, schema in _SCHEMAS.items()}
+    except (AttributeError, TypeError, ValueError, BuildError) as error:
         raise FrameError(f"no rows of a scene: {error}") from error
 
 

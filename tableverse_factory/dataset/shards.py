@@ -122,12 +122,26 @@ def check_exported(scene: ExportedScene, scene_id: str) -> None:
         ("task", TASKS, scene.task_rows),
         ("trajectory", TRAJECTORIES, scene.trajectory_rows),
     ):
-        _check_rows(what, schema, rows)
+        check_rows(what, schema, rows)
     if any(row["scene_id"] != scene_id for row in (*scene.object_rows, *scene.task_rows, *scene.trajectory_rows)):
         raise BuildError("every row of an object, a task or a trajectory must name its scene in scene_id")
     task_ids = [str(row["task_id"]) for row in scene.task_rows]
     for misfit in find_misfits(scene.trajectory_rows, dict(scene.files), task_ids):
         raise BuildError(misfit)
+
+
+def check_rows(what: str, schema: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Check that rows fit their table."""
+    for row in rows:
+        unknown = sorted(set(row) - set(schema.names))
+        if unknown:
+            raise BuildError(f"unknown columns {unknown[:5]} in a row of the {what} table")
+    try:
+        given = dict.fromkeys(name for row in rows for name, value in row.items() if value is not None)
+        for name in given:  # most columns of a row are empty: they cost nothing
+            pa.array([row.get(name) for row in rows], schema.field(name).type)
+    except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
+        raise BuildError(f"a row does not fit the {what} table: {' '.join(str(error).split())[:300]}") from error
 
 
 def advise_repair(path: StoragePath) -> str:
@@ -139,16 +153,3 @@ def _make_member(scene_id: str, name: str, size: int) -> tarfile.TarInfo:
     member = tarfile.TarInfo(f"{scene_id}/{name}")
     member.size, member.mtime, member.mode = size, 0, 0o644
     return member
-
-
-def _check_rows(what: str, schema: pa.Schema, rows: Sequence[Mapping[str, Any]]) -> None:
-    for row in rows:
-        unknown = sorted(set(row) - set(schema.names))
-        if unknown:
-            raise BuildError(f"unknown columns {unknown[:5]} in a row of the {what} table")
-    try:
-        given = dict.fromkeys(name for row in rows for name, value in row.items() if value is not None)
-        for name in given:  # most columns of a row are empty: they cost nothing
-            pa.array([row.get(name) for row in rows], schema.field(name).type)
-    except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
-        raise BuildError(f"a row does not fit the {what} table: {' '.join(str(error).split())[:300]}") from error

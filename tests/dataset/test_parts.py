@@ -1,10 +1,14 @@
 """A part gives back what was written, or says that it does not."""
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tableverse_factory.core.framing import FrameError
+from schemas.codec import encode
+from schemas.work import ScenePart
+from tableverse_factory.core.framing import FrameError, encode_header
 from tableverse_factory.dataset.parts import PartWriter, parts_folder, read_part_files, read_part_rows
 from tableverse_factory.dataset.tar_members import read_scene_files
 from tableverse_factory.evaluation.bench.noop_pipeline import make_minimal_scene
@@ -41,3 +45,27 @@ def test_a_flipped_bit_is_never_believed(tmp_path_factory, at, bit):
     with pytest.raises(FrameError):  # noqa: PT012 either of them
         read_part_rows(out, 0, part)
         read_part_files(out, 0, part)
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        (3, 4, 5, 6),
+        ((), (), ()),
+        ((), (), (), ()),
+        (({}, {}), (), (), ()),
+        ((3,), (), (), ()),
+        (({"n_objects": "many"},), (), (), ()),
+        (({"n_objects": 10**30},), (), (), ()),
+        (({"mesh_licences": 5},), (), (), ()),
+        (({},), ({"mass_kg": {"a": 1}},), (), ()),
+        (({},), (), ({"no_column": 1},), ()),
+    ],
+)
+def test_rows_that_fit_no_table_count_as_damaged(tmp_path, tables):
+    data = encode(tables)
+    folder = Path(parts_folder(tmp_path, 0))
+    folder.mkdir(parents=True)
+    (folder / "0.parts").write_bytes(encode_header(data, b"rows") + data)
+    with pytest.raises(FrameError):
+        read_part_rows(tmp_path, 0, ScenePart("0.parts", 0, len(data), 0))
