@@ -69,13 +69,13 @@ def read_journal(path: StoragePath, start: int = 0) -> JournalState:
 
     In a store a damaged object loses only its own frames.
     """
-    if isinstance(path, UPath):
-        return _read_objects(path, start)
     try:
+        if isinstance(path, UPath):
+            return _read_objects(path, start)
         with path.open("rb") as file:
             state = _fold_frames(_scan_frames(file, start), start)
             return replace(state, lost=max(os.fstat(file.fileno()).st_size - state.end, 0))
-    except (FileNotFoundError, NotADirectoryError):
+    except (FileNotFoundError, NotADirectoryError):  # also if its shard is committed just now
         return replace(EMPTY_JOURNAL, end=start)
 
 
@@ -86,13 +86,16 @@ def read_result(path: StoragePath, entry: JournalEntry) -> SceneResult:
 
 
 def read_results(path: StoragePath) -> dict[str, SceneResult]:
-    """Read the latest result of each scene of a journal; none if it is missing."""
+    """Read the latest result of each scene of a journal; none if it is missing, or removed meanwhile."""
     found: dict[str, bytes] = {}
-    for first, data in _read_segments(path):
-        for kind, scene_id, entry in _scan_frames(io.BytesIO(data), 0, first):
-            found.pop(scene_id, None)
-            if kind == RESULT:
-                found[scene_id] = data[entry.offset - first :][: entry.size]
+    try:
+        for first, data in _read_segments(path):
+            for kind, scene_id, entry in _scan_frames(io.BytesIO(data), 0, first):
+                found.pop(scene_id, None)
+                if kind == RESULT:
+                    found[scene_id] = data[entry.offset - first :][: entry.size]
+    except FileNotFoundError:
+        return {}
     return {scene_id: _decode_result(path, data) for scene_id, data in found.items()}
 
 
@@ -100,7 +103,10 @@ def find_journal_end(path: StoragePath) -> int:
     """Find where a journal ends, torn frames included [bytes]; 0 if there is none."""
     if isinstance(path, UPath):
         return max((int(name) + size for name, size in list_sizes(path).items()), default=0)
-    return path.stat().st_size if path.exists() else 0
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
 
 
 def segment_name(start: int) -> str:
@@ -123,7 +129,7 @@ def _read_segments(path: StoragePath, start: int = 0) -> Iterator[tuple[int, byt
     """Read the objects of a journal that begin at `start` or later, or its one file."""
     if isinstance(path, UPath):
         yield from ((int(name), read_whole(path / name)) for name in list_names(path) if int(name) >= start)
-    elif path.exists():
+    else:
         yield 0, path.read_bytes()
 
 

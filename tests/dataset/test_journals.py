@@ -1,5 +1,7 @@
 """Journals of a dataset from elsewhere: what no build wrote is refused, and no other file is read."""
 
+import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -10,7 +12,15 @@ from schemas.work import ScenePart, SceneResult
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import encode_header
-from tableverse_factory.dataset.journals import RESULT, journal_path, read_journal, read_result
+from tableverse_factory.dataset.journals import (
+    RESULT,
+    find_journal_end,
+    journal_path,
+    read_journal,
+    read_result,
+    read_results,
+)
+from workers.state.journal import open_journal
 
 ROW = ImageRow(scene_id="a-1", kind=SceneKind.CAPTURE, uri="/x")
 PART = ScenePart("0.parts", 0, 1000, 1000)
@@ -46,3 +56,28 @@ def test_a_frame_that_is_no_result_is_refused_in_one_line(tmp_path, payload):
     assert len(str(refused.value)) < 1000
     with pytest.raises(BuildError, match="delete it"):
         read_result(path, read_journal(path).results["a-1"])
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("place", ["tmp_path", "store"])
+def test_a_journal_that_goes_while_it_is_read_counts_as_missing(place, request):
+    """Shards are committed, and their journals removed, while others read the dataset."""
+    path, ended = journal_path(request.getfixturevalue(place), 0), threading.Event()
+
+    def write() -> None:
+        while not ended.is_set():
+            journal = open_journal(path)
+            journal.record(replace(DONE, part=None))
+            journal.flush()
+            journal.remove()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        until = time.monotonic() + 2.0
+        while time.monotonic() < until:
+            assert read_results(path).keys() | read_journal(path).results.keys() <= {"a-1"}
+            assert find_journal_end(path) >= 0
+    finally:
+        ended.set()
+        writer.join()
