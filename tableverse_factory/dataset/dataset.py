@@ -212,8 +212,10 @@ class Dataset:
             raise InputError(f"scene {scene_id} has no files: {_describe_loss(row)}")
         data = self._read_part(scene_id) if row["tar_offset"] == NO_OFFSET else self._read_scene_bytes(row, shard)
         if data is None:  # its shard was committed meanwhile
-            row = self._read_committed_rows(shard, scene_id, "scenes")[0]
-            data = self._read_scene_bytes(row, shard)
+            rows = self._read_committed_rows(shard, scene_id, "scenes")
+            if not rows:
+                raise InputError(f"scene {scene_id}: its files are gone; the next run of its build makes them again")
+            row, data = rows[0], self._read_scene_bytes(rows[0], shard)
         return Scene(scene_id, row, read_scene_files(scene_id, data), partial(self._read_rows, shard, scene_id))
 
     def _read_part(self, scene_id: str) -> bytes | None:

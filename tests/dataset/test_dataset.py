@@ -1,5 +1,6 @@
 """The consumer's side: tables of committed shards, a scene from its own bytes, clear words where there is none."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,10 +11,16 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import OBJECTS, SCENES, TASKS
+from schemas.work import SceneResult
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.journals import WORK, journal_path
+from tableverse_factory.dataset.parts import PartWriter
+from tableverse_factory.evaluation.bench.noop_pipeline import make_minimal_scene
 from tests.helpers.small_dataset import TETRAHEDRON, scene_files, write_small_dataset
+from workers.state.journal import open_journal
 
 
 @pytest.fixture
@@ -220,3 +227,17 @@ def test_importing_the_package_is_cheap():
 
     with pytest.raises(AttributeError, match="no attribute 'open_datset'"):
         _ = tableverse_factory.open_datset
+
+
+def test_a_part_that_is_removed_before_its_shard_is_committed_is_said_in_one_line(tmp_path):
+    (tmp_path / "run.json").write_text("{}")
+    row = ImageRow(scene_id="s-0", kind=SceneKind.CAPTURE, uri="/x")
+    part = PartWriter(tmp_path).write(0, make_minimal_scene("s-0"))
+    journal = open_journal(journal_path(tmp_path, 0))
+    journal.record(SceneResult(row, "done", "export", part=part))
+    journal.close()
+    dataset = open_dataset(tmp_path)
+    assert dataset.scene("s-0").files()
+    shutil.rmtree(tmp_path / WORK)
+    with pytest.raises(InputError, match="s-0: its files are gone; the next run"):
+        dataset.scene("s-0")
