@@ -1,11 +1,8 @@
 """Invalidation of scenes: the next build computes them again and rewrites their shards."""
 
-import os
 from collections.abc import Collection
 
-from upath import UPath
-
-from tableverse_factory.core.storage.files import StoragePath, make_write_error, sync_folder
+from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.dataset.journals import WORK, journal_path
 from tableverse_factory.dataset.shard_plan import Plan, read_plan
 from workers.state.commit import publish_ready
@@ -29,21 +26,6 @@ def invalidate_scenes(out: StoragePath, plan: Plan, scene_ids: Collection[str]) 
         journal = open_journal(journal_path(out, shard))
         for scene_id in members:
             journal.reopen(scene_id)
+        journal.flush()  # before run.json is written: a power loss must not keep only the latter
         journal.close()
-        _sync_journal(journal_path(out, shard))
     return len(by_shard)
-
-
-def _sync_journal(journal: StoragePath) -> None:
-    """Flush a journal to the disk before run.json is written: a power loss must not keep only the latter."""
-    if isinstance(journal, UPath):
-        return
-    try:
-        descriptor = os.open(journal, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        sync_folder(journal.parent)
-    except OSError as error:
-        raise make_write_error(journal, error) from error

@@ -1,5 +1,6 @@
 """Writers of journals: results of scenes whose shard is not committed yet (see `dataset.journals`)."""
 
+import os
 import time
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -10,7 +11,13 @@ from schemas.codec import encode
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import encode_header
-from tableverse_factory.core.storage.files import StoragePath, get_store, make_write_error, remove_folder
+from tableverse_factory.core.storage.files import (
+    StoragePath,
+    get_store,
+    make_write_error,
+    remove_folder,
+    sync_folder,
+)
 from tableverse_factory.dataset.journals import REOPEN, RESULT, read_journal, segment_name
 
 MAX_BUFFER_BYTES = 8 * 1024**2
@@ -42,7 +49,7 @@ class Journal(ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Write what waits."""
+        """Write what waits; then it survives a loss of power, and all machines see it."""
 
     @abstractmethod
     def close(self) -> None:
@@ -75,7 +82,12 @@ class FileJournal(Journal):
         """Do nothing: every result is on the disk when it is recorded."""
 
     def flush(self) -> None:
-        """Do nothing, likewise."""
+        """Flush the file and its name; before, other machines of a network file system may not see all of it."""
+        try:
+            os.fsync(self._file.fileno())
+            sync_folder(self._path.parent)
+        except OSError as error:
+            raise make_write_error(self._path, error) from error
 
     def close(self) -> None:
         """Close the file, which stays."""

@@ -1,13 +1,15 @@
 """A kill at any step of a commit leaves a dataset that the next start completes, with the same bytes."""
 
 import itertools
+import os
 import shutil
+from pathlib import Path
 
 import pytest
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.dataset.journals import journal_path
-from tableverse_factory.dataset.shard_plan import read_plan
+from tableverse_factory.dataset.shard_plan import make_plan, read_plan
 from tableverse_factory.dataset.shards import FOLDERS, is_committed, shard_path
 from tests.helpers.builds import build, compute, digests, write_manifest
 from workers.plan.read_manifest import read_manifest
@@ -150,3 +152,21 @@ def _reopen_with_its_own_result(manifest, out):
     journal.reopen(row.scene_id)
     journal.close()
     return compute(row, out)
+
+
+def test_the_journal_is_on_the_disk_before_a_worker_is_told_to_read_it(tmp_path, monkeypatch):
+    """The worker may be on another machine, which sees through a network file system what was flushed."""
+    (row,) = read_manifest(write_manifest(tmp_path / "m.parquet", ["fine"]))
+    ledger = Ledger(tmp_path / "out", make_plan([row], 4))
+    flushed: dict[Path, int] = {}
+    fsync = os.fsync
+
+    def note(descriptor):
+        flushed[Path(f"/proc/self/fd/{descriptor}").readlink()] = os.fstat(descriptor).st_size
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", note)
+    assert ledger.record(0, compute(row, tmp_path / "out")) is not None
+    journal = journal_path(tmp_path / "out", 0)
+    assert flushed[journal] == journal.stat().st_size
+    ledger.close()
