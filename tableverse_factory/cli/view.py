@@ -1,14 +1,21 @@
 """`tableverse view`: scenes in the browser."""
 
+import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli.arm import check_robot_option
 from tableverse_factory.cli.options import Robot
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import pluralize
+
+if TYPE_CHECKING:
+    from tableverse_factory.viz.viewer.scene_cache import SceneCache
+
+_MAX_SKIPPED = 100  # damaged scenes
 
 
 def view(
@@ -51,11 +58,11 @@ def view(
     if not single:
         check_robot_option(out, robot, needed=False)
     scenes = SceneCache(load_scene_file(Path(out)) if single else open_dataset(out))
-    first = scene_id or scenes.first()
+    first = scene_id or _open_first(scenes)
     if first is None:
         raise InputError(f"{out}: no scene is done yet")
-    if single or scenes.find_dropped_row(first) is None:
-        scenes.open(first)
+    if scene_id is not None and scenes.find_dropped_row(scene_id) is None:
+        scenes.open(scene_id)
     ended = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     viewer = Viewer(scenes, first, host, port, robot, allow_origin or ())
@@ -65,3 +72,20 @@ def view(
             ended.wait()
     finally:
         viewer.stop()
+
+
+def _open_first(scenes: "SceneCache") -> str | None:
+    """Open the first finished scene that is whole; without a finished one, return the first of any status."""
+    problem: InputError | None = None
+    for skipped, scene_id in enumerate(scenes.search("", "done").scene_ids[:_MAX_SKIPPED]):
+        try:
+            scenes.open(scene_id)
+        except InputError as error:
+            problem = problem or error
+            continue
+        if problem is not None:
+            print(f"skipped {pluralize(skipped, 'damaged scene')}: {problem}", file=sys.stderr)
+        return scene_id
+    if problem is not None:
+        raise problem
+    return scenes.first()

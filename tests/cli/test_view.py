@@ -1,14 +1,19 @@
 """`tableverse view` as people start it: a line with the address, errors of one line, an end without a word."""
 
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import urllib.request
+from contextlib import contextmanager
+from urllib.parse import urlsplit
 
 import pytest
 
+from tableverse_factory import open_dataset
+from tableverse_factory.dataset.shards import shard_path
 from tests.helpers.viewer_dataset import scene_of, write_viewed_dataset
 
 COMMAND = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()", "view"]
@@ -19,14 +24,10 @@ def dataset(tmp_path_factory):
     return write_viewed_dataset(tmp_path_factory.mktemp("viewed") / "out")
 
 
-@pytest.mark.heavy
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_it_prints_its_address_answers_and_ends_cleanly(tmp_path, dataset, stop):
-    source = dataset
-    if stop == signal.SIGTERM:
-        scene_of().extract(tmp_path / "scene")
-        source = tmp_path / "scene" / "scene.xml"
-    started = subprocess.Popen(
+@contextmanager
+def started(source, stop=signal.SIGTERM):
+    """A viewer, until the end of the block; then `communicate` gives what it wrote."""
+    process = subprocess.Popen(
         [*COMMAND, str(source), "--port", "0"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -35,14 +36,29 @@ def test_it_prints_its_address_answers_and_ends_cleanly(tmp_path, dataset, stop)
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a background shell ignores it
     )
     try:
-        url = started.stdout.readline().strip()
+        yield process
+    finally:
+        process.send_signal(stop)
+        process.wait(timeout=120)
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_it_prints_its_address_answers_and_ends_cleanly(tmp_path, dataset, stop):
+    source = dataset
+    if stop == signal.SIGTERM:
+        scene_of().extract(tmp_path / "scene")
+        source = tmp_path / "scene" / "scene.xml"
+    with started(source, stop) as view:
+        url = view.stdout.readline().strip()
         assert url.startswith("http://127.0.0.1:")
+        for request in (b"HEAD / HTTP/1.1\r\n\r\n", b"no HTTP\r\n\r\n"):
+            with socket.create_connection(("127.0.0.1", urlsplit(url).port)) as other:
+                other.sendall(request)
+                assert other.recv(1) == b"", "it hangs up"
         with urllib.request.urlopen(url, timeout=120) as page:  # noqa: S310 - our own server
             assert b"<html" in page.read()
-    finally:
-        started.send_signal(stop)
-        said, complained = started.communicate(timeout=120)
-    assert (started.returncode, said, complained) == (0, "", "")
+    assert (view.returncode, *view.communicate()) == (0, "", "")
 
 
 def test_a_port_in_use_is_said_in_one_line(dataset, run):
@@ -72,3 +88,31 @@ def test_mistakes_are_told_in_one_line(dataset, run, arguments, said):
     assert (code, out) == (1, "")
     assert said in complained
     assert complained.count("\n") == 2, "the error, and where to read on"
+
+
+@pytest.mark.heavy
+def test_a_damaged_scene_is_skipped_in_one_line(tmp_path, dataset):
+    out = tmp_path / "out"
+    shutil.copytree(dataset, out)
+    _damage(out, "a-1")
+    with started(out) as view:
+        assert view.stdout.readline().startswith("http://127.0.0.1:")
+    assert view.communicate()[1].startswith("skipped 1 damaged scene: scene a-1: ")
+
+
+def test_where_all_scenes_are_damaged_the_first_says_why(tmp_path, dataset, run):
+    out = tmp_path / "out"
+    shutil.copytree(dataset, out)
+    _damage(out, "a-1", "b-2")
+    code, said, complained = run("view", out)
+    assert (code, said) == (1, "")
+    assert complained.startswith("error: scene a-1: ")
+
+
+def _damage(out, *scene_ids):
+    rows = open_dataset(out).scenes.to_table().to_pylist()
+    with shard_path(out, "mjcf", 0).open("r+b") as tar:
+        for row in rows:
+            if row["scene_id"] in scene_ids:
+                tar.seek(row["tar_offset"])
+                tar.write(b"\xff" * 512)

@@ -1,6 +1,7 @@
 """The viewer as a web server: one session per browser, and one ticker for all of them."""
 
 import asyncio
+import logging
 import socket
 import threading
 import warnings
@@ -60,6 +61,7 @@ class Viewer:
         rich.get_console().quiet = True  # viser prints there when it starts and stops
         # A browser may leave while its scene moves; only the messages on their way to it are lost.
         warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+        logging.getLogger("websockets.server").addFilter(_is_own_error)
         with _wrap_websocket_handlers(self._guard):
             self._server: Any = _disable_sharing(viser)(host=host, port=port, label="TableVerse", verbose=False)
         shown = f"[{host}]" if ":" in host else host
@@ -140,6 +142,13 @@ def _wrap_websocket_handlers(guard: Callable[[Any, _Handler], Awaitable[None]]) 
         yield
     finally:
         websocket_server.serve = serve  # type: ignore[misc]
+
+
+def _is_own_error(record: logging.LogRecord) -> bool:
+    """Whether a message of the web server is not about a request that is none, such as HEAD or a scan of ports."""
+    from websockets.exceptions import InvalidHandshake
+
+    return record.exc_info is None or not isinstance(record.exc_info[1], InvalidHandshake)
 
 
 def _check_port(host: str, port: int) -> None:
