@@ -31,7 +31,7 @@ def config_from_run(run: Mapping[str, Any], section: str, overrides: Sequence[st
     """
     if others := [text for text in overrides if text.partition(".")[0].strip() != section]:
         raise ConfigError(
-            f"--set {others[0][:80]!r}: only {section}.… can be set here; all else is what the dataset was built with"
+            f"override {others[0][:80]!r}: only {section}.… can be set here; all else is as the dataset was built"
         )
     tree = run.get("config")
     if not isinstance(tree, Mapping):

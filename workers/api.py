@@ -122,8 +122,10 @@ def build(
 
 
 def _format_overrides(overrides: Mapping[str, object] | Sequence[str]) -> list[str]:
+    """Format overrides as those of the command, whose values are YAML: a text is quoted, so it stays a text."""
     if isinstance(overrides, Mapping):
-        return [f"{key}={value if isinstance(value, str) else json.dumps(value)}" for key, value in overrides.items()]
+        texts = {key: json.dumps(value, ensure_ascii=False, default=os.fspath) for key, value in overrides.items()}
+        return [f"{key}={text}" for key, text in texts.items()]
     return list(overrides)
 
 

@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import workers
 from tableverse_factory.core.errors import BuildError, ConfigError, InputError
+from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, write_manifest
 from tests.helpers.builds import build as build_with_tiny_line
 from workers import build
@@ -47,12 +49,19 @@ def test_limits_and_resumption(tiny, tmp_path):
     assert build(str(tiny), str(tmp_path / "out"), overrides=QUICK, display=None).read_state().remaining == 0
 
 
+@pytest.mark.parametrize("value", ["yes", "1.5", "a: b #c", "é😀", '"/a\\b', Path("/a b")])
+def test_a_text_or_path_among_the_overrides_is_no_yaml(tiny, tmp_path, value):
+    build(tiny, tmp_path / "out", overrides={**QUICK, "curate.replay_dir": value}, display=None)
+    assert read_run(tmp_path / "out" / "run.json")["config"]["curate"]["replay_dir"] == str(value)
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
         ({"from_stage": "settel"}, ConfigError, "did you mean settle"),
         ({"stages": "trajectories"}, ConfigError, r"\+trajectories"),
-        ({"overrides": {"run.sed": 1}}, ConfigError, r"run\.seed"),
+        ({"overrides": {"run.sed": 1}}, ConfigError, r"^override: .*run\.seed"),
+        ({"overrides": {"run.shard_size": "few"}}, ConfigError, r"^override: run\.shard_size: 'few' is not allowed"),
         ({"max_usd": float("nan")}, ConfigError, "amount of money"),
         ({"executor": "ray", "address": "host"}, BuildError, "HOST:PORT"),
         ({"executor": "local", "workers": 4}, BuildError, "one worker"),
