@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from tableverse_factory.cli.arm import check_robot_option
-from tableverse_factory.cli.options import FinishedOut, Robot, require_local_path
+from tableverse_factory.cli.options import BuiltOut, FinishedOut, Robot, require_local_path
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import pluralize, sanitize_line
 
@@ -47,7 +47,7 @@ Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are m
 
 @export.command(_DEFAULT)
 def export_dataset(
-    out: FinishedOut,
+    out: BuiltOut,
     dest: Annotated[
         str,
         typer.Argument(
@@ -58,6 +58,7 @@ def export_dataset(
         Literal["permissive", "share-alike", "non-commercial"],
         typer.Option(help="permissive: credit at most; share-alike and non-commercial allow these terms too."),
     ] = "permissive",
+    unfinished: Annotated[bool, typer.Option("--unfinished", help="Write the shards that there are.")] = False,
 ) -> None:
     """Write the scenes whose licences allow it as a dataset of their own, without any trace of the others.
 
@@ -72,7 +73,7 @@ def export_dataset(
     if place == parse_path(out):
         raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
     with _remove_if_unused(place), create_writer_lock(place / WORK / LOCK):
-        result = write_filtered_dataset(parse_path(out), place, profile)
+        result = write_filtered_dataset(parse_path(out), place, profile, unfinished)
     print(f"{pluralize(result.kept, 'scene')}, {result.done} of them with files, in {dest}")
     for verdict, count in sorted(result.left_out.items()):
         print(f"left out: {count} {verdict.value}")

@@ -3,7 +3,7 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import unquote, urlsplit, urlunsplit
@@ -40,18 +40,23 @@ class FilterResult:
     left_out: Mapping[LicenceVerdict, int]
 
 
-def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str) -> FilterResult:
-    """Write the scenes of a finished dataset that a profile allows to another folder; may be repeated after a kill.
+def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str, unfinished: bool = False) -> FilterResult:
+    """Write the scenes of a dataset that a profile allows to another folder; may be repeated after a kill.
 
     Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Private parts of
     `uri` (see `redact_uri`) and of the configuration (see `redact_config`) are removed. The caller holds the lock of
-    `dest`: a new or empty folder, or one where the same export was begun. `profile` is one of `licences.PROFILES`.
+    `dest`: a new or empty folder, or one where the same export was begun. `profile` is one of `licences.PROFILES`. Of a
+    dataset that is not finished, the finished shards are written if it may be `unfinished`.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
-    missing = plan.n_shards - len(committed_shards(out))
-    if missing:
-        raise BuildError(f"{out} is not finished: {missing} of {plan.n_shards} shards are missing; build on first")
-    shards, left_out = _select_rows(out, plan.n_shards, profile)
+    finished = sorted(committed_shards(out).intersection(range(plan.n_shards)))
+    missing = plan.n_shards - len(finished)
+    if missing and not (unfinished and finished):
+        or_option = ", or give --unfinished for the others" if finished else ""
+        raise BuildError(
+            f"{out} is not finished: {missing} of {plan.n_shards} shards are missing; build on first{or_option}"
+        )
+    shards, left_out = _select_rows(out, finished, profile)
     kept = [row for _, rows in shards for row in rows]
     if not kept:
         raise InputError(_explain_nothing(profile, left_out), "nothing_to_publish")
@@ -69,12 +74,12 @@ def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str) ->
 
 
 def _select_rows(
-    out: StoragePath, n_shards: int, profile: str
+    out: StoragePath, numbers: Iterable[int], profile: str
 ) -> tuple[list[tuple[int, list[Row]]], Counter[LicenceVerdict]]:
-    """Select rows that may be redistributed, by shard number, without empty shards."""
+    """Select rows of shards that may be redistributed, by shard number, without empty shards."""
     allowed, left_out = PROFILES[profile], Counter[LicenceVerdict]()
     shards: list[tuple[int, list[Row]]] = []
-    for number in range(n_shards):
+    for number in numbers:
         rows = []
         for row in _read_rows(out, "scenes", number):
             verdict = scene_license(row)

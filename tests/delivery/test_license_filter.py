@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 
 import pyarrow.parquet as pq
 import pytest
@@ -264,8 +265,28 @@ def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):
     with pytest.raises(BuildError, match="something else"):
         write_filtered_dataset(dataset, tmp_path / "mine", "permissive")
     shard_path(dataset, "scenes", 1).unlink()
-    with pytest.raises(BuildError, match="not finished"):
+    with pytest.raises(BuildError, match=r"not finished: .* or give --unfinished"):
         write_filtered_dataset(dataset, tmp_path / "other", "permissive")
+
+
+def test_what_publish_says_of_an_unfinished_dataset_can_be_done(dataset, tmp_path, run):
+    """Its rows name files of this machine, so it has to be exported, and then it is a whole dataset of its own."""
+    shard_path(dataset, "scenes", 2).unlink()
+    code, _, refused = run("publish", dataset, "--repo", "me/x", "--unfinished")
+    command = re.search(r"`tableverse (export [^`]*)`", refused)
+    assert (code, command is not None) == (1, True), refused
+    code, said, complained = run(*command[1].split())
+    assert (code, complained) == (0, ""), complained
+    code, said, complained = run("publish", f"{dataset}-public", "--repo", "me/x")
+    assert (code, complained) == (0, ""), complained
+    assert "1 of 1 shards" in said
+
+
+def test_without_a_finished_shard_there_is_nothing_to_export(dataset, tmp_path):
+    for number in range(3):
+        shard_path(dataset, "scenes", number).unlink()
+    with pytest.raises(BuildError, match=r"3 of 3 shards are missing; build on first$"):
+        write_filtered_dataset(dataset, tmp_path / "public", "permissive", unfinished=True)
 
 
 def test_the_card_counts_verdicts_sources_and_models(dataset, tmp_path):

@@ -105,7 +105,8 @@ def find_refusals(contents: UploadSet, unfinished: bool) -> list[str]:
         )
     profile = _choose_profile(contents.verdicts)
     forbidden = {verdict: count for verdict, count in contents.verdicts.items() if verdict not in PROFILES[profile]}
-    export = f"tableverse export {contents.out} {contents.out}-public --profile {profile}"
+    option = " --unfinished" if missing and unfinished else ""
+    export = f"tableverse export {contents.out} {contents.out}-public --profile {profile}{option}"
     if forbidden:
         counts = ", ".join(f"{count} {verdict.value}" for verdict, count in forbidden.items())
         total = sum(forbidden.values())
