@@ -47,6 +47,7 @@ def status(
         return
     from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
     from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
+    from tableverse_factory.dataset.provisional import find_cut_scenes
     from tableverse_factory.dataset.trajectory_summary import summarize_trajectories
     from workers.progress.build_state import OUTCOME_COLUMNS, read_build_state
     from workers.state.cost_log import sum_costs
@@ -54,12 +55,16 @@ def status(
     columns = dict.fromkeys((*OUTCOME_COLUMNS, *JUDGEMENT_COLUMNS, *COST_COLUMNS))
     state = read_build_state(place, [*columns], ["stage", "cpu_s"])
     verdicts, motions = summarize_judgements(state.stored), summarize_trajectories(place, state.published)
-    asked = sum_model_costs(state.stored), sum_costs(place)
+    asked, cut = (sum_model_costs(state.stored), sum_costs(place)), find_cut_scenes(place)
     if as_json:
         costs = {"costs": {asker: asdict(cost) for asker, cost in asked[0].items()}, "spent": asdict(asked[1])}
-        print(_dump_json({**_to_dict(state, verdicts, motions), **costs}))
+        print(_dump_json({**_to_dict(state, verdicts, motions), **costs, "damaged": cut}))
     else:
         _print_state(state, place)
+        if cut:
+            print(
+                f"damaged, as by a loss of power: {pluralize(len(cut), 'scene')} of those done ({', '.join(cut[:3])})"
+            )
         _print_judgements(verdicts)
         _print_costs(*asked)
         _print_trajectories(motions)

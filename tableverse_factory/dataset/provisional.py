@@ -14,10 +14,10 @@ import pyarrow as pa
 from schemas.tables import TABLES
 from schemas.work import ScenePart, SceneResult
 from tableverse_factory.core.framing import FrameError
-from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.core.storage.files import StoragePath, list_names, list_sizes
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.dataset.journals import WORK, find_journals, journal_path, read_results
-from tableverse_factory.dataset.parts import SceneRows, read_part_rows
+from tableverse_factory.dataset.parts import SceneRows, files_offset, parts_folder, read_part_rows
 from tableverse_factory.dataset.scene_rows import complete_rows
 from tableverse_factory.dataset.shards import committed_shards
 
@@ -42,8 +42,7 @@ class ProvisionalScenes:
 
 def read_provisional(out: StoragePath) -> ProvisionalScenes:
     """Read the scenes that ended in open shards; safe while they are being committed."""
-    open_shards = sorted(find_journals(list_names(out / WORK)) - committed_shards(out))
-    results = [(shard, result) for shard in open_shards for result in read_results(journal_path(out, shard)).values()]
+    results = _read_open_results(out)
     with ThreadPoolExecutor(_N_THREADS) as threads:
         rows = list(threads.map(lambda its: _read_rows(out, *its), results))
     committed = committed_shards(out)
@@ -60,6 +59,25 @@ def read_provisional(out: StoragePath) -> ProvisionalScenes:
         parts={result.scene_id: (shard, result.part) for shard, result, _ in found if result.part is not None},
         shards=tuple(sorted(committed)),
     )
+
+
+def find_cut_scenes(out: StoragePath) -> list[str]:
+    """Find scenes of open shards whose files are gone or cut short, as after a loss of power; nothing else is read."""
+    results = _read_open_results(out)
+    sizes = {shard: list_sizes(parts_folder(out, shard)) for shard in dict(results)}
+    committed = committed_shards(out)  # listed last: the parts of these are gone by right
+    parts = [(shard, result.scene_id, result.part) for shard, result in results if shard not in committed]
+    return [
+        scene_id
+        for shard, scene_id, part in parts
+        if part is not None and sizes[shard].get(part.file, 0) < files_offset(part) + part.files_size
+    ]
+
+
+def _read_open_results(out: StoragePath) -> list[tuple[int, SceneResult]]:
+    """Read the results of scenes in open shards, each with its shard."""
+    open_shards = sorted(find_journals(list_names(out / WORK)) - committed_shards(out))
+    return [(shard, result) for shard in open_shards for result in read_results(journal_path(out, shard)).values()]
 
 
 def _read_rows(out: StoragePath, shard: int, result: SceneResult) -> SceneRows | None:

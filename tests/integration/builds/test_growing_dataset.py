@@ -1,5 +1,6 @@
 """A dataset is read while it grows: scenes are there as soon as they end, and stay what they were."""
 
+import json
 import signal
 from dataclasses import replace
 
@@ -79,7 +80,7 @@ def test_what_is_done_can_be_read_after_any_stop(tmp_path, how):
 
 
 @pytest.mark.parametrize("damage", ["torn", "flipped", "gone"])
-def test_parts_that_a_loss_of_power_took_are_made_again(whole, tmp_path, damage):
+def test_parts_that_a_loss_of_power_took_are_named_and_made_again(whole, tmp_path, damage, run):
     manifest, finished = whole
     out = tmp_path / "out"
     run_build(replace(request(manifest, out), limit=6), Silent())
@@ -91,6 +92,10 @@ def test_parts_that_a_loss_of_power_took_are_made_again(whole, tmp_path, damage)
         data[len(data) // 2] ^= 1
         parts.write_bytes(data if damage == "flipped" else data[: len(data) // 2])
     assert open_dataset(out).scenes.count_rows() >= 4, "the others are still read"
+    code, said, _ = run("status", out, "--json")
+    cut = {"torn": ["scene_005"], "flipped": [], "gone": ["scene_004", "scene_005"]}[damage]
+    assert (code, json.loads(said)["damaged"]) == (0, cut), "all but what only its checksum tells"
+    assert ("damaged, as by a loss of power: " in run("status", out)[1]) == bool(cut)
     display = Silent()
     summary = run_build(request(manifest, out), display)
     assert summary.tally.accounted == len(NAMES), "no scene counts twice"

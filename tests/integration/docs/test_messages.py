@@ -119,6 +119,7 @@ ELSEWHERE = {
     "… the manifest cannot be restored …": "tests/integration/builds/test_trajectories_build.py",
     "… bytes hold no whole result …": "tests/workers/state/test_journal.py",
     "… finished scenes do not read …": "tests/integration/builds/test_growing_dataset.py",
+    "damaged, as by a loss of power: …": "tests/integration/builds/test_growing_dataset.py",
     "… not built yet": "tests/evaluation/test_verify.py",
     "… is being written by process …": "tests/integration/s3/test_store_builds.py",
     "… there is no bucket …": "tests/core/storage/test_files.py",
