@@ -63,18 +63,25 @@ class FakeLedger:
     """Results in memory; the only shard is whole when all scenes are recorded."""
 
     committed = bytes_committed = 0
+    damaged = ("1 finished scene does not read",)
 
     def __init__(self, n_scenes: int) -> None:
-        self._n_scenes = n_scenes
+        self.n_scenes = n_scenes
         self.results: dict[str, SceneResult] = {}
+        self.unreadable: list[list[int]] = []  # scenes whose parts do not read, at each attempt to publish
         self.published = 0
 
     def record(self, rank: int, result: SceneResult) -> CommitCall | None:
         assert result.scene_id not in self.results, "a scene ends once"
         self.results[result.scene_id] = result
-        return CommitCall(0, tuple(self.results), (), "0") if len(self.results) == self._n_scenes else None
+        return CommitCall(0, tuple(self.results), (), "0") if len(self.results) == self.n_scenes else None
 
     def publish(self, call: CommitCall, staged: StagedShard) -> list[int]:
+        if self.unreadable:
+            again = self.unreadable.pop(0)
+            for rank in again:
+                del self.results[f"s{rank}"]
+            return again
         self.published += 1
         return []
 
@@ -125,7 +132,11 @@ class FakeExecutor:
         pass
 
     def stage_shard(self, worker: int, call: CommitCall) -> None:
-        self._events.append(ShardStaged(worker, call, StagedShard(call.token, 0, ())))
+        if self._script["commit", call.shard]:
+            assert self._script["commit", call.shard].pop(0) == LOSE_WORKER
+            self._events.append(WorkerLost(worker, call, "its node is gone"))
+        else:
+            self._events.append(ShardStaged(worker, call, StagedShard(call.token, 0, ())))
 
     def close(self) -> None:
         pass

@@ -59,17 +59,21 @@ class Driver:
         When the budget is spent, scenes that need no more questions are finished first. `check` is called several times
         a second and ends the loop by raising.
         """
-        while self._todo or self._waiting or self._running or self._outcomes.commits or self._commits_in_flight:
+        while self._todo or self._waiting or self._is_busy():
             check()
             if not self.out_of_budget:
                 self._admit()
             self._assign()
             self._update_tally()
-            if self.out_of_budget and not (self._running or self._commits_in_flight or self._list_ready()):
+            if self.out_of_budget and not (self._is_busy() or self._list_ready()):
                 return
             for event in self._executor.wait(_WAIT_S):
                 self._on_event(event)
         self._update_tally()
+
+    def _is_busy(self) -> bool:
+        """Whether scenes run, or shards are to be committed."""
+        return bool(self._running or self._outcomes.commits or self._commits_in_flight)
 
     def _admit(self) -> None:
         room = self._workers.max_in_flight - len(self._waiting) - len(self._running)
@@ -156,7 +160,9 @@ class Driver:
     def _publish(self, call: CommitCall, staged: StagedShard) -> None:
         again = self._ledger.publish(call, staged)
         if again:
-            self._todo += again
+            scenes = [self._checkpoints.start(rank) for rank in again]
+            self._checkpoints.resume(scenes)
+            self._waiting |= {scene.rank: scene for scene in scenes}
             self._tally.before -= len(again)  # they were accounted for, in this run or before
             self._display.note(self._ledger.damaged[-1])
         elif not self._spec.keep:

@@ -126,6 +126,29 @@ def test_a_spent_budget_ends_the_run_and_the_rest_waits(tmp_path):
     assert build.budget.spent == ModelCost(calls=1, usd=0.5)
 
 
+def test_a_shard_is_committed_although_the_budget_is_spent_and_no_worker_is_left(tmp_path):
+    script = {
+        ("s0", 2): [ModelCost(calls=100)],
+        ("s1", 2): [Failed("BudgetSpentError", "the budget is spent")],
+        ("commit", 0): [LOSE_WORKER] * 2,
+    }
+    config = Config(curate=CurateConfig(judge="openai", model="m", base_url="http://127.0.0.1:1/v1"))
+    build = FakeBuild(tmp_path, make_rows(2), script, SpendingLimits(calls=100), config, workers=2)
+    build.ledger.n_scenes = 1
+    assert list(build.run()) == ["s0"]
+    assert build.driver.out_of_budget
+    assert build.ledger.published == 1
+
+
+def test_a_finished_scene_that_does_not_read_is_made_from_its_checkpoints(tmp_path):
+    build = FakeBuild(tmp_path, make_rows(2))
+    build.ledger.unreadable = [[0]]
+    results = build.run()
+    assert (len(results), build.ledger.published) == (2, 1)
+    assert [build.executor.runs["s0", position] for position in range(4)] == [1, 1, 1, 2]
+    assert build.display.notes == ["1 finished scene does not read"]
+
+
 def test_notes_show_few_tracebacks(tmp_path):
     script = {(f"s{i}", 0): [Failed("exception", "KeyError")] for i in range(6)}
     build = FakeBuild(tmp_path, make_rows(6), script)
