@@ -48,7 +48,9 @@ from tableverse_factory.dataset.shards import (
 
 STAGING, READY = ".staging", ".ready"
 _WITHOUT = "without "  # in the ready file before a folder for which the shard has no rows: an older file goes
-_STAGED = re.compile(rf"(shard-\d{{5,9}})\.([0-9a-f]+){re.escape(STAGING)}")
+_STAGED = re.compile(rf"shard-\d{{5,9}}\.[0-9a-f]+{re.escape(STAGING)}")
+_DECIDED = re.compile(rf"shard-(\d{{5,9}}){re.escape(READY)}")
+_DECISION = re.compile(rf"ready\n[0-9a-f]+\n({_WITHOUT}\w+\n)*")  # a dataset from elsewhere may hold any other
 
 
 class CommittedShard:
@@ -146,9 +148,8 @@ def publish_ready(out: StoragePath, guard: Callable[[], None] = lambda: None) ->
     """Finish commits that a kill interrupted after their decision, and discard the others."""
     names = list_names(out / WORK)
     abort_uploads(out)
-    for name in names:
-        if name.endswith(READY):
-            _publish(out, int(name.removeprefix("shard-").removesuffix(READY)), guard)
+    for decided in filter(None, map(_DECIDED.fullmatch, names)):
+        _publish(out, int(decided[1]), guard)
     for name in filter(_STAGED.fullmatch, names):
         remove_folder(out / WORK / name)
 
@@ -192,7 +193,10 @@ def _write_tables(out: StoragePath, call: CommitCall, rows: Mapping[str, SceneRo
 
 def _publish(out: StoragePath, number: int, guard: Callable[[], None]) -> None:
     """Move the staged files into place; safe to repeat after a kill at any point."""
-    _, token, *lines = read_whole(_ready(out, number)).decode().splitlines()
+    decision = read_whole(_ready(out, number)).decode(errors="replace")
+    if not _DECISION.fullmatch(decision):
+        raise BuildError(f"{_ready(out, number)} is damaged: delete it, and the same command makes the shard again")
+    _, token, *lines = decision.splitlines()
     staging = _staging(out, number, token)
     staged = set(list_names(staging))
     if _staged("scenes") in staged:  # otherwise all of them have been moved already
@@ -209,7 +213,7 @@ def _publish(out: StoragePath, number: int, guard: Callable[[], None]) -> None:
 
 def _remove_emptied(out: StoragePath, lines: Sequence[str], number: int) -> None:
     """Remove the shard's older files in folders for which it has no rows any more."""
-    for folder in (line.removeprefix(_WITHOUT) for line in lines if line.startswith(_WITHOUT)):
+    for folder in (line.removeprefix(_WITHOUT) for line in lines):
         if folder in SPARSE and shard_name(folder, number) in list_names(out / folder):
             remove(shard_path(out, folder, number))
 

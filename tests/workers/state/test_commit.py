@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tableverse_factory.core.errors import BuildError
-from tableverse_factory.dataset.journals import journal_path
+from tableverse_factory.dataset.journals import WORK, journal_path
 from tableverse_factory.dataset.shard_plan import make_plan, read_plan
 from tableverse_factory.dataset.shards import FOLDERS, is_committed, shard_path
 from tests.helpers.builds import build, compute, digests, write_manifest
@@ -170,3 +170,20 @@ def test_the_journal_is_on_the_disk_before_a_worker_is_told_to_read_it(tmp_path,
     journal = journal_path(tmp_path / "out", 0)
     assert flushed[journal] == journal.stat().st_size
     ledger.close()
+
+
+@pytest.mark.parametrize(
+    "decision", ["", "ready\n", "ready\n../../../other\n", "ready\n/../../../other\n", "ready\nab\nwithout ../x\n"]
+)
+def test_a_decision_that_no_build_wrote_moves_and_removes_nothing(tmp_path, decision):
+    """A dataset from elsewhere may name any folder in it."""
+    other = tmp_path / "other.staging"
+    other.mkdir()
+    work = tmp_path / "its" / "out" / WORK
+    (work / "shard-00000.").mkdir(parents=True)
+    (work / "shard-00000.ready").write_text(decision)
+    with pytest.raises(BuildError, match=r"shard-00000\.ready is damaged: delete it"):
+        commit.publish_ready(work.parent)
+    assert other.is_dir()
+    (work / "shard-00000.ready").rename(work / "my.ready")
+    commit.publish_ready(work.parent)
