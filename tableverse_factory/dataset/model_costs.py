@@ -1,6 +1,6 @@
 """Costs of a dataset's models, as its scenes record them: when each answer was first given, by any build."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -8,9 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from schemas.outcome import ModelCost
-from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.text import pluralize
-from tableverse_factory.dataset.committed_rows import read_columns
 
 MODEL_ROLE_BY_STAGE = {"perceive": "detector", "curate": "judge"}  # of the model that it asks; prefixes columns
 _FIGURES = ("calls", "input_tokens", "output_tokens", "usd")
@@ -25,11 +23,6 @@ def make_cost_columns(costs: Iterable[tuple[str, ModelCost]]) -> dict[str, Any]:
         for role in MODEL_ROLE_BY_STAGE.values()
         for figure in _FIGURES
     }
-
-
-def read_model_costs(out: StoragePath, shards: Sequence[int]) -> dict[str, ModelCost]:
-    """Sum the costs of each role over all scenes of these committed shards, dropped and failed ones too."""
-    return sum_model_costs(read_columns(out, "scenes", shards, COST_COLUMNS))
 
 
 def format_cost(cost: ModelCost) -> str:

@@ -17,7 +17,8 @@ from typer import Exit
 from schemas.config import AskingConfig, Config, CurateConfig, PerceiveConfig, RemoteModelSection, RunConfig
 from schemas.outcome import NO_COST
 from tableverse_factory.cli.build import OVER_BUDGET, report_summary
-from tableverse_factory.dataset.model_costs import read_model_costs
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.model_costs import sum_model_costs
 from tableverse_factory.run_record import read_run
 from tests.helpers.builds import Silent, digests, finish, kill, scenes, wait_until, write_manifest
 from tests.helpers.model_server import Scripted, chat, gemini
@@ -199,7 +200,7 @@ def test_retries_silence_repairs_and_lost_scenes_count_too(server, asking):
     assert rows["never"]["status"] == "dropped"
     assert rows["never"]["judge_calls"] is None
     assert sum_costs(request.out).calls == 8 + 3
-    assert read_model_costs(request.out, [0, 1])["detector"].input_tokens == 3 * 1800 + 900
+    assert sum_model_costs(open_dataset(request.out).scenes.to_table())["detector"].input_tokens == 3 * 1800 + 900
 
 
 @pytest.mark.slow

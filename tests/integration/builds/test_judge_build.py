@@ -17,8 +17,9 @@ from tableverse_factory.cli.status import status
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.dataset.committed_rows import read_columns
+from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
-from tableverse_factory.dataset.model_costs import read_model_costs
+from tableverse_factory.dataset.model_costs import sum_model_costs
 from tableverse_factory.models.remote.json_text import MAX_ANSWER_CHARS
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.builds import Silent, scenes
@@ -70,7 +71,7 @@ def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request
     assert len(server.asked) == 2
     verdicts = summarize_judgements(read_columns(request_of("out").out, "scenes", [0], JUDGEMENT_COLUMNS))
     assert verdicts.judges == {"openai: judge": 2}
-    assert read_model_costs(request_of("out").out, [0]) == {"judge": ModelCost(2, 1800, 80)}
+    assert sum_model_costs(open_dataset(request_of("out").out).scenes.to_table()) == {"judge": ModelCost(2, 1800, 80)}
     assert verdicts.remarks["mass_clipped"] == 2
     assert verdicts.agreement.scenes == 2
     assert verdicts.agreement.mass_ratio > 10
