@@ -11,6 +11,7 @@ from schemas.codec import encode
 from schemas.work import SceneResult
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.framing import encode_header
+from tableverse_factory.core.storage.append_files import append_whole
 from tableverse_factory.core.storage.files import (
     StoragePath,
     get_store,
@@ -100,12 +101,9 @@ class FileJournal(Journal):
 
     def _append(self, frame: bytes) -> None:
         """Append a frame; if the disk is full, the journal stays as before."""
-        left = memoryview(frame)
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            append_whole(self._file.fileno(), [frame], self._end)
         except OSError as error:
-            self._file.truncate(self._end)
             raise make_write_error(self._path, error) from error
         self._end += len(frame)
 

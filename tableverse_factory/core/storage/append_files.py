@@ -6,6 +6,7 @@ the end of a file can be torn.
 
 import os
 import secrets
+from collections.abc import Iterable
 from pathlib import Path
 
 from tableverse_factory.core.storage.files import make_write_error
@@ -29,7 +30,7 @@ class AppendFiles:
             descriptor = os.open(folder / self._name, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
             try:
                 start = os.fstat(descriptor).st_size
-                _write_all(descriptor, pieces, start)
+                append_whole(descriptor, pieces, start)
             finally:
                 os.close(descriptor)
         except OSError as error:
@@ -37,7 +38,8 @@ class AppendFiles:
         return self._name, start
 
 
-def _write_all(descriptor: int, pieces: tuple[bytes | memoryview, ...], start: int) -> None:
+def append_whole(descriptor: int, pieces: Iterable[bytes | memoryview], start: int) -> None:
+    """Append pieces to a file that ends at `start`; if the disk refuses, cut off what it took of them."""
     try:
         for piece in pieces:
             left = memoryview(piece)
