@@ -9,6 +9,7 @@ from tableverse_factory.cli.bench_cpu_time import bench_stages, bench_trajectori
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_soak import bench_soak
+from tableverse_factory.cli.bench_twin import bench_twin
 from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.cache_dir import get_cache_dir
@@ -25,6 +26,7 @@ bench.command("trajectories")(bench_trajectories)
 bench.command("perception")(bench_perception)
 bench.command("placement")(bench_placement)
 bench.command("completion")(bench_completion)
+bench.command("twin")(bench_twin)
 
 
 Truth = Annotated[

@@ -1,4 +1,4 @@
-"""`meta.json` as `tableverse verify` and growing datasets read it, without importing physics."""
+"""`meta.json` as other rooms read it, without importing physics."""
 
 import json
 import math
@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from schemas.geometry import Pose
+from schemas.geometry import Camera, Pose
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.dataset.preview_image import TALLEST
+from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 
@@ -51,6 +53,22 @@ def read_meta(data: bytes) -> SceneMeta:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error
+
+
+def read_meta_camera(meta: Mapping[str, Any]) -> PosedCamera | None:
+    """Read the camera of the photograph; None if there is no photograph."""
+    camera, pose = meta.get("camera"), meta.get("camera_to_table")
+    if camera is None or pose is None:
+        return None
+    try:
+        fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
+        width, height = int(camera["width"]), int(camera["height"])
+        if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= TALLEST * width):
+            raise ValueError(f"{width} × {height} pixels")
+        return PosedCamera(Camera(fx, fy, cx, cy, width, height), read_meta_pose(pose, "the camera"))
+    except (KeyError, TypeError, ValueError) as error:
+        problem = f"meta.json: invalid camera: {json.dumps(camera)[:200]}: {error}"[:400]
+        raise InputError(problem, "bad_meta") from error
 
 
 def read_meta_pose(value: Any, owner: str) -> Pose:

@@ -101,7 +101,7 @@ def compare_scene(name: str, result: MethodScene, truth: SceneTruth, cache_dir: 
         name,
         (*matches, *(ObjectMatch(missing) for missing in truth.missing)),
         tuple(item.name for item in result.objects if item.name not in used),
-        compare_relations(_find_relations(truth.objects, cache_dir), _find_relations(pairs, cache_dir)),
+        compare_relations(find_object_relations(truth.objects, cache_dir), find_object_relations(pairs, cache_dir)),
     )
 
 
@@ -171,7 +171,7 @@ def _measure_match(true: MethodObject, found: MethodObject, same_meshes: bool) -
     return ObjectMatch(true.name, found.name, shift, size, heading)
 
 
-def _find_relations(items: Sequence[MethodObject | None], cache_dir: Path) -> Relations:
+def find_object_relations(items: Sequence[MethodObject | None], cache_dir: Path) -> Relations:
     """Find relations by index in the list; missing objects have none."""
     present = [(index, item) for index, item in enumerate(items) if item is not None]
     poses, scales = [item.pose for _, item in present], [item.scale for _, item in present]

@@ -66,7 +66,7 @@ def find_truths(folder: Path) -> dict[str, ReadTruth]:
     """
     captures = sorted(folder.glob(f"*/{CAPTURE_TRUTH}"))
     if captures:
-        return {path.parent.name: partial(_load_capture_truth, path) for path in captures}
+        return {path.parent.name: partial(load_capture_truth, path) for path in captures}
     poses = {path.stem: _read_poses(path) for path in sorted(folder.glob("*.json"))}
     if poses and all(found is not None for found in poses.values()):
         return {name: partial(_load_pose_truth, found) for name, found in poses.items() if found is not None}
@@ -100,7 +100,7 @@ def _load_pose_truth(poses: Mapping[str, tuple[Pose, float]], result: MethodScen
     return SceneTruth(objects, tuple(missing), named=True, same_meshes=True)
 
 
-def _load_capture_truth(path: Path, result: MethodScene) -> SceneTruth:
+def load_capture_truth(path: Path, result: MethodScene) -> SceneTruth:
     """Load the true meshes of a synthetic capture in the table frame of the result."""
     truth = _read_capture_truth(path)
     to_result: Pose | None = None  # the same frame

@@ -71,7 +71,7 @@ def place(
 
 def _view_objects(scene: PerceivedObjects, left_out: list[tuple[str, str]]) -> list[tuple[PerceivedObject, ObjectView]]:
     """View the objects of which enough was observed; the others are added to `left_out`."""
-    supports = find_supports(scene)
+    supports = find_supports(scene.objects, scene.camera_to_table)
     seen = []
     for perceived in scene.objects:
         try:

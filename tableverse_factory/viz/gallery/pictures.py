@@ -1,7 +1,6 @@
 """Pictures of one scene: the photograph, and renders of the twin before rectification and after export."""
 
 import io
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,13 +9,12 @@ from typing import Any, ClassVar
 import numpy as np
 from PIL import Image
 
-from schemas.geometry import Camera, Picture, Pose
+from schemas.geometry import Picture, Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.dataset.preview_image import PHOTOGRAPH, TALLEST, read_photograph
-from tableverse_factory.dataset.scene_meta import read_meta_pose
-from tableverse_factory.geometry.math.camera import PosedCamera
+from tableverse_factory.dataset.preview_image import PHOTOGRAPH, read_photograph
+from tableverse_factory.dataset.scene_meta import read_meta_camera, read_meta_pose
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
 from tableverse_factory.physics.mjcf.scenery import Scenery, load_scenery
 from tableverse_factory.physics.render.preview import PreviewRenderer
@@ -102,9 +100,9 @@ def _render_views(scene: Scene) -> dict[str, Picture]:
         "front": make_front_camera(scenery, WIDTH, HEIGHT, _AZIMUTH),
         "top": make_top_camera(scenery, WIDTH, HEIGHT),
     }
-    photo_camera = _load_photo_camera(scene.meta)
-    if photo_camera is not None:
-        cameras["twin"] = photo_camera
+    eye = read_meta_camera(scene.meta)
+    if eye is not None:
+        cameras["twin"] = replace(eye, camera=resize_camera(eye.camera, WIDTH))
     views = render_pictures(scenery, list(cameras.values()), QUALITY)
     drawn = {name: view.color for name, view in zip(cameras, views, strict=True)}
     before = _build_before(scenery, scene.meta)
@@ -157,21 +155,6 @@ def _load_photograph(scene: Scene) -> Picture | None:
     if photo.width < WIDTH:  # it is compared with the twin, which is drawn at this width
         photo = photo.resize((WIDTH, round(photo.height * WIDTH / photo.width)), Image.Resampling.LANCZOS)
     return np.asarray(photo)
-
-
-def _load_photo_camera(meta: Mapping[str, Any]) -> PosedCamera | None:
-    camera, pose = meta.get("camera"), meta.get("camera_to_table")
-    if camera is None or pose is None:
-        return None
-    try:
-        fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-        width, height = int(camera["width"]), int(camera["height"])
-        if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= TALLEST * width):
-            raise ValueError(f"{width} × {height} pixels")
-        photo = resize_camera(Camera(fx, fy, cx, cy, width, height), WIDTH)
-        return PosedCamera(photo, read_meta_pose(pose, "the camera"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"meta.json: invalid camera: {json.dumps(camera)[:200]}: {error}"[:400]) from error
 
 
 def _save(picture: Picture, stem: Path, thumb: bool) -> None:

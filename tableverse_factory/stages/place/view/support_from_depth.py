@@ -1,13 +1,14 @@
 """Support of each object, the table or the top of another object, from the observed heights."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
-from schemas.geometry import Frozen, Points
-from schemas.objects import PerceivedObjects
+from schemas.geometry import Frozen, Points, Pose
+from schemas.objects import PerceivedObject
 from tableverse_factory.geometry.math.transforms import transform_points
 
 ABOVE_M = 0.03  # most height of an object's lowest visible points above its support [m]: its foot can be hidden
@@ -32,16 +33,18 @@ class DepthSupport(Frozen):
     height: float  # of the support [m]; 0 is the table
     carried: Points2  # corners of the middle part of the footprints of all that stands on the object [m]
     leaning: bool = False  # a long object in a container
+    carrier: str | None = None  # the object on whose top it stands; None on the table or in a container
 
 
-def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
+def find_supports(objects: Sequence[PerceivedObject], camera_to_table: Pose) -> dict[str, DepthSupport]:
     """Find the support of each object, by object id."""
-    clouds = {o.object_id: transform_points(scene.camera_to_table, o.points_camera) for o in scene.objects}
+    clouds = {o.object_id: transform_points(camera_to_table, o.points_camera) for o in objects}
     clouds = {name: cloud for name, cloud in clouds.items() if len(cloud) >= MIN_POINTS}
-    heights = {o.object_id: 0.0 for o in scene.objects}
+    heights = {o.object_id: 0.0 for o in objects}
     leaning = dict.fromkeys(heights, False)
+    carriers: dict[str, str] = {}
     carried: dict[str, list[Points2]] = {name: [] for name in heights}
-    for item in scene.objects:
+    for item in objects:
         cloud = clouds.get(item.object_id)
         if cloud is None:
             continue
@@ -55,11 +58,12 @@ def find_supports(scene: PerceivedObjects) -> dict[str, DepthSupport]:
         }
         carrier = max(below, key=lambda name: (below[name], name), default=None)
         if carrier is not None and below[carrier] > 0.0:
-            heights[item.object_id] = below[carrier]
+            heights[item.object_id], carriers[item.object_id] = below[carrier], carrier
             carried[carrier].append(_shrink_footprint(cloud[:, :2]))
     empty = np.zeros((0, 2))
     return {
-        name: DepthSupport(heights[name], np.concatenate([empty, *carried[name]]), leaning[name]) for name in heights
+        name: DepthSupport(heights[name], np.concatenate([empty, *carried[name]]), leaning[name], carriers.get(name))
+        for name in heights
     }
 
 

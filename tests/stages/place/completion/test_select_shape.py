@@ -21,7 +21,8 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_no_shape_costs_less_than_its_draft_and_the_cheapest_is_selected(name):
     scene = render_noisy_view([stand_on_table(from_trimesh(SHAPES[name]))], 0.7, 0.8, np.random.default_rng(3))
-    view = view_object(scene, scene.objects[0], find_supports(scene)[scene.objects[0].object_id])
+    support = find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
+    view = view_object(scene, scene.objects[0], support)
     rays, costs = sample_rays(view), {}
     for method, freedom, make in KINDS:
         if (draft := make(view, rays)) is not None:
