@@ -23,7 +23,7 @@ _BOUNDS = {
 }
 _MAX_PROBLEMS = 4  # Problems with one remedy that are listed
 RUNTIME_SECTIONS = frozenset({"asking"})  # Sections that may change between runs of a build
-_OVERRIDE_PREFIX = "override: "  # Start of messages about overrides
+_OVERRIDE_PREFIX = "--set or override: "  # Start of messages about overrides
 
 
 class _StrictLoader(yaml.SafeLoader):

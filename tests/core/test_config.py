@@ -189,14 +189,14 @@ def test_addresses_on_this_machine_and_behind_https_are_taken(url):
 
 def test_a_message_names_where_the_mistake_stands(tmp_path):
     """An override's own mistake is not looked for in a file, and the other way round."""
-    with pytest.raises(ConfigError, match=r"^override: unknown key 'trajectories\.foo'"):
+    with pytest.raises(ConfigError, match=r"^--set or override: unknown key 'trajectories\.foo'"):
         build_config({"run": {"seed": 3}}, ["trajectories.foo=1"], "run.json: ")
     with pytest.raises(ConfigError, match=r"^run\.json: unknown key 'trajectories\.foo'"):
         build_config({"trajectories": {"foo": 1}}, ["trajectories.tries=6"], "run.json: ")
     with pytest.raises(ConfigError) as both:
         build_config({"run": {"foo": 3}}, ["trajectories.tries=-1"], "run.json: ")
     assert "run.json: unknown key 'run.foo'" in str(both.value)
-    assert "override: trajectories.tries" in str(both.value)
+    assert "--set or override: trajectories.tries" in str(both.value)
 
 
 @pytest.mark.parametrize(
