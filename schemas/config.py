@@ -147,6 +147,8 @@ class PerceiveConfig(RemoteModelSection):
     """Pictures per batch of the segmenter on a GPU."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60
     """Most objects that are kept of one picture."""
+    min_explained: Annotated[float, Field(ge=0.0, le=1.0)] = 0.65
+    """Least share of the area above the table that the objects must explain; a scene with less is dropped."""
 
     @property
     def protocol(self) -> str:

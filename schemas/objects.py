@@ -1,5 +1,6 @@
 """Objects as perceived in the picture, and as placed on the table."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,37 @@ class PerceivedObject(Frozen):
     count: int = 1
 
 
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """What stands above the table in a picture, by the sensor, and how much of it each object explains.
+
+    Attributes:
+        points: Number of pixels.
+        area_m2: Their area across the line of sight [m²].
+        of_objects: Id of each object with its pixels and area among them.
+    """
+
+    points: int
+    area_m2: float
+    of_objects: tuple[tuple[str, int, float], ...]
+
+    def measure_shares(self, object_ids: Collection[str]) -> tuple[float, float]:
+        """Measure the shares of points and area that these objects explain; 1 where nothing stands above the table."""
+        own = [(points, area) for name, points, area in self.of_objects if name in object_ids]
+        points, area = (sum(values) for values in zip((0, 0.0), *own, strict=True))
+        return points / self.points if self.points else 1.0, min(area / self.area_m2, 1.0) if self.points else 1.0
+
+    def describe_shortfall(self, object_ids: Collection[str], least: float) -> str:
+        """Describe how much area these objects leave unexplained; empty if they explain at least this share."""
+        points, area = self.measure_shares(object_ids)
+        if area >= least:
+            return ""
+        return (
+            f"objects found: {len(object_ids)}; they explain {area:.0%} of the {1e4 * self.area_m2:.0f} cm² and "
+            f"{points:.0%} of the {self.points} pixels above the table; at least {least:.0%} of the area is wanted"
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PerceivedObjects(Frozen):
     """Objects found in one observation.
@@ -62,6 +94,7 @@ class PerceivedObjects(Frozen):
         perception: Name of the backend that found them, e.g. `geometric`, `replay`.
         left_out: Ids of objects that were found but cannot be used, with the reason.
         detection: Origin of the answer of a model that found them; None if none was asked.
+        explanation: What stands above the table, and which objects explain it; None where it was not measured.
     """
 
     scene_id: str
@@ -73,6 +106,7 @@ class PerceivedObjects(Frozen):
     perception: str
     left_out: tuple[tuple[str, str], ...] = ()
     detection: DetectionRecord | None = None
+    explanation: Explanation | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +186,7 @@ class PlacedObjects(Frozen):
     Attributes:
         evidence: The picture it came from; None for a layout file.
         left_out: Ids of objects that were found but could not be used or placed, with the reason.
+        explanation: As in `PerceivedObjects`.
     """
 
     scene_id: str
@@ -161,3 +196,4 @@ class PlacedObjects(Frozen):
     perception: str = "layout"
     left_out: tuple[tuple[str, str], ...] = ()
     detection: DetectionRecord | None = None
+    explanation: Explanation | None = None

@@ -46,14 +46,28 @@ class SettledScene(Frozen):
     settle_time_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """How the settled twin, seen from the camera of the photograph, covers the masks that perception found.
+
+    Attributes:
+        whole: Share of the pixels of all masks at which the twin shows the object of the mask.
+        of_objects: The same of each object's mask, in their order; None for a copy, which has none.
+    """
+
+    whole: float
+    of_objects: tuple[float | None, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CuratedScene(Frozen):
-    """Settled scene with the judge's seven outputs, checked against the geometry."""
+    """Settled scene with the judge's seven outputs, checked against the geometry; no coverage without a photograph."""
 
     scene_id: str
     settled: SettledScene
     judge: str
     assessment: Assessment
+    coverage: Coverage | None = None
 
 
 @dataclass(frozen=True, slots=True)

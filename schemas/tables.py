@@ -69,6 +69,13 @@ SCENES = pa.schema(
         ("displacement_max_m", pa.float64()),
         ("n_fell", pa.int32()),
         ("n_left_container", pa.int32()),
+        ("explained_points", pa.float64()),  # shares of what stands above the table; null without a photograph
+        ("explained_area", pa.float64()),
+        ("coverage", pa.float64()),  # of the masks, by the twin from the camera; null without a photograph
+        ("n_toppled", pa.int32()),  # since the picture, as the next
+        ("n_slid", pa.int32()),
+        ("n_left_out", pa.int32()),
+        ("twin_remarks", pa.list_(pa.string())),  # code:object, of what toppled, slid, is left out or poorly covered
         ("at_rest", pa.bool_()),
         ("colliding", pa.bool_()),
         ("settle_time_s", pa.float64()),  # simulated
@@ -113,6 +120,8 @@ OBJECTS = pa.schema(
         ("qy", pa.float64()),
         ("qz", pa.float64()),
         ("displacement_m", pa.float64()),  # of its box centre, from where the picture put it; null for copies
+        ("tilt_rad", pa.float64()),  # since then, of its vertical axis; null for copies
+        ("coverage", pa.float64()),  # of its mask, by the twin from the camera; null for copies and layouts
         ("fit_residual_m", pa.float64()),
         ("position_std_m", pa.float64()),  # this and the next three are null for layouts and copies
         ("heading_std_rad", pa.float64()),  # null for round things too

@@ -42,7 +42,7 @@ _FROM_LAYOUT = (
     Stage("export", "physics", export, reads=("export", "settle")),
 )
 
-_PLACE = Stage("place", "geometry", place, reads=("place", "export.jpeg_quality"))
+_PLACE = Stage("place", "geometry", place, reads=("place", "export.jpeg_quality", "perceive.min_explained"))
 STAGES = (_OBSERVE, _PERCEIVE, _PLACE, *_FROM_LAYOUT)
 
 PIPELINES: Pipelines = {

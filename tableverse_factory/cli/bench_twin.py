@@ -58,7 +58,8 @@ def _show_twins(scores: "list[TwinScore]") -> None:
     from tableverse_factory.evaluation.bench.twin import summarize_twins
 
     rows = [_format_row(score.name, [score], score.reason) for score in scores]
-    columns = ("capture", "things", "lost", "extra", "twin", "silhouette", "depth mm", "ΔE", "support", "inside", "")
+    errors = ("twin", "silhouette", "depth mm", "ΔE", "explained")
+    columns = ("capture", "things", "lost", "extra", *errors, "support", "inside", "")
     print_figures(columns, [*rows, _format_row("all", scores)], "things of seg.png or masks.png, else as perceived (*)")
     whole = summarize_twins(scores)
     print(f"{whole['scenes']:.0f} of {whole['captures']:.0f} captures have a scene")
@@ -71,6 +72,7 @@ def _format_row(name: str, scores: "list[TwinScore]", reason: str = "") -> tuple
     counts = [f"{its[key]:.0f}" for key in ("things", "lost", "extra")]
     counts[0] += "" if all(score.truth for score in scores) or len(scores) > 1 else "*"
     depth, color = 1e3 * its["depth_error_m"], its["color_difference"]
-    figures = f"{its['twin']:.3f}", f"{its['silhouette_iou']:.3f}", f"{depth:.1f}", f"{color:.1f}"
+    figures = [f"{its['twin']:.3f}", f"{its['silhouette_iou']:.3f}", f"{depth:.1f}", f"{color:.1f}"]
+    figures.append(f"{its['explained_area']:.3f}")
     kept = [f"{its[f'{kind}_kept']:.0f}/{its[kind]:.0f}" for kind in ("supports", "containments")]
     return name, *counts, *(figure.replace("nan", "–") for figure in figures), *kept, reason[:60]

@@ -119,6 +119,7 @@ def _done_row(scene_id: str, offset: int, size: int) -> dict[str, Any]:
         "displacement_max_m": 0.009,
         "n_fell": 0,
         "n_left_container": 0,
+        "twin_remarks": ["toppled:obj_001", "toppled:obj_000"],
         "at_rest": True,
         "colliding": False,
         "shard": 0,

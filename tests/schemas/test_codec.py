@@ -19,6 +19,7 @@ from schemas.known_length import KnownCameraHeight, KnownDistance, KnownHeight, 
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import (
     Evidence,
+    Explanation,
     FitUncertainty,
     PerceivedObject,
     PerceivedObjects,
@@ -28,7 +29,7 @@ from schemas.objects import (
 )
 from schemas.observation import Observation
 from schemas.outcome import Allowance, Done, Dropped, Failed, ModelCost
-from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
+from schemas.scene import Certificate, Coverage, CuratedScene, ExportedScene, RectifiedLayout, SettledScene
 from schemas.trajectories import Grasps, Motion, NoMotion, Phase, Placement, Verdict
 from schemas.work import (
     CommitCall,
@@ -87,7 +88,12 @@ def examples(seed: int) -> dict[str, object]:
     texture = Texture(color, floats(2, 3, 2))
     placed = PlacedObject("obj_000", "mug", 0.25, mesh(True), 1.25, pose(), None, 2, 0.004, "carved")
     evidence = Evidence(rng.bytes(33), rng.bytes(1), (1, 500), camera, pose())
-    layout = PlacedObjects("a-1", table, (placed, placed), evidence, "geometric", (("obj_009", HARD_TEXT),), record)
+    explanation = Explanation(90, float(rng.random()), (("obj_000", 60, 0.125),))
+    left_out = (("obj_009", HARD_TEXT),)
+    layout = PlacedObjects(
+        "a-1", table, (placed, placed), evidence, "geometric", left_out, record, explanation=explanation
+    )
+    coverage = Coverage(0.5, (float(rng.random()), None))
     pieces = ConvexPieces((mesh(False), mesh(False)), 1.0625, 1e-300, "coacd", "filled")
     rectified = RectifiedLayout("a-1", layout, (pieces, pieces), (pose(), pose()), (0, 1), math.inf)
     settled = SettledScene("a-1", rectified, (pose(), pose()), 0.5)
@@ -116,7 +122,9 @@ def examples(seed: int) -> dict[str, object]:
         camera,
         certificate,
         pieces,
-        CuratedScene("a-1", settled, "rules", assessment),
+        CuratedScene("a-1", settled, "rules", assessment, coverage),
+        coverage,
+        explanation,
         record,
         detections,
         Done(layout),

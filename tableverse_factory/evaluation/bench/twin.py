@@ -55,6 +55,7 @@ class TwinScore:
     relations: PreservedRelations = NO_RELATIONS  # those of the photograph, and those that hold in the scene
     truth: bool = False  # whether the things are ground truth; else what perception found
     reason: str = ""  # why there is no scene, or empty
+    explained_area: float | None = None  # share of what stands above the table, as the scene states it
 
     @property
     def number(self) -> float:
@@ -120,6 +121,7 @@ def compare_files(
         len(view.names) - sum(bool(thing.twin) for thing in compared),
         compare_twin_relations(Path(row.uri), capture, files, meta, masks),
         truth is not None,
+        explained_area=meta.get("fidelity", {}).get("explained_area"),
     )
     return score, TwinPair(capture.color, view.color, things, shown)
 
@@ -138,6 +140,7 @@ def summarize_twins(scores: Sequence[TwinScore]) -> dict[str, float]:
         "twin": float(np.mean(of_all)) if things else float("nan"),
         "silhouette_iou": float(np.median(of_all)) if things else float("nan"),
         "depth_error_m": _take_median([thing.depth_error_m for thing in things]),
+        "explained_area": _take_median([its.explained_area for its in scores if its.explained_area is not None]),
         "color_difference": _take_median([thing.color_difference for thing in things]),
         "supports": relations.carried,
         "supports_kept": relations.carried_kept,

@@ -19,6 +19,7 @@ from tableverse_factory.stages.curate.labels import estimate_label_confidence, e
 from tableverse_factory.stages.curate.phrases import name_objects
 from tableverse_factory.stages.curate.score import UNUSABLE_CAP, WEIGHTS, weigh_criteria
 from tableverse_factory.stages.curate.task_checks import check_tasks
+from tableverse_factory.stages.curate.twin_check import TwinCheck
 
 MAX_PHRASES = 20
 MAX_REMARKS = 100
@@ -31,13 +32,20 @@ def assess_answer(judgement: Judgement, case: JudgeInput, config: CurateConfig) 
     """Check a judge's answer and return the verdict."""
     answer = judgement.answer
     objects = _assess_objects(answer, case)
-    usable = answer.usability.usable and not answer.usability.reason_codes
-    remarks = (*_remark_on_gate(answer), *_remark_on_ids(answer, case), *_remark_on_objects(answer, objects))
+    codes = case.twin.reason_codes
+    usable = answer.usability.usable and not answer.usability.reason_codes and not codes
+    score = min(answer.final_score, case.twin.most_points, 10 if usable else UNUSABLE_CAP)
+    remarks = (
+        *_remark_on_gate(answer),
+        *_remark_on_twin(answer, case.twin),
+        *_remark_on_ids(answer, case),
+        *_remark_on_objects(answer, objects),
+    )
     return Assessment(
         usable=usable,
-        reason_codes=tuple(sorted(set(answer.usability.reason_codes))),
+        reason_codes=tuple(sorted({*answer.usability.reason_codes, *codes})),
         severe_label_error=any(o.label_error for o in objects),
-        quality_score=min(answer.final_score, 10 if usable else UNUSABLE_CAP),
+        quality_score=score,
         criterion_scores={name: getattr(answer.per_criterion, name).score for name in WEIGHTS},
         objects=objects,
         tasks=check_tasks(answer, case, objects, config.judge),
@@ -106,6 +114,14 @@ def _remark_on_gate(answer: JudgeAnswer) -> Iterator[JudgeRemark]:
     elif usable and abs(answer.final_score - weighted) > _OFF_CRITERIA:
         detail = f"{answer.final_score}, but its criteria give {weighted:.1f}"
         yield JudgeRemark(code="score_off_criteria", detail=detail)
+
+
+def _remark_on_twin(answer: JudgeAnswer, twin: TwinCheck) -> Iterator[JudgeRemark]:
+    """Remark where the comparison with the photograph overrules the answer."""
+    if twin.reason_codes and answer.usability.usable:
+        yield JudgeRemark(code="gate_overruled", detail=", ".join(twin.reason_codes))
+    if answer.final_score > twin.most_points:
+        yield JudgeRemark(code="score_capped", detail=f"{answer.final_score}, but the twin allows {twin.most_points}")
 
 
 def _remark_on_ids(answer: JudgeAnswer, case: JudgeInput) -> Iterator[JudgeRemark]:

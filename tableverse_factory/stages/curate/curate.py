@@ -38,7 +38,7 @@ def curate(
     if judge != "rules":
         rules = assess_answer(RulesJudge(config.curate, services).judge(case), case, config.curate)
         verdict = verdict.model_copy(update={"agreement": compare_verdicts(verdict, rules)})
-    return Done(CuratedScene(scene.scene_id, scene, judge, verdict))
+    return Done(CuratedScene(scene.scene_id, scene, judge, verdict, case.twin.coverage))
 
 
 def compare_verdicts(verdict: Assessment, rules: Assessment) -> Agreement:

@@ -19,6 +19,7 @@ from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import fit_slab
 from tableverse_factory.stages.curate.appearance import measure_color_shares
 from tableverse_factory.stages.curate.feasibility import Feasibility
+from tableverse_factory.stages.curate.twin_check import TwinCheck, check_twin
 
 _MAX_CELLS = 400  # most cells along the longer side of the layout: huge layouts get coarser maps
 
@@ -47,13 +48,17 @@ class JudgedObject(Frozen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgeInput:
-    """One scene to judge, its table as exported; `penetration_before_m` is the deepest of the placed pieces [m]."""
+    """One scene to judge, its table as exported; `penetration_before_m` is the deepest of the placed pieces [m].
+
+    `twin` compares it with its photograph, which no judge can overrule.
+    """
 
     scene_id: str
     items: tuple[JudgedObject, ...]
     table: Table
     feasibility: Feasibility
     penetration_before_m: float
+    twin: TwinCheck
 
     @property
     def bodies(self) -> tuple[BodyFeatures, ...]:
@@ -75,7 +80,8 @@ def build_judge_input(scene: SettledScene, config: CurateConfig) -> JudgeInput:
     table = replace(placed.table, center_xy=slab.center_xy, half_size_xy=slab.half_size_xy)
     top = make_support_surface(tuple(item.body for item in items), table, cell)
     feasibility = Feasibility(tuple(meshes), tuple(item.grips for item in items), top, config.max_grasp_mass_kg)
-    return JudgeInput(scene.scene_id, items, table, feasibility, scene.rectified.penetration_before_m)
+    twin = check_twin(scene, tuple(meshes))
+    return JudgeInput(scene.scene_id, items, table, feasibility, scene.rectified.penetration_before_m, twin)
 
 
 def _measure_object(

@@ -28,6 +28,7 @@ from tableverse_factory.physics.mjcf.spec import (
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, increase_rolling_friction, move_bodies
 from tableverse_factory.sources.textures.catalogue import TILE_M
+from tableverse_factory.stages.export.fidelity import describe_fidelity
 from tableverse_factory.stages.export.meta import build_meta_json
 from tableverse_factory.stages.export.projected_color import ColorProjector, load_projectors
 from tableverse_factory.stages.export.rows import build_object_rows, build_scene_row, build_task_rows
@@ -170,12 +171,14 @@ def _assemble(scene: CuratedScene, written: _CertifiedFiles) -> ExportedScene:
     if evidence is not None:
         members["observation/color.jpg"] = evidence.color_jpg
         members["observation/masks.png"] = evidence.masks_png
+    fidelity = describe_fidelity(scene, written.bodies)
+    rows = build_object_rows(scene, written.bodies, written.certificate)
     members["meta.json"] = build_meta_json(scene, written.bodies, written.certificate, members)
     return ExportedScene(
         scene.scene_id,
         tuple(sorted(members.items())),
         written.certificate,
-        build_scene_row(scene, written.certificate),
-        build_object_rows(scene, written.bodies, written.certificate),
+        {**build_scene_row(scene, written.certificate), **fidelity.scene},
+        tuple({**row, **columns} for row, columns in zip(rows, fidelity.objects, strict=True)),
         build_task_rows(scene),
     )

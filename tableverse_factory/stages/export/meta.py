@@ -14,6 +14,7 @@ from schemas.objects import PlacedObjects
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.dataset.scene_meta import FORMAT
 from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
+from tableverse_factory.stages.export.fidelity import describe_fidelity
 from tableverse_factory.stages.export.rows import describe_metric
 
 
@@ -25,7 +26,7 @@ def build_meta_json(
     It keeps the digests of `files`, all other files of the scene.
     """
     placed = scene.settled.rectified.placed
-    evidence = placed.evidence
+    evidence, fidelity = placed.evidence, describe_fidelity(scene, bodies)
     content = {
         "format": FORMAT,
         "scene_id": scene.scene_id,
@@ -41,7 +42,13 @@ def build_meta_json(
         "left_out": [list(entry) for entry in placed.left_out],
         "rectified_by": scene.settled.rectified.method,
         "settle_time_s": scene.settled.settle_time_s,
-        "objects": _describe_objects(scene, placed, bodies, certificate),
+        "fidelity": fidelity.scene,
+        "objects": [
+            {**entry, **columns}
+            for entry, columns in zip(
+                _describe_objects(scene, placed, bodies, certificate), fidelity.objects, strict=True
+            )
+        ],
         "files": compute_file_digests(files),
     }
     return json.dumps(_to_json_value(content), sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False).encode()

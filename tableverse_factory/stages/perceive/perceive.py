@@ -15,6 +15,7 @@ from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.explanation import measure_explanation
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.stages.perceive.scale.known_length import find_scaled_table, scale_by_object
 from tableverse_factory.stages.perceive.table import (
@@ -65,8 +66,13 @@ def perceive(
     pose = compute_camera_to_table(view, points)
     table = fit_table_rectangle(view, pose, points, item.color)
     kept = _paint_ids(view, candidates, ids, objects)
+    explanation = measure_explanation(view, kept, objects)
+    if why := explanation.describe_shortfall({o.object_id for o in objects}, config.perceive.min_explained):
+        return Dropped("too_little_explained", why)
     seen = view.observation
-    return Done(PerceivedObjects(item.scene_id, seen, pose, table, kept, objects, name, left_out, found.record))
+    return Done(
+        PerceivedObjects(item.scene_id, seen, pose, table, kept, objects, name, left_out, found.record, explanation)
+    )
 
 
 def choose_detector(item: Observation, config: PerceiveConfig) -> str:

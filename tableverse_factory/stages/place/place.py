@@ -56,6 +56,9 @@ def place(
         detail = "; ".join(f"{name}: {reason}" for name, reason in left_out[:5]) or "no objects were perceived"
         return Dropped("nothing_placed", detail)
     names = {o.object_id for o in placed}
+    explanation, least = item.explanation, config.perceive.min_explained
+    if explanation is not None and (why := explanation.describe_shortfall(names, least)):
+        return Dropped("too_little_explained", why)
     return Done(
         PlacedObjects(
             scene_id=item.scene_id,
@@ -65,6 +68,7 @@ def place(
             perception=item.perception,
             left_out=tuple(left_out),
             detection=item.detection,
+            explanation=explanation,
         )
     )
 

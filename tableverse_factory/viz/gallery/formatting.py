@@ -30,6 +30,7 @@ _EXPLANATIONS = {
     "no_table_plane": "no table plane was found",
     "no_table_detected": "the detector found no table-top",
     "no_objects": "nothing stands on the table",
+    "too_little_explained": "the objects explain too little of what stands on the table",
     "nothing_placed": "no object could be placed",
     "no_depth_model": "a picture without depth needs a depth model: set observe.depth",
     "no_recorded_depth": "there is no recorded depth beside the picture",

@@ -159,7 +159,7 @@ def _write_index_pages(site: Site, records: Records, cards: Mapping[str, SceneCa
         site.write(names[number - 1], "lost.html", scenes=scenes, pager=pager)
     shown = _split_pages(drawn, PAGE_SIZE) or [[]]
     names = _list_names(make_page_name, shown)
-    reasons = records.count_reasons([code for _, card in drawn for code in card.reason_codes])
+    reasons = records.count_reasons([code for scene, card in drawn for code in (*card.reason_codes, *scene.losses)])
     filtered = {"moves": records.has_trajectories, "reasons": reasons, "scales": records.list_scale_sources()}
     for number, items in reversed(list(enumerate(shown, 1))):
         pager = {"page": number, "pages": len(shown), "names": names}

@@ -62,6 +62,11 @@ class SceneRecord:
         return None not in (self.row["at_rest"], self.row["colliding"], self.row["epsilon_m"])
 
     @property
+    def losses(self) -> list[str]:
+        """Kinds of what toppled, slid, is left out or poorly covered, once each."""
+        return sorted({str(remark).partition(":")[0] for remark in self.row["twin_remarks"] or ()})
+
+    @property
     def labels(self) -> list[str]:
         """Name of each object."""
         return [str(item["relabel_name"] or item["label"]) for item in self.objects]

@@ -44,7 +44,7 @@ def _encode_done(scene: SceneRecord, card: SceneCard, number: dict[str, int]) ->
         _encode_title(scene),
         row["quality_score"],
         0 if row["usable"] is False else 1,
-        list(card.reason_codes),
+        [*card.reason_codes, *scene.losses],
         _to_micrometres(scene.penetration_m),
         _to_micrometres(row["drift_m"]),
         sorted(number[name] for name in set(scene.labels)),

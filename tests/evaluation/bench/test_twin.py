@@ -156,5 +156,6 @@ def test_the_command_computes_the_scene_of_a_capture_and_draws_it(tmp_path, monk
     assert (together["things"], together["lost"]) == (2, 0)
     assert together["twin"] > 0.9
     assert together["depth_error_m"] < 0.003
+    assert together["explained_area"] > 0.98
     with Image.open(pictures / "two.jpg") as picture:
         assert picture.width > 3 * 640

@@ -12,7 +12,7 @@ from schemas.codec import decode, encode
 from schemas.config import Config, PlaceConfig
 from schemas.geometry import TriangleMesh
 from schemas.manifest import SceneKind
-from schemas.objects import PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
+from schemas.objects import Explanation, PerceivedObject, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.bench.completion import render_noisy_view
@@ -214,6 +214,20 @@ def test_hopeless_objects_are_left_out_with_their_reason_and_the_rest_goes_on() 
     (left_out,) = result.left_out
     assert left_out[0] == "obj_000"
     assert "5 points" in left_out[1]
+
+
+def test_a_scene_that_loses_most_of_what_stands_there_while_it_is_placed_is_dropped() -> None:
+    scene = seen(box(0.06, 0.05, 0.1), can(0.03, 0.06, x=0.15))
+    few = replace(
+        scene.objects[0], points_camera=scene.objects[0].points_camera[:5], colors=scene.objects[0].colors[:5]
+    )
+    standing = Explanation(1000, 0.01, (("obj_000", 600, 0.006), ("obj_001", 400, 0.004)))
+    scene = replace(scene, explanation=standing)
+    assert placed(scene).explanation == standing
+    outcome = run(replace(scene, objects=(few, scene.objects[1])))
+    assert isinstance(outcome, Dropped)
+    assert outcome.reason == "too_little_explained"
+    assert outcome.detail.startswith("objects found: 1; they explain 40%")
 
 
 @pytest.mark.parametrize("kind", ["few", "none", "line", "elsewhere"])

@@ -147,6 +147,13 @@ def test_reasons_and_figures_are_told(pages):
     assert "No pictures" in shown["broken"]
     assert "does not load" in shown["broken"]
     assert "1 refused" in shown["photo"]
+    assert "toppled, slid, left out since the picture" in shown["photo"]
+
+
+def test_what_toppled_is_a_reason_to_filter_by(gallery):
+    index = json.loads((gallery / "scenes.js").read_text().removeprefix("window.TABLEVERSE = ").rstrip(";\n"))
+    assert {tuple(codes) for _, _, _, _, codes, *_ in index["done"]} >= {("NON_TABLETOP_OBJECT", "toppled")}
+    assert '<option value="toppled">' in (gallery / "index.html").read_text()
 
 
 def test_where_metres_come_from_is_told_and_filtered_by(pages, gallery):

@@ -16,7 +16,7 @@ from tests.helpers.tabletop_views import Bowl, Box, camera_above, look, overlap
 pytestmark = pytest.mark.heavy
 
 GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
-REPLAY = Config.model_validate({"perceive": {"detector": "replay"}})
+REPLAY = Config.model_validate({"perceive": {"detector": "replay", "min_explained": 0.0}})  # of some of the things
 
 
 def box_of(mask):
