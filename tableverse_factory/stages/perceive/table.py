@@ -35,6 +35,9 @@ MAX_DOWNWARD = 0.5
 MAX_SIDEWAYS = 0.7
 LOWEST_TABLE_OVER_FLOOR_M = 0.25
 MIN_RAISED_AREA_M2 = 0.08
+HIGH_OVER_FLOOR_M = 0.45
+MIN_HIGH_AREA_M2 = 0.04
+LEANING_COS = 0.985  # 10 degrees
 PARALLEL_COS = 0.996
 BENT_PARALLEL_COS = 0.98
 BENDS = 2.0  # tolerance of the fit to a plane, in bends of a depth model
@@ -52,6 +55,8 @@ MIN_TABLE_TOP_PIXELS = 2000
 MIN_BOX_SHARE = 0.35
 CELL_M = 0.02
 GAP_M = 0.2
+COVERED_BELOW_M = 0.3
+OUTLINE_SAMPLES = 20_000
 OUTLINE_MARGIN_M = 0.03
 RECTANGLE_MARGIN_M = 0.03
 
@@ -151,13 +156,20 @@ def _rate_plane(plane: Plane, sample: Points, inliers: Mask) -> _PlaneCandidate:
     return _PlaneCandidate(plane, float(inliers.mean()), area, solidity, float(above.mean()))
 
 
-def _find_main_region(xy: Points2) -> tuple[Points2, float]:
-    """Find the points of the largest patch and of those near it or not much smaller, and their area [m²]."""
+def _find_main_region(xy: Points2, covered: Points2 | None = None) -> tuple[Points2, float]:
+    """Find the points of the largest patch and of those near it or not much smaller, and their area [m²].
+
+    Points over which objects stand, `covered`, connect patches: a pile may hide the middle of a table.
+    """
     cells = np.floor((xy - xy.min(axis=0)) / CELL_M).astype(np.int64)
     if int(cells.max(initial=0)) > 4000:
         return xy, float("inf")
     grid = np.zeros(tuple(cells.max(axis=0) + 1), dtype=bool)
     grid[cells[:, 0], cells[:, 1]] = True
+    if covered is not None:
+        between = np.floor((covered - xy.min(axis=0)) / CELL_M).astype(np.int64)
+        between = between[((between >= 0) & (between < grid.shape)).all(axis=1)]
+        grid[between[:, 0], between[:, 1]] = True
     reach = int(GAP_M / CELL_M / 2)
     near, count = ndimage.label(ndimage.distance_transform_edt(~np.pad(grid, reach)) <= reach)
     near = near[reach:-reach, reach:-reach]
@@ -180,18 +192,29 @@ def _explain_rejection(candidate: _PlaneCandidate) -> str:
 
 
 def _choose_plane(candidates: list[_PlaneCandidate], parallel: float) -> _PlaneCandidate:
-    """Choose the plane with the best score, unless a parallel one stands over it like a table over its floor."""
+    """Choose the plane with the best score, unless a parallel one stands over it like a table over its floor.
+
+    Of several such planes, as of chairs around a table, it is the one that is most of the picture with what it carries.
+    """
     best = max(candidates, key=lambda c: c.score)
-    raised = [
-        c
-        for c in candidates
-        if float(c.plane.normal @ best.plane.normal) > parallel
-        and c.plane.offset - best.plane.offset >= LOWEST_TABLE_OVER_FLOOR_M
-        and c.area_m2 >= MIN_RAISED_AREA_M2
-        and c.solidity >= MIN_SOLIDITY
-        and c.supported_share >= SUPPORT_MIN_SHARE
-    ]
-    return max(raised, key=lambda c: c.score, default=best)
+    raised = [c for c in candidates if c is not best and _is_table_over(c, best, parallel)]
+    return max(raised, key=lambda c: c.share + c.supported_share, default=best)
+
+
+def _is_table_over(table: _PlaneCandidate, floor: _PlaneCandidate, parallel: float) -> bool:
+    """Whether a plane that carries something stands over another one like a table over its floor.
+
+    High above the floor there are no tops of boxes, so that a table may be small and lean, as a school desk does.
+    """
+    over = table.plane.offset - floor.plane.offset
+    high = over >= HIGH_OVER_FLOOR_M
+    return (
+        over >= LOWEST_TABLE_OVER_FLOOR_M
+        and float(table.plane.normal @ floor.plane.normal) > (min(parallel, LEANING_COS) if high else parallel)
+        and table.area_m2 >= (MIN_HIGH_AREA_M2 if high else MIN_RAISED_AREA_M2)
+        and table.solidity >= MIN_SOLIDITY
+        and table.supported_share >= SUPPORT_MIN_SHARE
+    )
 
 
 def _build_view(
@@ -210,7 +233,8 @@ def _build_view(
     n_flat, n_wide = int(flat.sum()), int(wide.sum())
     if n_wide < MIN_WIDE_SHARE * n_flat:
         return Dropped("no_table_plane", f"of {n_flat} readings in one plane only {n_wide} lie together")
-    kept, _ = _find_main_region(xy[wide][:: max(1, n_wide // 20000)])
+    covered = valid & (heights > tolerance) & (heights < COVERED_BELOW_M)
+    kept, _ = _find_main_region(_thin(xy[wide]), _thin(xy[covered]))
     outline = compute_convex_outline(kept)
     depth_over = measure_depth_inside(outline, xy)
     over = valid & (depth_over >= -OUTLINE_MARGIN_M)
@@ -242,6 +266,10 @@ def _level_plane(plane: Plane, others: list[Plane], points: Points, tolerance: F
         return plane
     normal = fit_shared_normal([patch / np.median(patch[:, 2]) for patch in patches if len(patch)])
     return Plane(normal, float(normal @ patches[0].mean(axis=0))).facing(np.zeros(3))
+
+
+def _thin(xy: Points2) -> Points2:
+    return xy[:: max(1, len(xy) // OUTLINE_SAMPLES)]
 
 
 def _remove_strips(flat: Mask, tolerance_px: float) -> Mask:

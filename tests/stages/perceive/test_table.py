@@ -14,11 +14,20 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table, refit_table_to_box
-from tests.helpers.tabletop_views import Box, camera_above, look
+from tests.helpers.tabletop_views import Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
+
+
+def turn_camera(camera, degrees):
+    """The camera turned about the table's y."""
+    half = np.deg2rad(degrees) / 2
+    w, x, y, z = camera.quaternion_wxyz
+    cos, sin = np.cos(half), np.sin(half)
+    turned = np.array([cos * w - sin * y, cos * x + sin * z, cos * y + sin * w, cos * z - sin * x])
+    return replace(camera, quaternion_wxyz=turned)
 
 
 def seen(observation, tmp_path):
@@ -69,6 +78,38 @@ def test_a_small_table_wins_over_the_larger_floor_below(tmp_path):
     found = seen(observation, tmp_path)
     assert found.camera_to_table.position[2] == pytest.approx(0.8, abs=3e-3)
     assert len(found.objects) == 2
+
+
+@pytest.mark.parametrize("lean_deg", [0.0, 6.0])
+def test_a_small_leaning_desk_wins_over_floor_and_chair(tmp_path, lean_deg):
+    """A desk of 0.28 m by 0.2 m, the camera turned by its lean against the floor; a wider seat is lower and empty."""
+    things = (Box(-0.06, 0.02, (0.07, 0.05, 0.12)), Box(0.08, -0.02, (0.06, 0.06, 0.06)))
+    camera = camera_above(0.6, 0.6, 42.0)
+    observation, _ = look(things, camera, noise_m=0.001, table_half=(0.14, 0.1))
+    turned = turn_camera(camera, lean_deg)
+    seat = Box(0.55, 0.5, (0.42, 0.42, 0.03), z=-0.3, color=(90, 30, 30))
+    below, _ = look((seat,), turned, noise_m=0.001, seed=1, table_half=(0, 0), floor_z=-0.65)
+    empty = observation.depth == 0
+    picture = replace(
+        observation,
+        depth=np.where(empty, below.depth, observation.depth),
+        color=np.where(empty[..., None], below.color, observation.color),
+    )
+    found = seen(picture, tmp_path)
+    assert found.camera_to_table.position[2] == pytest.approx(0.6, abs=3e-3)
+    assert len(found.objects) == len(things)
+
+
+def test_a_pile_that_hides_the_middle_of_the_table_loses_nothing_beyond_it(tmp_path):
+    """The right part of the table-top is less than a third of the left, and 0.3 m from it."""
+    rows = enumerate((-0.3, -0.1, 0.1, 0.3))
+    pile = [Box(0.22, y, (0.3, 0.2, 0.07 + 0.05 * (k % 2)), color=(200, 40 + 50 * k, 40)) for k, y in rows]
+    beyond = Box(0.44, 0.0, (0.08, 0.08, 0.1), color=(40, 80, 200))
+    things = [*pile, beyond, Box(-0.25, 0.0, (0.08, 0.08, 0.1))]
+    observation, truth = look(things, camera_above(0.9, 0.7, 52.0), noise_m=0.001, table_half=(0.5, 0.4))
+    found = seen(observation, tmp_path)
+    assert best_overlaps(truth, found.instance_ids)[4] > 0.9, "the box beyond the pile"
+    assert len(found.objects) == len(things)
 
 
 def test_the_flat_top_of_a_box_is_no_table(tmp_path):
@@ -184,7 +225,13 @@ def test_a_box_of_the_table_finds_a_low_one_over_a_larger_floor_and_a_wrong_box_
 
 @pytest.mark.shared
 def test_the_table_of_real_captures_does_not_depend_on_the_seed(shared_dir):
-    heights = {"uoc_000005": 0.455, "osd_test55": 0.590, "ycbv_000002": 0.537}
+    heights = {
+        "uoc_000005": 0.455,
+        "osd_test55": 0.590,
+        "ycbv_000002": 0.537,
+        "ycbv_000003": 0.666,
+        "ycbv_000004": 0.714,
+    }
     for name, height in heights.items():
         row = ImageRow(scene_id=name, kind=SceneKind.CAPTURE, uri=str(shared_dir / "captures" / name))
         observation = observe(row, Config(), np.random.default_rng(0), Services(shared_dir)).value
