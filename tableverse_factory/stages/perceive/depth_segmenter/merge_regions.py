@@ -33,6 +33,7 @@ CHORD_ENDS = 10
 MIN_CONSISTENT = 0.85
 MIN_HIDDEN = 0.3
 NEARER_M = 0.012
+MIN_STEP = 0.2  # length of a step between two regions, in square roots of the smaller one's pixels
 
 ACROSS_PX = 4
 IN_FOOTPRINT = 0.85
@@ -89,7 +90,7 @@ def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdI
     nearer = measure_occlusion(ids, surface)
     pairs: list[tuple[int, int]] = []
     for b in range(len(regions)):
-        a = _find_other_part(regions, b, surface)
+        a = _find_other_part(regions, b, surface, nearer)
         if a is None:
             a = _find_vessel(regions, b, nearer)
         if a is not None:
@@ -103,11 +104,18 @@ def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdI
     return numbered.reshape(ids.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
 
 
-def _find_other_part(regions: list[MergedRegion], b: int, surface: Surface) -> int | None:
-    """Find the region of which b is a smaller part, separated from it in the picture by an occluder."""
+def _find_other_part(
+    regions: list[MergedRegion], b: int, surface: Surface, nearer: Float64[np.ndarray, "k k"]
+) -> int | None:
+    """Find the region of which b is a smaller part, separated from it in the picture by an occluder.
+
+    Where one of the two is itself seen in front of the other, it ends there, however well they continue each other.
+    """
     for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
         if regions[a].size <= regions[b].size:
             return None
+        if max(nearer[a + 1, b + 1], nearer[b + 1, a + 1]) >= MIN_STEP * regions[b].size ** 0.5:
+            continue
         if is_continuation(regions[a], regions[b]) and is_hidden_between(regions[a], regions[b], surface):
             return a
     return None

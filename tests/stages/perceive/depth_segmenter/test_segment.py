@@ -51,6 +51,13 @@ def test_a_box_stacked_on_another_is_cut_at_the_crease(tmp_path, noise_m):
     assert_found([lower, upper], tmp_path, noise_m=noise_m)
 
 
+@pytest.mark.parametrize("gap_m", [0.03, 0.06])
+def test_two_boxes_of_one_height_behind_a_third_stay_two_where_one_is_seen_before_the_other(tmp_path, gap_m):
+    """Their tops continue each other behind the third, but beside it the near one ends in a step."""
+    near, far = Box(0.0, -0.1, (0.2, 0.2, 0.08)), Box(0.0, 0.12 + gap_m, (0.2, 0.24, 0.08), color=(40, 160, 60))
+    assert_found([near, far, Box(0.0, -0.08, (0.1, 0.05, 0.12), z=0.08, color=(20, 20, 200))], tmp_path, noise_m=0.0015)
+
+
 def test_things_of_one_colour_are_told_apart_by_shape_alone(tmp_path):
     gray = (150, 150, 150)
     assert_found(
