@@ -11,6 +11,7 @@ from tableverse_factory.physics.mjcf.slab import fit_slab
 from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_spec
 from tableverse_factory.physics.simulate import at_rest
 from tableverse_factory.physics.simulate.at_rest import SPEED_LIMIT, measure_drift, simulate_to_rest
+from tableverse_factory.physics.simulate.certificate import find_deepest_contact
 from tests.helpers.simple_scenes import TABLE, UPRIGHT, ball, box
 
 SLAB = fit_slab(TABLE, [], [], [])
@@ -58,6 +59,17 @@ def test_a_stack_of_three_stands_and_a_heavy_top_does_not_sink_in() -> None:
         np.testing.assert_allclose(pose.position, [0.0, 0.0, 0.025 + 0.05 * k], atol=5e-4)
     drift = measure_drift(model, 5.0)
     assert drift.angle_rad.max() < 0.01
+
+
+def test_what_weighs_grams_does_not_sink_under_what_weighs_a_kilogram() -> None:
+    balls = [(ball(0.008), (x, 0.0, 0.008)) for x in (-0.04, 0.04)]
+    model = model_of(
+        [*balls, (ball(0.008), (0.0, 0.05, 0.008)), (box(0.14, 0.14, 0.1), (0.0, 0.015, 0.0665))], [0.008] * 3 + [1.5]
+    )
+    rest = simulate_to_rest(model, 6.0)
+    assert rest.at_rest
+    depth, pair = find_deepest_contact(model, rest.poses)
+    assert depth < 1e-4, pair
 
 
 def test_a_tall_box_on_a_bumpy_foot_stays_upright() -> None:
