@@ -16,6 +16,7 @@ TILT_NOISE_DEG = 3.0  # an object is as good as upright if it would stand when t
 BASIN_DEG = 6.0  # so far tilted, a standing object has its centre of mass higher than for some tilt within the noise
 BASIN_TOLERANCE_M = 2e-4  # round objects stand in any direction: their centre of mass must not sink by more than this
 ON_TABLE_M = 0.008  # an object whose lowest vertex is higher than this does not stand on the table
+HANGING_M = 0.015  # noise does not lift an object higher than this: something carries it, wherever it touches it
 
 VERTICAL_NOISE_M = 0.012  # an object that must rise or sink by no more than this to lie upon another may lie upon it
 STEEP_NOISE_M = 0.025  # so at steep edges, which turn sideways noise into height, if the opposite is twice as far
@@ -49,7 +50,8 @@ def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelatio
     Of two near parts, one carries the other if that one could not stand alone, or has its centre of mass above the
     other's footprint. The upper one is the one that must rise or sink less to lie upon the other: by the order of the
     noise, instead of an object's height. A part that could not stand alone and has no support so far leans on the
-    nearest part on the side to which it would fall.
+    nearest part on the side to which it would fall; one that hangs in the air, on the nearest on any side. Where all
+    that it touches was read as carried by it, the one upon which it would lie soonest carries it instead, within noise.
     """
     reader = _Reader(parts)
     pairs: set[tuple[int, int]] = set()
@@ -62,6 +64,7 @@ def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelatio
         if reader.needy[i] and all(upper != i for upper, _ in pairs):
             lower = reader.leans_on(i, [j for j in range(len(parts)) if j != i and (j, i) not in pairs])
             pairs |= set() if lower is None else {(i, lower)}
+    reader.turn_hanging(pairs)
     uppers = {upper for upper, _ in pairs}
     return SupportRelation(frozenset(pairs), tuple(i not in uppers for i in range(len(parts))))
 
@@ -72,6 +75,7 @@ class _Reader:
         self._falls = [_find_fall_direction(part) for part in parts]
         self._outlines = [_compute_half_planes((part.body.solids.points + part.body.offset)[:, :2]) for part in parts]
         self._hovers = [part.lowest_now_m > ON_TABLE_M for part in parts]
+        self._hangs = [part.lowest_now_m > HANGING_M for part in parts]
         self._ranks = [(-float(part.mass_center_now[2]), part.object_id) for part in parts]
         # Parts that the table alone cannot carry, within the noise of their poses.
         self.needy = [fall is not None or hovers for fall, hovers in zip(self._falls, self._hovers, strict=True)]
@@ -87,21 +91,32 @@ class _Reader:
         likely = [k for k in (i, j) if off[k] <= VERTICAL_NOISE_M and (needy[k] or over[k])]
         if likely:
             return min(likely, key=lambda k: (not needy[k], off[k], ranks[k]))
+        if (over[i] or over[j]) and max(off.values()) > 2 * min(off.values()):
+            return min((i, j), key=lambda k: off[k])
         if over[i] or over[j]:
             return min((i, j), key=lambda k: (not self._hovers[k], not needy[k], off[k], ranks[k]))
         steep = [k for k in (i, j) if needy[k] and off[k] <= min(STEEP_NOISE_M, off[i + j - k] / 2)]
         return min(steep, key=lambda k: (off[k], ranks[k]), default=None)
 
     def leans_on(self, i: int, others: Sequence[int]) -> int | None:
-        """Find the nearest of the others on the side to which a part would fall, within reach."""
+        """Find the nearest of the others within reach, on the side to which a part would fall unless it hangs."""
         fall = self._falls[i]
         found = []
         for j in others:
             gap, point = find_nearest_point(self._parts[i].body, self._parts[j].body, LEANING_REACH_M)
             side = 0.0 if fall is None else float((point - self._parts[i].mass_center_now)[:2] @ fall)
-            if gap <= LEANING_REACH_M and side >= 0.0:
+            if gap <= LEANING_REACH_M and (side >= 0.0 or self._hangs[i]):
                 found.append((gap, self._parts[j].object_id, j))
         return min(found)[2] if found else None
+
+    def turn_hanging(self, pairs: set[tuple[int, int]]) -> None:
+        """Turn one pair of every hanging part that nothing carries and that carries others, where noise allows it."""
+        for i in (i for i, hangs in enumerate(self._hangs) if hangs and all(upper != i for upper, _ in pairs)):
+            carried = [(self._off(i, j), self._parts[j].object_id, j) for j, lower in pairs if lower == i]
+            if carried and min(carried)[0] <= STEEP_NOISE_M:
+                j = min(carried)[2]
+                pairs -= {(j, i)}
+                pairs |= {(i, j)}
 
     def _off(self, i: int, j: int) -> float:
         """Measure how far a part must rise or sink to lie upon another one [m]."""

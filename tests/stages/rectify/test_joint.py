@@ -213,6 +213,29 @@ def test_what_leans_stays_leaning() -> None:
         assert np.abs(offsets(result)).max() < 0.008
 
 
+@pytest.mark.parametrize("angle", [-30.0, 30.0])
+def test_what_hangs_is_carried_by_what_it_touches(angle: float) -> None:
+    """A tilted board in the air beside a box, to which it would fall or not."""
+    prop = placed("prop", box(0.1, 0.1, 0.2), (0, 0, 0.1))
+    board = tilted(placed("board", box(0.02, 0.1, 0.08), (0.09, 0, 0.1)), 0.0, angle)
+    assert read_support([part(prop), part(board)], CONFIG.contact_m).pairs == {(1, 0)}
+
+
+def test_of_two_in_one_place_the_one_that_rises_less_lies_on_the_other() -> None:
+    """A rod through a plate that hovers: the rod need not rise by its length, as the plate would."""
+    plate, rod = placed("plate", box(0.1, 0.1, 0.01), (0, 0, 0.025)), placed("rod", box(0.04, 0.04, 0.2), (0, 0, 0.1))
+    assert read_support([part(plate), part(rod)], CONFIG.contact_m).pairs == {(1, 0)}
+
+
+def test_what_hangs_stands_on_what_seemed_to_lie_on_it() -> None:
+    """A ball noisily sunk into the bar below it, which has a carrier of its own."""
+    post = placed("post", box(0.04, 0.04, 0.05), (-0.1, 0, 0.025))
+    bar = placed("bar", box(0.24, 0.03, 0.02), (-0.005, 0, 0.0605))
+    knob = placed("knob", box(0.05, 0.05, 0.025), (0.09, 0, 0.06))
+    pairs = read_support([part(post), part(bar), part(knob)], CONFIG.contact_m).pairs
+    assert pairs == {(1, 0), (2, 1)}
+
+
 def test_a_ball_in_a_tray_goes_where_its_walls_are_not() -> None:
     floor = placed("tray", box(0.2, 0.2, 0.01), (0, 0, 0.005))
     fruit = placed("fruit", ball(0.03), (0.02, 0.0, 0.035), contained_in="tray")
