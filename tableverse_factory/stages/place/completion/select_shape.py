@@ -11,6 +11,7 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
+from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
@@ -132,5 +133,6 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
     ("carved/revolution", 1e-4, _draft_revolution),
     ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
     ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
-    ("carved/columns", 2.0e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+    ("carved/inflation", 1.9e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    ("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )

@@ -77,13 +77,13 @@ class CarvedSurface(Frozen):
 def carve_columns(view: ObjectView) -> CarvedSurface:
     """Carve the solid below the observed points by free space, down to the support or its underside."""
     rectangle = fit_min_rectangle(view.points[:, :2])
-    pose, half = _place_frame(view, rectangle, rectangle.center)
-    grid, stretch = _build_flat_grid(view, half)
+    pose, half = place_frame(view, rectangle, rectangle.center)
+    grid, stretch = build_flat_grid(view, half)
     local = grid.points() / np.array([1.0, 1.0, stretch])
     free = measure_free_space(view, local, pose).reshape(grid.shape)
-    field = np.minimum(_compute_column_field(view, pose, grid, stretch, free), free)
+    field = np.minimum(compute_column_field(view, pose, grid, stretch, free), free)
     if _is_torn(field):
-        field = np.minimum(_compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
+        field = np.minimum(compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
     return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 
@@ -92,7 +92,7 @@ def carve_half_turn(view: ObjectView) -> CarvedSurface:
     center = _find_turn_center(view)
     turned = 2 * center - view.points[:, :2]
     rectangle = fit_min_rectangle(np.concatenate([view.points[:, :2], turned]))
-    pose, half = _place_frame(view, rectangle, center)
+    pose, half = place_frame(view, rectangle, center)
     cell = float(np.clip((2 * half).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
     grid = make_grid(-half - cell, half + cell, cell)
     local = grid.points()
@@ -109,7 +109,7 @@ def carve_half_turn(view: ObjectView) -> CarvedSurface:
     return CarvedSurface(extract_surface(drop_crumbs(smooth), grid), 1.0, cell, pose)
 
 
-def _place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndarray, "2"]) -> tuple[Pose, Vector3]:
+def place_frame(view: ObjectView, rectangle: Rectangle, center: Float64[np.ndarray, "2"]) -> tuple[Pose, Vector3]:
     """Place an upright frame about a centre with the yaw of a rectangle; returns it and half the object's size [m]."""
     top = max(float(np.quantile(view.points[:, 2], 0.998)), view.support_z + MIN_THICKNESS_M)
     half = np.array([*rectangle.half_size, (top - view.support_z) / 2])
@@ -152,7 +152,7 @@ def _is_torn(field: Field) -> bool:
     return len(sizes) > 1 and bool(sizes[-2] > TORN_SHARE * sizes.sum())
 
 
-def _build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]:
+def build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]:
     """Build a grid and the stretch of its heights: flat objects need finer vertical steps."""
     size = 2 * half
     pixel = float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) / view.camera.fx
@@ -163,7 +163,7 @@ def _build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]
     return make_grid(-half * scale - cell, half * scale + cell, cell), stretch
 
 
-def _compute_column_field(
+def compute_column_field(
     view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
 ) -> Field:
     """Compute the signed distance to the columns below the observed points [m]."""

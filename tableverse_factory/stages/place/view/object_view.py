@@ -143,6 +143,16 @@ def measure_clearances(
     return np.where(inside, clearance, 1.0), np.where(inside & own, depth_gap, np.inf), hidden
 
 
+def sample_nearest(
+    view: ObjectView, points: Points, frame: Pose, images: tuple[DepthImage, ...]
+) -> tuple[Distances, list[Distances]]:
+    """Compute the depth of points in a frame [m], and the values of images of the window at the pixels next to them."""
+    u, v, z = _project_columns(points, compose_poses(invert_pose(view.camera_to_table), frame), view.camera)
+    height, width = view.own.shape
+    row, column = np.clip(np.rint(v), 0, height - 1).astype(np.intp), np.clip(np.rint(u), 0, width - 1).astype(np.intp)
+    return z, [image[row, column] for image in images]
+
+
 def _remove_bleed(
     own: Mask, trusted: Mask, raw: DepthImage, window: Camera, camera_to_table: Pose, support_z: float
 ) -> tuple[Mask, Mask]:
