@@ -16,7 +16,14 @@ AZIMUTHS = 32
 CELLS = 4500
 CELL_RANGE_M = (0.0007, 0.0025)
 WALL_RANGE_M = (0.0012, 0.012)
-USUAL_WALL_M = 0.003
+USUAL_WALL_M = 0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls
+WALL_POINTS, LEAST_POINTS = 300, 30
+LIP_M = 0.004  # height next to rim and floor over which a wall is not measured: both are rounded
+# Least height of a floor that the cavity's own wall hid: deep cups stand on a thick one or on a ring.
+HIDDEN_FLOOR_M = 0.004
+FLAT = 0.2  # most sideways part of the normal of a level floor
+FLOOR_SHARE = 0.9  # part of a cavity's radius within which level points are its floor
+FLOOR_CELLS = 2  # height above the lowest open cell up to which they are
 MIN_HOLLOW_M = 0.008
 HOLLOW_TILT_COS = 0.8
 SLICE_M = 0.002
@@ -126,28 +133,37 @@ def _find_cavity_cells(votes: _Votes, least: float) -> Cells | None:
     return cavity
 
 
-def _measure_wall(profile: Profile, outward: Float64[np.ndarray, " n"]) -> float:
-    """Measure the thickness of a wall seen from both sides [m], across it; a usual one for others."""
-    slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
-    found: list[float] = []
-    for k in np.unique(slices):
-        inner = (slices == k) & (outward < -0.3)
-        outer = (slices == k) & (outward > 0.3)
-        if inner.sum() >= 5 and outer.sum() >= 5:
-            across = float(np.median(profile[outer, 0]) - np.median(profile[inner, 0]))
-            # Where both sides are seen the outer one is often the rounded lip: the inner side says how the wall slants.
-            slant = min(float(np.median(np.abs(outward[side]))) for side in (inner, outer))
-            found.append(across * slant)
-    return float(np.clip(np.median(found), *WALL_RANGE_M)) if found else USUAL_WALL_M
+def _measure_wall_across(hole: CrossSection, outer: Profile, low: float, high: float) -> float:
+    """Measure a wall between its cavity and the points seen outside [m]; a usual one where too few lie beside it.
+
+    Those whose nearest point of the cavity is not between the heights `low` and `high` belong to the lip or the foot.
+    """
+    loop = max((np.asarray(loop) for loop in hole.to_polygons()), key=_compute_area)
+    along = np.roll(loop, -1, axis=0) - loop
+    step = max(1, len(outer) // WALL_POINTS)
+    points = outer[::step, None]
+    share = ((points - loop) * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-18)
+    nearest = loop + np.clip(share, 0.0, 1.0)[..., None] * along
+    distance = np.linalg.norm(points - nearest, axis=-1)
+    best = distance.argmin(axis=1)
+    height = nearest[np.arange(len(best)), best, 1]
+    beside = (height > low) & (height < high)
+    if beside.sum() * step < LEAST_POINTS:
+        return USUAL_WALL_M
+    return float(np.clip(np.median(distance.min(axis=1)[beside]), *WALL_RANGE_M))
 
 
 def _build_thin_wall(
     votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], swelling: float
 ) -> tuple[CrossSection, CrossSection]:
     """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
-    wall = _measure_wall(profile, outward)
     outer = _find_outer_profile(profile, outward)
-    completed, floor_z = _complete_cavity(votes, cavity, outer, wall)
+    rim = votes.bottom + votes.cell * (int(np.flatnonzero(cavity.any(axis=0))[-1]) + 1)
+    flat = profile[np.abs(outward) < FLAT]
+    completed, floor_z = _complete_cavity(votes, cavity, outer, USUAL_WALL_M, flat)
+    seen = _build_cavity(votes, completed, swelling)
+    wall = _measure_wall_across(seen, profile[outward > 0.3], floor_z + LIP_M, rim - LIP_M)
+    completed, floor_z = _complete_cavity(votes, cavity, outer, wall, flat)
     hole = _build_cavity(votes, completed, swelling)
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
     if len(outer) >= 2:
@@ -164,7 +180,6 @@ def _build_thin_wall(
         solid = solid - _build_rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
     carved = _build_solid(votes)
-    rim = votes.bottom + votes.cell * (int(rows[-1]) + 1)
     thin = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24)
     least = thin ^ _build_rectangle(2.0, votes.bottom, rim)
     sealed = hole - _build_rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
@@ -205,8 +220,11 @@ def _find_outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) ->
     return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
 
 
-def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) -> tuple[Cells, float]:
-    """Complete the cavity by cells that its own wall hid, down to the visible floor or to a wall above the bottom."""
+def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float, flat: Profile) -> tuple[Cells, float]:
+    """Complete the cavity by cells that its own wall hid, down to the visible floor or to a usual one.
+
+    `flat` are the points of the profile whose surface is level.
+    """
     unknown = np.isnan(votes.field)
     rows = np.flatnonzero(cavity.any(axis=0))
     edges = {int(k): int(np.flatnonzero(cavity[:, k])[-1]) for k in rows}
@@ -220,7 +238,12 @@ def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float) 
     below = votes.field[: max(int(0.7 * radius), 1), max(lowest - 3, 0) : lowest + 1]
     if float((below > 0.0).any(axis=1).mean()) > 0.3:
         return completed, votes.bottom + votes.cell * lowest
-    floor = min(max(int(np.ceil(max(wall, USUAL_WALL_M) / votes.cell)), 1), lowest)
+    near = (flat[:, 0] < FLOOR_SHARE * radius * votes.cell) & (
+        flat[:, 1] < votes.bottom + votes.cell * (lowest + FLOOR_CELLS)
+    )
+    if near.sum() >= LEAST_POINTS:
+        return completed, min(float(np.median(flat[near, 1])), votes.bottom + votes.cell * lowest)
+    floor = min(max(int(np.ceil(max(wall, HIDDEN_FLOOR_M) / votes.cell)), 1), lowest)
     for k in range(floor, lowest):
         z = votes.bottom + (k + 0.5) * votes.cell
         limit = radius * votes.cell

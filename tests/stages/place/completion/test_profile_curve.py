@@ -1,0 +1,54 @@
+"""Cups and bowls: a wall is as thick as it is, its floor as high as it was seen."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.geometry import TriangleMesh
+from tableverse_factory.evaluation.bench.completion import contains_points, render_noisy_view
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.stages.place.completion.ray_misfit import sample_rays
+from tableverse_factory.stages.place.completion.revolution import fit_revolution
+from tableverse_factory.stages.place.view.object_view import view_object
+from tableverse_factory.stages.place.view.support_from_depth import find_supports
+
+RADIUS_M, HEIGHT_M = 0.04, 0.07
+STEP_M = 1e-4
+
+
+def cup(wall: float, floor: float) -> TriangleMesh:
+    inner = RADIUS_M - wall
+    outline = [(0, 0), (RADIUS_M, 0), (RADIUS_M, HEIGHT_M), (inner, HEIGHT_M), (inner, floor), (0, floor)]
+    return from_trimesh(trimesh.creation.revolve(np.array(outline), sections=64))
+
+
+def complete(mesh: TriangleMesh, elevation: float) -> TriangleMesh:
+    scene = render_noisy_view([mesh], 0.7, elevation, np.random.default_rng(3))
+    view = view_object(scene, scene.objects[0], find_supports(scene)[scene.objects[0].object_id])
+    fit = fit_revolution(view, sample_rays(view))
+    assert fit is not None
+    assert fit[3]
+    return place_mesh(fit[0], fit[1])
+
+
+def measure_solid(mesh: TriangleMesh, start: np.ndarray, along: np.ndarray, length: float) -> float:
+    steps = np.arange(0.0, length, STEP_M)
+    return STEP_M * float(contains_points(mesh, start + steps[:, None] * along).sum())
+
+
+@pytest.mark.parametrize("wall", [0.002, 0.004, 0.006])
+def test_a_wall_seen_from_both_sides_is_as_thick_as_it_is(wall):
+    whole = complete(cup(wall, 0.006), elevation=0.7)
+    directions = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+    middle = np.array([0.0, 0.0, 0.6 * HEIGHT_M])
+    found = np.mean([measure_solid(whole, middle, direction, 2 * RADIUS_M) for direction in directions])
+    assert abs(found - wall) < 0.0007
+
+
+@pytest.mark.parametrize("floor", [0.004, 0.012])
+def test_a_floor_seen_is_as_high_as_it_is(floor):
+    whole = complete(cup(0.004, floor), elevation=1.1)
+    z = np.arange(0.0, HEIGHT_M, STEP_M)
+    for x in (-0.015, 0.0, 0.015):
+        solid = contains_points(whole, np.stack([np.full(len(z), x), np.zeros(len(z)), z], axis=1))
+        assert abs(z[solid][-1] - floor) < 0.001
