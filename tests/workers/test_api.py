@@ -61,7 +61,7 @@ def test_a_text_or_path_among_the_overrides_is_no_yaml(tiny, tmp_path, value):
         ({"from_stage": "settel"}, ConfigError, "did you mean settle"),
         ({"stages": "trajectories"}, ConfigError, r"\+trajectories"),
         ({"overrides": {"run.sed": 1}}, ConfigError, r"^--set or override: .*run\.seed"),
-        ({"overrides": {"run.shard_size": "few"}}, ConfigError, r"^--set or override: run\.shard_size: 'few' is not allowed"),
+        ({"overrides": {"run.shard_size": "few"}}, ConfigError, r"^--set or override: run\.shard_size: 'few'"),
         ({"max_usd": float("nan")}, ConfigError, "amount of money"),
         ({"executor": "ray", "address": "host"}, BuildError, "HOST:PORT"),
         ({"executor": "local", "workers": 4}, BuildError, "one worker"),
