@@ -128,6 +128,19 @@ def test_a_wall_behind_is_neither_table_nor_object(tmp_path):
     assert (truth[found.instance_ids > 0] > 1).mean() > 0.98
 
 
+@pytest.mark.parametrize("height_m", [0.15, 0.25])
+def test_a_rail_on_a_wall_over_the_tables_edge_is_no_object(tmp_path, height_m):
+    wall = Box(0.51, 0.2, (0.1, 1.4, 0.7), color=(240, 240, 240))
+    rail = Box(0.435, 0.25, (0.05, 0.5, 0.05), z=height_m, color=(90, 90, 90))
+    on_table = Box(-0.1, 0.0, (0.1, 0.1, 0.1))
+    observation, truth = look(
+        [on_table, rail, wall], camera_above(0.9, 0.8, 42.0), noise_m=0.001, table_half=(0.46, 0.5)
+    )
+    found = seen(observation, tmp_path)
+    assert len(found.objects) == 1
+    assert best_overlaps(truth, found.instance_ids)[0] > 0.9
+
+
 def test_a_wall_alone_is_no_table():
     observation, _ = look([], camera_above(0.6, 0.7, 5.0), table_half=(0, 0), wall_y=0.6)
     outcome = find_table(observation, np.random.default_rng(0))

@@ -41,7 +41,11 @@ def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) 
     for k in range(1, int(ids.max(initial=0)) + 1):
         mask = (ids == k) & view.valid
         least = MIN_CONTENT_AREA_M2 if k in contents else MIN_AREA_M2
-        if _is_large_enough(mask, view, least) and _is_carried(mask, view) and not _is_ragged_edge(mask, inner, view):
+        if (
+            _is_large_enough(mask, view, least)
+            and _is_carried(mask, ids, view)
+            and not _is_ragged_edge(mask, inner, view)
+        ):
             kept.append(k)
     return renumber_regions(ids, kept)
 
@@ -74,10 +78,11 @@ def _find_feet_below_image(view: TableView) -> Mask:
     return np.nan_to_num(rows, nan=np.inf) > view.valid.shape[0] - 1
 
 
-def _is_carried(mask: Mask, view: TableView) -> bool:
+def _is_carried(mask: Mask, ids: IdImage, view: TableView) -> bool:
     """Whether the region is near the table or has a visible or hidden support.
 
     Below its lower contour are the table, a surface that it touches, or something nearer that may hide its support.
+    What rises there beyond the table, in no region of `ids`, is a wall or furniture: a rail on it is no object.
     """
     if float(np.percentile(view.heights[mask], 2)) < HANGING_M:
         return True
@@ -88,7 +93,7 @@ def _is_carried(mask: Mask, view: TableView) -> bool:
     below = np.minimum(below, mask.shape[0] - 1)
     points, under = view.points_camera[lowest, columns], view.points_camera[below, columns]
     touches = np.linalg.norm(points - under, axis=1) < CONTACT_M
-    seen = view.valid[below, columns]
+    seen = view.valid[below, columns] & ((ids[below, columns] > 0) | ~view.raised[below, columns])
     carried = at_border | (seen & (touches | view.on_plane[below, columns] | (under[:, 2] < points[:, 2])))
     return float(carried.mean()) >= MIN_CARRIED
 
