@@ -1,5 +1,6 @@
 """`tableverse bench perception | placement | completion`: comparison of masks, poses and meshes with the truth."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -75,23 +76,38 @@ def bench_placement(
 def bench_completion(
     folder: Annotated[Path, typer.Argument(help="Folder of scanned meshes.", exists=True, file_okay=False)],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the depth noise.")] = 0,
+    view: Annotated[
+        list[str] | None,
+        typer.Option(metavar="AZIMUTH,ELEVATION", help="A camera's direction [degrees]; repeat it for more."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare single-view completions of scanned meshes with the whole meshes, beside hull and height field.
 
-    Example: `tableverse bench completion meshes`
+    Example: `tableverse bench completion meshes --seed 11 --view 200,25 --view 320,45`
     """
-    from tableverse_factory.evaluation.bench.completion import bench_completion
+    from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion
 
-    scores = bench_completion(folder, seed)
+    scores = bench_completion(folder, seed, [_parse_view(text) for text in view] if view else VIEWS)
     if as_json:
         print_json(scores)
     else:
         _show_completions(scores)
 
 
+def _parse_view(text: str) -> tuple[float, float]:
+    azimuth, _, elevation = text.partition(",")
+    try:
+        found = float(azimuth), float(elevation)
+    except ValueError:
+        found = math.nan, math.nan
+    if not (math.isfinite(found[0]) and 5.0 <= found[1] <= 85.0):
+        raise typer.BadParameter(f"{text!r}: give azimuth and elevation in degrees, as in 200,25; elevation 5 to 85")
+    return found
+
+
 def _show_completions(scores: list["CompletionScore"]) -> None:
-    title = "two views of each mesh: IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
+    title = "IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
     columns = ("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
     ours = [score for score in scores if score.method.startswith("carved")]

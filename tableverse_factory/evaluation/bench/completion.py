@@ -46,7 +46,7 @@ class CompletionScore:
     """Score of one method on one view of a mesh."""
 
     mesh: str
-    view: int  # index into `VIEWS`
+    view: int  # index into the views
     method: str  # `hull`, `height field`, or the `completion` that the place stage recorded
     iou: float  # volume of the intersection over the union; 0 where nothing was placed
     chamfer_m: float  # mean of the two mean distances between the surfaces [m]
@@ -56,8 +56,13 @@ class CompletionScore:
     cpu_s: float = 0.0  # CPU time of the place stage; 0 for the other methods [s]
 
 
-def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
-    """Complete every mesh in `folder` from two views by convex hull, height field and the place stage."""
+def bench_completion(
+    folder: Path, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS
+) -> list[CompletionScore]:
+    """Complete every mesh in `folder` from each view by convex hull, height field and the place stage.
+
+    A view is the azimuth and elevation of a camera [degrees].
+    """
     paths = sorted(folder.glob("*.obj"))
     if not paths:
         raise InputError(f"{sanitize_line(str(folder))} holds no meshes: give a folder with *.obj in it")
@@ -66,7 +71,7 @@ def bench_completion(folder: Path, seed: int = 0) -> list[CompletionScore]:
         truth = stand_on_table(read_mesh(path.read_bytes(), path.name))
         share, cavity = measure_cavity(truth)
         hollow = share >= HOLLOW_SHARE
-        for view, (azimuth, elevation) in enumerate(VIEWS):
+        for view, (azimuth, elevation) in enumerate(views):
             rng = np.random.default_rng([seed, index, view])
             scene = render_noisy_view([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng)
             for method, mesh, cpu_s in _complete_all(scene):

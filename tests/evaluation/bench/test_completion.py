@@ -53,6 +53,25 @@ def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
 
 
 @pytest.mark.heavy
+def test_views_are_those_that_were_asked_for(tmp_path, run):
+    (tmp_path / "box.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))
+    found = {}
+    for view in ("20,35", "200,60"):
+        code, out, _ = run("bench", "completion", tmp_path, "--view", view, "--json")
+        found[view] = {row["method"]: row["iou"] for row in json.loads(out)}
+        assert code == 0
+        assert {row["view"] for row in json.loads(out)} == {0}
+    assert found["20,35"]["hull"] != found["200,60"]["hull"]
+
+
+@pytest.mark.parametrize("view", ["north", "20", "20,95", "nan,40"])
+def test_a_view_that_is_none_is_refused_with_what_would_be_right(tmp_path, run, view):
+    code, _, err = run("bench", "completion", tmp_path, "--view", view)
+    assert code == 2
+    assert "200,25" in " ".join(err.split())
+
+
+@pytest.mark.heavy
 def test_figures_come_as_strict_json_too(tmp_path, run):
     (tmp_path / "NaN.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))
     code, out, _ = run("bench", "completion", tmp_path, "--json")

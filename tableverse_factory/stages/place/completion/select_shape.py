@@ -133,6 +133,6 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
     ("carved/revolution", 1e-4, _draft_revolution),
     ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
     ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
-    ("carved/inflation", 1.9e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    ("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     ("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )
