@@ -1,4 +1,4 @@
-"""The mesh model `carved`: the simplest of five kinds of shape that explains the picture."""
+"""The mesh model `carved`: the simplest of six kinds of shape that explains the picture."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -72,7 +72,7 @@ class _Search:
 
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
-    """Fit boxes, a surface of revolution, a half-turn symmetric solid and columns, and select the best."""
+    """Fit boxes, a surface of revolution, half-turn symmetric and inflated solids and columns, and select the best."""
     rays = sample_rays(view)
     search = _Search()
     for method, freedom, make in KINDS:
