@@ -5,7 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.config import Config
+from schemas.geometry import Pose
 from schemas.identity import find_name_clashes
+from schemas.objects import PlacedObject
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.core.errors import GeometryError
@@ -14,7 +16,8 @@ from tableverse_factory.physics.bodies.prior_mass import make_prior_body
 from tableverse_factory.physics.mjcf.slab import Slab, fit_slab
 from tableverse_factory.physics.mjcf.spec import SceneBody
 from tableverse_factory.physics.simulate.at_rest import Rest
-from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, find_fallen
+from tableverse_factory.physics.simulate.settle_bodies import find_fallen
+from tableverse_factory.physics.simulate.settle_near import settle_near
 
 
 def settle(
@@ -25,8 +28,10 @@ def settle(
 ) -> Outcome[SettledScene]:
     """Simulate until every object is at rest.
 
-    Masses are priors from labels and volumes: the judge predicts better ones next, and export settles again
-    with those. Dropped: `reserved_object_id`, `unusable_mesh`, `simulation_unstable`, `object_fell`, `not_at_rest`.
+    Objects that end far from where they were seen are put down once more near there, unless the paper's method, which
+    may move objects far, has rectified them. Masses are priors from labels and volumes: the judge predicts better ones
+    next, and export settles again with those. Dropped: `reserved_object_id`, `unusable_mesh`, `simulation_unstable`,
+    `object_fell`, `not_at_rest`.
     """
     objects = layout.placed.objects
     if bad := find_name_clashes([item.object_id for item in objects]):
@@ -36,7 +41,8 @@ def settle(
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
     step, limit = config.settle.timestep_s, config.settle.max_time_s
-    ended, rest = bring_to_rest(bodies, slab, timestep_s=step, max_time_s=limit, gentle=True)
+    seen = {} if layout.method == "lccr" else list_seen_poses(objects)
+    ended, rest = settle_near(bodies, seen, slab, timestep_s=step, max_time_s=limit)
     return _decide_outcome(layout, ended, slab, rest)
 
 
@@ -46,6 +52,13 @@ def make_bodies(layout: RectifiedLayout) -> tuple[tuple[SceneBody, ...], Slab]:
     bodies = tuple(map(make_prior_body, objects, layout.pieces, layout.poses))
     meshes, scales = [item.mesh for item in objects], [item.scale for item in objects]
     return bodies, fit_slab(layout.placed.table, meshes, layout.poses, scales)
+
+
+def list_seen_poses(objects: Sequence[PlacedObject]) -> dict[str, Pose]:
+    """List the poses that the picture gave, by id, but of contents and their containers, which were assembled."""
+    containers = {item.contained_in for item in objects}
+    free = (item for item in objects if item.contained_in is None and item.object_id not in containers)
+    return {item.object_id: item.pose for item in free}
 
 
 def _decide_outcome(

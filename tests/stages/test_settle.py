@@ -1,5 +1,6 @@
 """The stage settle: rest where there is rest, a true reason where there is none."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,13 +9,13 @@ import trimesh
 
 from schemas.codec import encode
 from schemas.config import Config, SettleConfig
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Pose, TriangleMesh
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout, SettledScene
 from tableverse_factory.geometry.math.transforms import rotation_angle
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.settle import settle
+from tableverse_factory.stages.settle import list_seen_poses, settle
 from tests.helpers.simple_scenes import TABLE, Solid, ball, box, cylinder, layout
 
 
@@ -85,10 +86,25 @@ def test_pieces_at_scale_and_an_open_mesh_settle_too() -> None:
 
 
 def test_a_table_seen_in_part_does_not_let_its_objects_fall() -> None:
-    from dataclasses import replace
-
     seen = replace(TABLE, center_xy=np.array([0.5, 0.5]), half_size_xy=np.array([0.05, 0.05]), yaw=0.4)
     assert isinstance(run(layout(CLUTTER, seen)), Done)
+
+
+def test_what_topples_is_put_back_where_it_was_seen_but_not_after_the_papers_method() -> None:
+    upright = layout([Solid(box(0.02, 0.1, 0.16), (0.0, 0.0, 0.0803)), Solid(box(0.1, 0.1, 0.04), (-0.2, 0, 0.0203))])
+    half = np.radians(12.0) / 2
+    toppling = Pose(np.array([0.0, 0.0, 0.0885]), np.array([np.cos(half), 0.0, np.sin(half), 0.0]))
+    poses = (toppling, upright.poses[1])
+    for method, height in (("joint", 0.08), ("lccr", 0.01)):
+        scene = settled(replace(upright, poses=poses, method=method))
+        assert scene.poses[0].position[2] == pytest.approx(height, abs=2e-4)
+
+
+def test_contents_and_their_containers_are_not_put_back() -> None:
+    solids = [
+        Solid(box(0.1, 0.1, 0.1), (0.2 * k, 0.0, 0.05), contained_in="obj_001" if k == 0 else None) for k in range(3)
+    ]
+    assert list(list_seen_poses(layout(solids).placed.objects)) == ["obj_002"]
 
 
 def _ramp(length: float, width: float, height: float) -> TriangleMesh:

@@ -3,7 +3,7 @@
 Bodies, table, contacts and the criterion of rest are those of the settle stage and of the certificate.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -18,6 +18,7 @@ from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_spec
 from tableverse_factory.physics.simulate.at_rest import Drift, find_free_bodies, make_quiet_data, measure_drift
 from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD, DRIFT_TIME_S
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, find_fallen, move_bodies
+from tableverse_factory.physics.simulate.settle_near import settle_near
 from tableverse_factory.stages.settle import make_bodies
 
 BURST_TIME_S = 0.1
@@ -58,6 +59,13 @@ def simulate_to_rest(scene: ReleasedScene, config: SettleConfig, gentle: bool) -
     ended, rest = bring_to_rest(
         scene.bodies, scene.slab, timestep_s=config.timestep_s, max_time_s=config.max_time_s, gentle=gentle
     )
+    return replace(scene, bodies=ended), rest.at_rest
+
+
+def simulate_near(scene: ReleasedScene, seen: Mapping[str, Pose], config: SettleConfig) -> tuple[ReleasedScene, bool]:
+    """Simulate to rest near the seen poses, by id; return the scene and whether it came to rest within the limit."""
+    step, limit = config.timestep_s, config.max_time_s
+    ended, rest = settle_near(scene.bodies, seen, scene.slab, timestep_s=step, max_time_s=limit)
     return replace(scene, bodies=ended), rest.at_rest
 
 

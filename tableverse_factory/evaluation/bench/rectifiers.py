@@ -9,7 +9,12 @@ import numpy as np
 from schemas.config import Config, RectifyConfig
 from schemas.geometry import Frozen, Vector3
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.bench.free_simulation import ReleasedScene, make_scene, simulate_to_rest
+from tableverse_factory.evaluation.bench.free_simulation import (
+    ReleasedScene,
+    make_scene,
+    simulate_near,
+    simulate_to_rest,
+)
 from tableverse_factory.evaluation.bench.layouts import LayoutCase, make_parts
 from tableverse_factory.stages.rectify.composites import AssembledLayout, assemble_composites
 from tableverse_factory.stages.rectify.fault_check import are_near
@@ -18,6 +23,7 @@ from tableverse_factory.stages.rectify.joint import rectify_jointly
 from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_lccr
 from tableverse_factory.stages.rectify.radial import compute_outward, list_members
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_center
+from tableverse_factory.stages.settle import list_seen_poses
 
 STEP_M = 0.001
 
@@ -87,6 +93,8 @@ def _make_rectification(rectifier: Rectifier) -> Method:
 
 
 def _make_simulation(before: Method, gentle: bool) -> Method:
+    """Simulate as the settle stage does after `lccr`, gently or not."""
+
     def method(case: LayoutCase, config: Config) -> MethodResult:
         start = time.process_time()
         given = before(case, config)
@@ -96,6 +104,17 @@ def _make_simulation(before: Method, gentle: bool) -> Method:
     return method
 
 
+def _settle_near_seen(case: LayoutCase, config: Config) -> MethodResult:
+    """Run the settle stage after `joint`."""
+    start = time.process_time()
+    given = _rectify_jointly(case, config)
+    seen = list_seen_poses(given.layout.placed.objects)
+    scene, resting = simulate_near(given.scene, seen, config.settle)
+    return MethodResult(given.layout, scene, time.process_time() - start, not resting, simulated=True)
+
+
+_rectify_jointly = _make_rectification(rectify_jointly)
+
 RECTIFICATION_METHODS: dict[str, Method] = {
     "Direct": _keep_poses,
     "MuJoCo alone": _make_simulation(_keep_poses, gentle=False),
@@ -103,8 +122,8 @@ RECTIFICATION_METHODS: dict[str, Method] = {
     "1 mm steps": _make_rectification(rectify_in_steps),
     "LCCR": _make_rectification(rectify_lccr),
     "LCCR + sim": _make_simulation(_make_rectification(rectify_lccr), gentle=True),
-    "joint": _make_rectification(rectify_jointly),
-    "joint + sim": _make_simulation(_make_rectification(rectify_jointly), gentle=True),
+    "joint": _rectify_jointly,
+    "joint + sim": _settle_near_seen,
 }
 """`MuJoCo alone` simulates the layout as it is; `settle alone` runs the settle stage, which damps the first motion."""
 

@@ -24,12 +24,12 @@ def bring_to_rest(
 
     Returns the bodies where they ended, in their order, and the outcome of the last try, with the time of both.
     """
-    ended, rest = _simulate(bodies, slab, timestep_s, max_time_s, gentle)
+    ended, rest = simulate_bodies(bodies, slab, timestep_s, max_time_s, gentle)
     if rest.at_rest or rest.warnings or find_fallen(ended, slab):
         return ended, rest
     restless = {body.object_id for body, moving in zip(ended, rest.moving, strict=True) if moving}
     steady = increase_rolling_friction(ended, restless)
-    ended, again = _simulate(steady, slab, timestep_s, max_time_s, gentle=False)
+    ended, again = simulate_bodies(steady, slab, timestep_s, max_time_s, gentle=False)
     return ended, replace(again, time_s=rest.time_s + again.time_s)
 
 
@@ -53,9 +53,10 @@ def find_fallen(bodies: Sequence[SceneBody], slab: Slab) -> list[str]:
     return [body.object_id for body, gone in zip(bodies, off, strict=True) if gone]
 
 
-def _simulate(
+def simulate_bodies(
     bodies: Sequence[SceneBody], slab: Slab, timestep_s: float, max_time_s: float, gentle: bool
 ) -> tuple[tuple[SceneBody, ...], Rest]:
+    """Simulate once, until `max_time_s` is up; returns the bodies where they ended."""
     spec, _ = make_scene_spec(bodies, slab, timestep_s=timestep_s, visuals=False)
     rest = simulate_to_rest(spec.compile(), max_time_s, gentle)
     return move_bodies(bodies, rest.poses), rest
