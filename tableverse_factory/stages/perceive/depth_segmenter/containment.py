@@ -53,8 +53,11 @@ def _describe_region(mask: Mask, view: TableView) -> _RegionShape:
 
 
 def _lies_in(inner: _RegionShape, holder: _RegionShape) -> bool:
-    """Whether `inner` is over the holder's footprint, begins below its rim, and is surrounded by its walls."""
-    if inner.low > holder.rim - BELOW_RIM_M:
+    """Whether `inner` is over the holder's footprint, begins below its rim, and is surrounded by its walls.
+
+    What lies below all that is seen of a holder carries it.
+    """
+    if inner.low > holder.rim - BELOW_RIM_M or inner.rim < holder.low:
         return False
     over = is_inside_outline(holder.footprint, inner.xy, -WALL_M)
     if min(float(over.mean()), float(over[inner.heights <= inner.low + WALL_M].mean())) < MIN_OVER:

@@ -16,7 +16,9 @@ BELOW_M = 0.012  # most depth of them below it [m], for noise and flying pixels
 TABLE_M = 0.012  # least height of a top above the table's noise [m]
 NEAR_M = 0.01
 MIN_POINTS = 20
-MIN_OVERLAP = 0.1
+MIN_OVERLAP = 0.1  # least share of an object's footprint within the outline of what carries it
+# Of a carrier that is overhung: most of it that is hidden [m], least share of its top, so deep [m], under the overhang
+NARROW_ABOVE_M, NARROW_OVERLAP, NARROW_TOP_M = 0.06, 0.6, 0.02
 CONTAINER_FLOOR_M = 0.005  # height of the hidden floor of a container above the table [m]
 LONG_RATIO = 2.5  # least length over breadth of contents that lean on the rim and reach the floor
 STEEP_RATIO = 1.9  # the same of steep ones, which are more hidden
@@ -71,7 +73,8 @@ def _find_top_below(own: Points, lowest: float, other: Points) -> float:
     """Find the height of `other` where `own`, whose foot is at the height `lowest`, stands on it [m], else 0.
 
     It is the support where its top, beside the footprint of `own`, lies about at the lowest points of `own`, and some
-    of that footprint lies within its outline.
+    of that footprint lies within its outline. `own` may also overhang a narrow one, which it hides in part: most of
+    what is seen of its top lies within the footprint of `own`, whose bottom is seen.
     """
     within = np.ones(len(other), dtype=bool)
     for k in range(2):  # an axis at a time: numpy is slow on rows of two
@@ -80,9 +83,12 @@ def _find_top_below(own: Points, lowest: float, other: Points) -> float:
     if len(under) < MIN_POINTS:
         return 0.0
     top = float(np.quantile(under[:, 2], 0.9))
-    if not (top > TABLE_M and lowest - ABOVE_M <= top <= lowest + BELOW_M):
+    if not (top > TABLE_M and lowest - NARROW_ABOVE_M <= top <= lowest + BELOW_M):
         return 0.0
-    return top if _measure_share_within(own[:, :2], other[:, :2]) >= MIN_OVERLAP else 0.0
+    if top >= lowest - ABOVE_M and _measure_share_within(own[:, :2], other[:, :2]) >= MIN_OVERLAP:
+        return top
+    upper = under[under[:, 2] >= top - NARROW_TOP_M, :2]
+    return max(top, lowest) if _measure_share_within(upper, own[:, :2]) >= NARROW_OVERLAP else 0.0
 
 
 def _measure_share_within(points: Points2, outline: Points2) -> float:
