@@ -29,7 +29,9 @@ def lie(shape: trimesh.Trimesh, *, raised_m: float = 0.0) -> TriangleMesh:
 
 def look(mesh: TriangleMesh, elevation: float = 0.8, noise_m: float = 0.001) -> ObjectView:
     scene = render_noisy_view([mesh], 0.7, elevation, np.random.default_rng(3), noise_m)
-    return view_object(scene, scene.objects[0], find_supports(scene)[scene.objects[0].object_id])
+    return view_object(
+        scene, scene.objects[0], find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
+    )
 
 
 def measure_true_thickness(mesh: TriangleMesh, view: ObjectView) -> np.ndarray:

@@ -24,7 +24,9 @@ def cup(wall: float, floor: float) -> TriangleMesh:
 
 def complete(mesh: TriangleMesh, elevation: float) -> TriangleMesh:
     scene = render_noisy_view([mesh], 0.7, elevation, np.random.default_rng(3))
-    view = view_object(scene, scene.objects[0], find_supports(scene)[scene.objects[0].object_id])
+    view = view_object(
+        scene, scene.objects[0], find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
+    )
     fit = fit_revolution(view, sample_rays(view))
     assert fit is not None
     assert fit[3]
