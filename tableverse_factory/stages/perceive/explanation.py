@@ -1,6 +1,7 @@
 """How much of what stands above the table the objects explain, whatever found them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,8 +14,12 @@ from schemas.objects import Explanation, PerceivedObject
 from tableverse_factory.geometry.math.planes import (
     Points2,
     compute_convex_outline,
-    is_inside_outline,
     measure_depth_inside,
+)
+from tableverse_factory.stages.perceive.base.object_filter import (
+    find_over_table,
+    keep_objects,
+    keep_regions_over_table,
 )
 from tableverse_factory.stages.perceive.base.table_view import (
     ImageWindow,
@@ -25,8 +30,6 @@ from tableverse_factory.stages.perceive.base.table_view import (
 
 MAX_PIXELS = 100_000  # of the picture as it is looked at
 TOUCHING_M = 0.01  # nearer neighbours in the picture are of one piece, besides twice the width of their pixels
-MIN_OVER_TABLE = 0.3  # share of a piece over the table: less of a wall or furniture beside it
-MIN_PIECE_M2 = 0.00045  # smaller pieces are noise
 LEVEL_M, LEVEL_NOISES = 0.01, 5.0  # height of the table's own readings, the larger of it and of this many deviations
 MIN_PATCH_M2, FARTHEST_PATCH_M = 0.02, 0.6  # of a part of the table behind a pile
 CORE_PX = 7  # narrower strips are where an upright face crosses the table's height
@@ -36,7 +39,7 @@ def measure_explanation(view: TableView, ids: IdImage, objects: Sequence[Perceiv
     """Measure what stands above the table by the sensor's own readings, and the part of each object.
 
     It is what is raised over the outline of the table, with the parts of the table that a pile cuts off, but not what
-    mostly stands beside it, such as a wall.
+    mostly stands beside it, such as a wall, or hangs there.
     """
     height, width = ids.shape
     stride = int(np.ceil(np.sqrt(ids.size / MAX_PIXELS)))
@@ -62,18 +65,15 @@ def _measure_pixel_areas(view: TableView) -> Float64[np.ndarray, "h w"]:
 
 
 def _find_standing(view: TableView, areas: Float64[np.ndarray, "h w"]) -> Mask:
-    raised = view.raised & (areas > 0.0)
-    over = raised & is_inside_outline(_extend_outline(view, areas), view.xy(view.points_camera))
-    piece = _label_pieces(raised, view)
-    sizes, inside = np.bincount(piece[raised]), np.bincount(piece[over], minlength=int(piece.max()) + 1)
-    large = np.bincount(piece[raised], areas[raised]) >= MIN_PIECE_M2
-    kept = large & (inside >= MIN_OVER_TABLE * sizes)
-    return over & np.append(kept, False)[piece]
+    """Find what is raised over the table, less the pieces that are no objects by the segmenter's own filters."""
+    whole = replace(view, outline_xy=_extend_outline(view, areas))
+    pieces = keep_objects(keep_regions_over_table(_label_pieces(view.raised & (areas > 0.0), view), whole), whole)
+    return (pieces > 0) & find_over_table(whole)
 
 
 def _label_pieces(mask: Mask, view: TableView) -> IdImage:
-    """Number the pieces of a mask from 0, split where neighbouring readings lie apart; -1 elsewhere."""
-    number = np.full(mask.shape, -1, dtype=np.int32)
+    """Number the pieces of a mask from 1, split where neighbouring readings lie apart; 0 elsewhere."""
+    number = np.zeros(mask.shape, dtype=np.int32)
     number[mask] = np.arange(int(mask.sum()))
     reach = TOUCHING_M + 2 * view.depth / view.observation.camera.fx
     ends = []
@@ -83,7 +83,7 @@ def _label_pieces(mask: Mask, view: TableView) -> IdImage:
         ends.append((number[first][near], number[second][near]))
     rows, columns = (np.concatenate(sides) for sides in zip(*ends, strict=True))
     graph = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(int(mask.sum()),) * 2)
-    number[mask] = connected_components(graph, directed=False)[1]
+    number[mask] = connected_components(graph, directed=False)[1] + 1
     return number
 
 

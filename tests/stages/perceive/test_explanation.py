@@ -64,6 +64,17 @@ def test_a_wall_and_what_stands_on_the_floor_need_no_explanation():
     assert found.measure_shares({"obj_1", "obj_2", "obj_3", "obj_4"})[1] > 0.98
 
 
+@pytest.mark.parametrize("gap_m", [0.0, 0.05])
+def test_a_wall_on_the_tables_edge_and_a_rail_before_it_need_no_explanation(gap_m):
+    wall, rail = Box(0.0, 0.51, (2.0, 0.1, 0.7)), Box(0.0, 0.44 - gap_m, (0.8, 0.04, 0.05), z=0.15)
+    areas = []
+    for things in (BOXES[:2], [*BOXES[:2], wall, rail]):
+        observation, truth = look(things, camera_above(0.9, 0.8, 42.0), noise_m=0.001, table_half=(0.6, 0.46))
+        view = find_table(observation, np.random.default_rng(0))
+        areas.append(measure_explanation(view, np.zeros_like(truth), []).area_m2)
+    assert areas[1] == pytest.approx(areas[0], rel=0.02)
+
+
 def test_what_stands_behind_a_pile_counts_though_the_outline_of_the_table_ends_there():
     observation, ids = photograph(2)
     view = find_table(observation, np.random.default_rng(0))

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from skimage.segmentation import watershed
 
 from schemas.geometry import IdImage, Mask
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import renumber_regions
+from tableverse_factory.stages.perceive.base.object_filter import renumber_regions
 from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, measure_border, shift_image
 
 SEED_SPACING_M = 0.013

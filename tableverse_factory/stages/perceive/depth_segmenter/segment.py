@@ -10,13 +10,13 @@ from schemas.geometry import IdImage
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.box_overlap import compute_area
 from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult, PixelBox
-from tableverse_factory.stages.perceive.base.table_view import TableView, crop_view, find_working_window, uncrop_ids
-from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import merge_occluded_parts
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import (
+from tableverse_factory.stages.perceive.base.object_filter import (
     keep_objects,
     keep_regions_over_table,
     renumber_regions,
 )
+from tableverse_factory.stages.perceive.base.table_view import TableView, crop_view, find_working_window, uncrop_ids
+from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import merge_occluded_parts
 from tableverse_factory.stages.perceive.depth_segmenter.oversegment import (
     attach_border_pixels,
     merge_patches,

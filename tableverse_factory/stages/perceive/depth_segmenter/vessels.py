@@ -6,9 +6,9 @@ from scipy import ndimage
 
 from schemas.geometry import IdImage, Mask, Vector3
 from tableverse_factory.geometry.math.planes import Points2
+from tableverse_factory.stages.perceive.base.object_filter import renumber_regions
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.containment import find_containers_by_outline
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import renumber_regions
 from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, Rim
 from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface
 

@@ -12,12 +12,12 @@ from schemas.config import PerceiveConfig
 from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
-from tableverse_factory.stages.perceive.base.table_view import ImageWindow, TableView, crop_view
-from tableverse_factory.stages.perceive.depth_segmenter.object_filter import (
+from tableverse_factory.stages.perceive.base.object_filter import (
     keep_objects,
     keep_regions_over_table,
     renumber_regions,
 )
+from tableverse_factory.stages.perceive.base.table_view import ImageWindow, TableView, crop_view
 from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
 from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_holes, to_detections
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers

@@ -9,7 +9,7 @@ from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.planes import is_inside_outline
 from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise
 
-EDGE_M = 0.01
+EDGE_M = 0.01  # a wall at the table's edge is read on both sides of it
 MIN_OVER_TABLE = 0.3
 MIN_AREA_M2, MIN_CONTENT_AREA_M2 = 0.00045, 0.0002
 NOISE_AT_HALF_A_METRE_M = 0.0012
@@ -24,11 +24,15 @@ RAGGED_EDGE_M = 0.03
 
 def keep_regions_over_table(ids: IdImage, view: TableView) -> IdImage:
     """Keep the regions over the table's outline, renumbered from 1: no wall, no floor, no other table."""
-    xy = view.xy(view.points_camera)
-    over = view.valid & (is_inside_outline(view.outline_xy, xy, -EDGE_M) | _find_feet_below_image(view))
     sizes = np.bincount(ids[view.valid], minlength=int(ids.max(initial=0)) + 1)
-    inside = np.bincount(ids[over], minlength=len(sizes))
+    inside = np.bincount(ids[find_over_table(view)], minlength=len(sizes))
     return renumber_regions(ids, [k for k in range(1, len(sizes)) if inside[k] >= MIN_OVER_TABLE * sizes[k] > 0])
+
+
+def find_over_table(view: TableView) -> Mask:
+    """Find readings inside the table's outline, or over a part of the table that lies below the picture."""
+    xy = view.xy(view.points_camera)
+    return view.valid & (is_inside_outline(view.outline_xy, xy, -EDGE_M) | _find_feet_below_image(view))
 
 
 def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) -> IdImage:
