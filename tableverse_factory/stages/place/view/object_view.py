@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
 
 from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Points, Pose
@@ -28,6 +28,8 @@ Distances = Float64[np.ndarray, " n"]
 WINDOW_MARGIN_PX = 24
 MIN_DEPTH_M = 0.01
 PAST_SLACK_M = 0.006
+TOP_QUANTILE = 0.98  # of heights: flying pixels lie higher than an object's seen top
+BAND_M, UPRIGHT_SINE = 0.01, 0.5  # height of the band of upright sides that goes on under what hides the rest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,11 +95,12 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     to_eye = pose.position - cloud
     with np.errstate(invalid="ignore"):
         cosine = (normals * to_eye).sum(axis=-1) / np.linalg.norm(to_eye, axis=-1)
+    points, source = _extend_to_ceiling(cloud[seen], normals[seen], support.ceiling)
     return ObjectView(
         instance_id=item.instance_id,
-        points=cloud[seen],
-        normals=normals[seen],
-        colors=np.ascontiguousarray(color[seen]),
+        points=points,
+        normals=normals[seen][source],
+        colors=np.ascontiguousarray(color[seen][source]),
         camera=window,
         camera_to_table=pose,
         own=own,
@@ -107,6 +110,19 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
         outline_px=compute_outline_distance(past),
         support=support,
     )
+
+
+def _extend_to_ceiling(points: Points, normals: Points, ceiling: float) -> tuple[Points, Int64[np.ndarray, " n"]]:
+    """Continue the upright sides under what hides them, up to the ceiling; the second is which point each copies."""
+    top = float(np.quantile(points[:, 2], TOP_QUANTILE)) if len(points) else np.inf
+    gap = ceiling - top
+    upright = np.abs(normals[:, 2]) < UPRIGHT_SINE
+    band = np.flatnonzero(upright & (points[:, 2] > top - BAND_M) & (points[:, 2] <= top))
+    rises = np.linspace(gap, 0.0, int(np.ceil(gap / BAND_M)) if gap > BAND_M else 0, endpoint=False)
+    source = np.concatenate([np.arange(len(points)), np.tile(band, len(rises))])
+    extended = points[source]
+    extended[len(points) :, 2] += np.repeat(rises, len(band))
+    return extended, source
 
 
 def measure_free_space(view: ObjectView, points: Points, frame: Pose | None = None) -> Distances:

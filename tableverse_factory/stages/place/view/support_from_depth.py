@@ -36,6 +36,7 @@ class DepthSupport(Frozen):
     carried: Points2  # corners of the middle part of the footprints of all that stands on the object [m]
     leaning: bool = False  # a long object in a container
     carrier: str | None = None  # the object on whose top it stands; None on the table or in a container
+    ceiling: float = 0.0  # height of the lowest of what stands on the object [m]; 0 if nothing does
 
 
 def find_supports(objects: Sequence[PerceivedObject], camera_to_table: Pose) -> dict[str, DepthSupport]:
@@ -64,7 +65,13 @@ def find_supports(objects: Sequence[PerceivedObject], camera_to_table: Pose) -> 
             carried[carrier].append(_shrink_footprint(cloud[:, :2]))
     empty = np.zeros((0, 2))
     return {
-        name: DepthSupport(heights[name], np.concatenate([empty, *carried[name]]), leaning[name], carriers.get(name))
+        name: DepthSupport(
+            heights[name],
+            np.concatenate([empty, *carried[name]]),
+            leaning[name],
+            carriers.get(name),
+            min((heights[above] for above, carrier in carriers.items() if carrier == name), default=0.0),
+        )
         for name in heights
     }
 
