@@ -43,10 +43,13 @@ $(VENV)/.develop: $(VENV)/.ready
 browser:
 	@deploy/system-libraries.sh browser || echo "without a Chromium its tests are skipped" >&2
 
-demo: setup ## synthetic captures -> dataset (Ray) with trajectories -> verify -> gallery
+demo: setup ## captures and bare pictures -> dataset (Ray) with trajectories -> verify -> gallery
 	rm -rf $(DEMO)
 	$(BIN)/tableverse synth $(DEMO)/captures --scenes $(SCENES) --seed 7
-	$(BIN)/tableverse manifest $(DEMO)/captures --out $(DEMO)/images.parquet
+	$(BIN)/tableverse synth $(DEMO)/other --scenes 1 --seed 8
+	mkdir $(DEMO)/pictures && mv $(DEMO)/other/*/color.png $(DEMO)/pictures/table.png
+	$(BIN)/python -c 'import skimage.data, shutil; shutil.copy(skimage.data.data_dir + "/coffee.png", "$(DEMO)/pictures")'
+	$(BIN)/tableverse manifest $(DEMO)/captures $(DEMO)/pictures --out $(DEMO)/images.parquet
 	$(BIN)/tableverse build $(DEMO)/images.parquet $(DEMO)/out --executor ray \
 		--stages +trajectories --set trajectories.max_tasks=$(TASKS)
 	$(BIN)/tableverse status $(DEMO)/out

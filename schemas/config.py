@@ -110,36 +110,46 @@ class ObserveConfig(StageSection):
     max_depth_m: Positive = 5.0
     """Largest depth that is used [m]."""
     depth: Literal[
-        "sensor", "recorded", "depth_anything_3", "depth_anything_3_nested", "moge_2", "depth_anything_2"
-    ] = "sensor"
-    """Source of the depth of a bare picture; `sensor` has none for it, `recorded` reads `NAME.depth.npy` and
-    `NAME.camera.json` beside it. A capture always has its own.
+        "picture", "sensor", "recorded", "depth_anything_3", "depth_anything_3_nested", "moge_2", "depth_anything_2"
+    ] = "picture"
+    """Source of the depth of a bare picture: `picture` is our own net, `recorded` reads `NAME.depth.npy` and
+    `NAME.camera.json` beside it, `sensor` has none for it. A capture always has its own.
     """
     depth_weights: Weights = ""
-    """Folder, or `owner/name` or `owner/name@revision` on the Hub, of the depth model; empty for the published ones."""
+    """Folder, or `owner/name` or `owner/name@revision` on the Hub, of the depth model; an `.onnx` file of `picture`.
+    Empty for the published ones.
+    """
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
     """Focal length of bare pictures that neither the model nor EXIF gives [px]; null: 58 degrees on the longer side."""
+    min_table_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.9
+    """`picture`: least probability that a table-top is shown; else the picture is dropped as `no_table`."""
+    table_distance_m: tuple[Positive, Positive] = (0.1, 4.0)
+    """`picture`: least and greatest distance of the camera from the table's plane [m]."""
+    min_view_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 8.0
+    """`picture`: least angle between the camera's axis and the table [degrees]."""
+    max_roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 40.0
+    """`picture`: greatest angle by which the table is turned about the camera's axis [degrees]."""
 
     @property
     def _extra_s(self) -> float:
-        return 0.0 if self.depth in ("sensor", "recorded") else MODEL_LOAD_S
+        return 0.0 if self.depth in ("picture", "sensor", "recorded") else MODEL_LOAD_S
 
 
 class PerceiveConfig(RemoteModelSection):
     """Detector, segmenter and limits on objects."""
 
-    detector: Literal["auto", "geometric", "learned", "replay", "openai", "gemini"] = "auto"
-    """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else `geometric`.
-    `learned` is a net of `tableverse train segmenter`, `openai` any server of OpenAI's chat completions, `gemini`
-    Google's own protocol.
+    detector: Literal["auto", "geometric", "picture", "learned", "replay", "openai", "gemini"] = "auto"
+    """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `geometric`
+    where a sensor measured depth, and `picture`, our own net, where a model estimated it. `learned` is a net of
+    `tableverse train segmenter`, `openai` any server of OpenAI's chat completions, `gemini` Google's own protocol.
     """
     detector_weights: Weights = ""
-    """The `.onnx` file of `learned`."""
+    """The `.onnx` file of `learned`, or of `picture`, whose own is in the package."""
     box_order: Literal["auto", "xyxy", "yxyx"] = "auto"
     """Coordinate order of the model's boxes; `auto` is yxyx for `gemini`, else xyxy."""
-    segmenter: Literal["geometric", "sam2", "sam3"] = "geometric"
-    """Converts boxes to masks: our own from depth, or a model with weights, for detectors that give boxes: `replay`
-    without `masks.png`, `openai`, `gemini`.
+    segmenter: Literal["geometric", "picture", "sam2", "sam3"] = "geometric"
+    """Converts boxes to masks, for detectors that give boxes: `replay` without `masks.png`, `openai`, `gemini`. Our own
+    from depth, our net of bare pictures, or a model with weights.
     """
     segmenter_weights: Weights = ""
     """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; empty for the published ones."""
@@ -157,7 +167,7 @@ class PerceiveConfig(RemoteModelSection):
 
     @property
     def _extra_s(self) -> float:
-        return 0.0 if self.segmenter == "geometric" else MODEL_LOAD_S
+        return 0.0 if self.segmenter in ("geometric", "picture") else MODEL_LOAD_S
 
     @model_validator(mode="after")
     def _check_required_keys(self) -> "PerceiveConfig":
@@ -166,7 +176,7 @@ class PerceiveConfig(RemoteModelSection):
             names.append("perceive.detector_weights")
         if names:
             raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
-        if self.detector in ("auto", "geometric", "learned") and self.segmenter != "geometric":
+        if self.detector in ("auto", "geometric", "picture", "learned") and self.segmenter != "geometric":
             where = " where a capture has no detections.json" if self.detector == "auto" else ""
             raise ValueError(
                 f"the detector {self.detector!r} gives masks, not boxes{where}, so perceive.segmenter "

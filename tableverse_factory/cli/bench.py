@@ -7,6 +7,7 @@ import typer
 
 from tableverse_factory.cli.bench_cpu_time import bench_stages, bench_trajectories
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
+from tableverse_factory.cli.bench_picture import bench_picture
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_soak import bench_soak
 from tableverse_factory.cli.bench_twin import bench_twin
@@ -24,6 +25,7 @@ bench.command("soak")(bench_soak)
 bench.command("query")(bench_query)
 bench.command("trajectories")(bench_trajectories)
 bench.command("perception")(bench_perception)
+bench.command("picture")(bench_picture)
 bench.command("placement")(bench_placement)
 bench.command("completion")(bench_completion)
 bench.command("twin")(bench_twin)

@@ -39,7 +39,7 @@ EXTRAS = {  # of pyproject.toml, without `dev` and `docs`: packages and purpose
     "gym": (("gymnasium",), "a scene and a task as an environment"),
     "usd": (("usd-core",), "tableverse extract --format usd"),
     "models": (
-        ("torch", "transformers", "onnxruntime", "onnx"),
+        ("torch", "transformers", "onnx"),
         "real models instead of the embedded ones, depth_anything_2 among them; tableverse train",
     ),
     "bench": (("pandas",), "the comparison of tableverse bench with Ray Data"),

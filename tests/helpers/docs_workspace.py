@@ -1,9 +1,9 @@
 """A folder in which a page of the documentation is read: what its commands speak of lies there.
 
-`my_captures/` and `captures/` (one synthetic capture), `images.parquet` of the former, `layouts/` with its `truth/`,
-`meshes/`, `recording/` as Open3D unpacks one, and `out`: the dataset as the first command of the page that builds it
-would leave it, so that building it finds nothing left to do. It is not there where a page makes its manifest from
-something else. `SCENE_ID` is the id of a scene of `out`.
+`my_captures/` and `captures/` (one synthetic capture), `photos/` with one picture, `images.parquet` of the first,
+`layouts/` with its `truth/`, `meshes/`, `recording/` as Open3D unpacks one, and `out`: the dataset as the first command
+of the page that builds it would leave it, so that building it finds nothing left to do. It is not there where a page
+makes its manifest from something else. `SCENE_ID` is the id of a scene of `out`.
 """
 
 import json
@@ -16,6 +16,8 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import skimage.data
 
 from tableverse_factory import open_dataset
 from tests.helpers.docs_pages import Command
@@ -98,6 +100,8 @@ def prepare(prepared: Path, folder: Path) -> None:
 
     run(folder, common, "synth", OWN_CAPTURES, "--scenes", SCENES, "--seed", 7)
     shutil.copytree(common / OWN_CAPTURES, common / "captures")
+    (common / "photos").mkdir()
+    shutil.copy(Path(skimage.data.data_dir) / "coffee.png", common / "photos")
     run(folder, common, "synth", ".synth", "--kind", "layouts", "--scenes", SCENES, "--seed", 7)
     for name in ("layouts", "meshes"):
         shutil.move(common / ".synth" / name, common / name)

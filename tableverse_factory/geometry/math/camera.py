@@ -16,6 +16,12 @@ class PosedCamera(Frozen):
     camera_to_table: Pose
 
 
+def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Rescale intrinsics to another picture size; pixel centres are at whole numbers."""
+    x, y = width / camera.width, height / camera.height
+    return Camera(camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5, width, height)
+
+
 def backproject(depth: DepthImage, camera: Camera) -> Float64[np.ndarray, "h w 3"]:
     """Points in the camera frame [m], pixel by pixel; zero depth gives the origin."""
     z = np.asarray(depth, dtype=np.float64)

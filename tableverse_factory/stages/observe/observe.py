@@ -28,6 +28,7 @@ from tableverse_factory.stages.observe.depth.depth_anything_3 import (
     estimate_depth_anything_3_nested,
 )
 from tableverse_factory.stages.observe.depth.moge import estimate_moge_2
+from tableverse_factory.stages.observe.depth.picture import estimate_picture_depth
 from tableverse_factory.stages.observe.depth.recorded import read_recorded_depth
 
 TABLE_MARGIN_M = 0.15
@@ -56,6 +57,7 @@ def read_sensor_depth(item: ImageRow, config: Config) -> Capture:
 
 DEPTH_MODELS: dict[str, DepthModel] = {
     "sensor": read_sensor_depth,
+    "picture": estimate_picture_depth,
     "recorded": read_recorded_depth,
     "depth_anything_3": estimate_depth_anything_3,
     "depth_anything_3_nested": estimate_depth_anything_3_nested,

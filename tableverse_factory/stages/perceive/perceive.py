@@ -16,6 +16,7 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.explanation import measure_explanation
+from tableverse_factory.stages.perceive.picture.detector import find_table_top
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.stages.perceive.scale.known_length import find_scaled_table, scale_by_object
 from tableverse_factory.stages.perceive.table import (
@@ -37,10 +38,10 @@ def perceive(
     item: Observation, config: Config, rng: np.random.Generator, services: Services
 ) -> Outcome[PerceivedObjects]:
     """Find the table and the objects on it; their points are denoised, in the camera frame."""
-    view = find_scaled_table(item, rng)
+    name = choose_detector(item, config.perceive)
+    view = find_scaled_table(item, rng, find_table_top(item, config.perceive) if name == "picture" else None)
     if isinstance(view, Dropped):
         return view
-    name = choose_detector(item, config.perceive)
     found = DETECTORS[name](view, config.perceive, services)
     if isinstance(found, Dropped):
         return found
@@ -66,7 +67,7 @@ def perceive(
     pose = compute_camera_to_table(view, points)
     table = fit_table_rectangle(view, pose, points, item.color)
     kept = _paint_ids(view, candidates, ids, objects)
-    explanation = measure_explanation(view, kept, objects)
+    explanation = measure_explanation(view, kept, objects, found.shown)
     if why := explanation.describe_shortfall({o.object_id for o in objects}, config.perceive.min_explained):
         return Dropped("too_little_explained", why)
     seen = view.observation
@@ -76,10 +77,12 @@ def perceive(
 
 
 def choose_detector(item: Observation, config: PerceiveConfig) -> str:
-    """Choose the backend for this capture."""
+    """Choose the backend; only a model's depth is bent, and that of a bare picture."""
     if config.detector != "auto":
         return config.detector
-    return "geometric" if item.recorded_detections is None else "replay"
+    if item.recorded_detections is not None:
+        return "replay"
+    return "picture" if item.bend else "geometric"
 
 
 def segment_boxes(view: TableView, found: DetectionResult, config: Config) -> IdImage:

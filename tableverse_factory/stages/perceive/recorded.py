@@ -12,7 +12,7 @@ def record_detector(config: Config, _before: Mapping[str, Any]) -> dict[str, Any
     """Record the prompt of a detector that asks a model, or the weights of a learned one."""
     if config.perceive.protocol:
         return {"prompt_sha256": hash_detection_prompt(choose_box_order(config.perceive))}
-    if config.perceive.detector == "learned":
+    if config.perceive.detector_weights:
         return record_onnx("perceive.detector_weights", config.perceive.detector_weights)
     return None
 
@@ -20,4 +20,4 @@ def record_detector(config: Config, _before: Mapping[str, Any]) -> dict[str, Any
 def record_segmenter(config: Config, before: Mapping[str, Any]) -> dict[str, Any] | None:
     """Record the weights of a segmenter that has any (see `record_weights`)."""
     backend = config.perceive.segmenter
-    return None if backend == "geometric" else record_weights("segmenter", backend, config, before)
+    return None if backend in ("geometric", "picture") else record_weights("segmenter", backend, config, before)

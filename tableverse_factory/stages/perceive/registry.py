@@ -6,18 +6,21 @@ from tableverse_factory.stages.perceive.base.interfaces import BoxSegmenter, Det
 from tableverse_factory.stages.perceive.base.replay import replay_detections
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth, segment_boxes_from_depth
 from tableverse_factory.stages.perceive.learned.detector import detect_with_network
+from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, segment_boxes_in_picture
 from tableverse_factory.stages.perceive.sam.segmenter import segment_with_sam
 from tableverse_factory.stages.perceive.vlm.detector import detect_with_vlm
 
 DETECTORS: dict[str, Detector] = {
     "geometric": detect_from_depth,
     "learned": detect_with_network,
+    "picture": detect_in_picture,
     "replay": replay_detections,
     "openai": detect_with_vlm,
     "gemini": detect_with_vlm,
 }
 BOX_SEGMENTERS: dict[str, BoxSegmenter] = {
     "geometric": segment_boxes_from_depth,
+    "picture": segment_boxes_in_picture,
     "sam2": partial(segment_with_sam, "sam2"),
     "sam3": partial(segment_with_sam, "sam3"),
 }

@@ -82,6 +82,9 @@ def find_table(
     """Find the table plane among the pixels `table_top`, None for all, or the reason why there is none."""
     depth = fill_depth_gaps(observation.depth)
     points, valid = backproject(depth, observation.camera), depth > 0
+    if table_top is not None and int((table_top & valid).sum()) < MIN_TABLE_TOP_PIXELS:
+        why = f"{int((table_top & valid).sum())} pixels of a table-top have depth; at least {MIN_TABLE_TOP_PIXELS} must"
+        return Dropped("no_table_plane", why)
     index = _sample_grid(valid if table_top is None else valid & table_top)
     sample = points[index]
     tolerance = np.maximum(0.006, 2.5 * compute_depth_noise(depth[index]))
@@ -101,8 +104,6 @@ def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generat
 
     Unchanged where too few of them were measured, or they lie on no plane that a table can have.
     """
-    if int((table_top & view.valid).sum()) < MIN_TABLE_TOP_PIXELS:
-        return view
     found = find_table(view.observation, rng, table_top)
     return view if isinstance(found, Dropped) else found
 

@@ -75,7 +75,7 @@ REJECTED = {
 }
 """Inputs that `tableverse manifest` rejects, by the reason."""
 
-DROPPED = ("content_changed", "no_depth_model", "no_objects", "no_table_plane")
+DROPPED = ("content_changed", "no_objects", "no_table", "no_table_plane")
 """By one build of four inputs."""
 
 AFTERWARDS = (

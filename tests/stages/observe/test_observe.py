@@ -213,8 +213,8 @@ def test_a_place_that_is_not_there_is_dropped(uri):
     assert refusal(observed(uri)) in ("missing_color", "unreachable_uri")
 
 
-def test_a_picture_needs_a_depth_model_and_the_reason_says_so(tmp_path):
-    outcome = observed(write_picture(tmp_path / "photo.jpg", 1), SceneKind.IMAGE)
+def test_a_picture_without_a_depth_model_says_which_there_are(tmp_path):
+    outcome = observed(write_picture(tmp_path / "photo.jpg", 1), SceneKind.IMAGE, depth="sensor")
     assert refusal(outcome) == "no_depth_model"
     assert all(name in outcome.detail for name in DEPTH_MODELS)
 

@@ -8,6 +8,7 @@ from schemas.config import ObserveConfig
 from schemas.geometry import Camera, DepthImage, Frozen, Picture
 from schemas.observation import IntrinsicsSource, ScaleSource
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.math.camera import rescale_camera
 from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.resample import resample_depth
 
@@ -27,12 +28,6 @@ class DepthEstimate(Frozen):
     camera: Camera
     bend: float = MODEL_BEND
     intrinsics_source: IntrinsicsSource = "model"
-
-
-def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Rescale intrinsics to another picture size; pixel centres are at whole numbers."""
-    x, y = width / camera.width, height / camera.height
-    return Camera(camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5, width, height)
 
 
 def create_centered_camera(focal_px: float, shape: tuple[int, ...], scaled: tuple[int, ...]) -> Camera:

@@ -5,7 +5,7 @@ from typing import Protocol
 
 from schemas.config import Config, PerceiveConfig
 from schemas.detection import DetectionRecord
-from schemas.geometry import Frozen, IdImage
+from schemas.geometry import Frozen, IdImage, Mask
 from schemas.outcome import Dropped
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.table_view import TableView
@@ -34,6 +34,7 @@ class DetectionResult(Frozen):
     table_box: PixelBox | None = None
     record: DetectionRecord | None = None  # origin of the answer; None where no model was asked
     ids: IdImage | None = None  # the instance at each pixel; None for boxes only, for a BoxSegmenter
+    shown: Mask | None = None  # where objects are seen, found or not; None: wherever the depth rises over the table
 
 
 class Detector(Protocol):

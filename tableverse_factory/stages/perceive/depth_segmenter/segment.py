@@ -49,7 +49,11 @@ def segment_boxes_from_depth(view: TableView, found: DetectionResult, _config: C
 
     Of two boxes with the same pixel the smaller one has it: contents lie in the box of their container.
     """
-    regions, _ = segment_depth(view)
+    return assign_regions_to_boxes(segment_depth(view)[0], found)
+
+
+def assign_regions_to_boxes(regions: IdImage, found: DetectionResult) -> IdImage:
+    """Return an image of `k + 1` in the regions of the k-th box, as `segment_boxes_from_depth` assigns them."""
     sizes = np.bincount(regions.ravel())
     parts = [_slice_box(candidate.box, regions.shape) for candidate in found.candidates]
     counts = np.array([np.bincount(regions[part].ravel(), minlength=len(sizes)) for part in parts])

@@ -43,28 +43,31 @@ class ScaleFactor:
     sigma: float
 
 
-def find_scaled_table(item: Observation, rng: np.random.Generator) -> TableView | Dropped:
+def find_scaled_table(
+    item: Observation, rng: np.random.Generator, table_top: Mask | None = None
+) -> TableView | Dropped:
     """Find the table in the scale of the known length; the height of an object waits for `scale_by_object`.
 
-    It is dropped for `known_length_unmeasured`, `scale_implausible` or `scale_contradicts_sensor`.
+    The table lies among the pixels `table_top`, None for all. The scene is dropped for `known_length_unmeasured`,
+    `scale_implausible` or `scale_contradicts_sensor`.
     """
     try:
-        return _find_scaled_table(item, rng)
+        return _find_scaled_table(item, rng, table_top)
     except InputError as error:
         return Dropped(error.reason, str(error))
 
 
-def _find_scaled_table(item: Observation, rng: np.random.Generator) -> TableView | Dropped:
+def _find_scaled_table(item: Observation, rng: np.random.Generator, table_top: Mask | None) -> TableView | Dropped:
     known = item.known_length
     if isinstance(known, KnownDistance):
         item = _scale(item, compute_factor(item, known.length_m, measure_distance(item, known)))
     elif isinstance(known, KnownSheet):
         item = _scale(item, compute_factor(item, known.size_m[0], measure_sheet(item, known)))
-    view = find_table(item, rng)
+    view = find_table(item, rng, table_top)
     if isinstance(view, Dropped) or not isinstance(known, KnownCameraHeight):
         return view
     factor = compute_factor(item, known.length_m, measure_camera_height(view, known))
-    return view if factor is None else find_table(_scale(item, factor), rng)
+    return view if factor is None else find_table(_scale(item, factor), rng, table_top)
 
 
 def scale_by_object(view: TableView, candidates: tuple[Candidate, ...], ids: IdImage) -> TableView | Dropped:

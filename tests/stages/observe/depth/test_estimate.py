@@ -10,12 +10,11 @@ from scipy import ndimage
 from schemas.config import ObserveConfig
 from schemas.geometry import Camera
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.geometry.math.camera import backproject, project
+from tableverse_factory.geometry.math.camera import backproject, project, rescale_camera
 from tableverse_factory.stages.observe.depth.estimate import (
     DepthEstimate,
     build_capture,
     parse_intrinsics,
-    rescale_camera,
 )
 from tableverse_factory.stages.observe.depth.resample import find_step_pixels, resample_depth
 from tests.helpers.tabletop_views import Box, camera_above, look

@@ -1,0 +1,85 @@
+"""`tableverse bench picture`: bare pictures against the depth and masks that a sensor and people gave them."""
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides
+from tableverse_factory.cli.tables import print_figures, print_json
+
+if TYPE_CHECKING:
+    from tableverse_factory.evaluation.bench.perception import MaskScore
+    from tableverse_factory.evaluation.bench.picture import PictureScore, PictureSummary
+
+
+def bench_picture(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of captures; only their colour is given to the net.", exists=True)
+    ],
+    other: Annotated[
+        Path | None, typer.Option(help="Folder of pictures that show no table-top.", exists=True, file_okay=False)
+    ] = None,
+    focal: Annotated[bool, typer.Option("--focal", help="Give the net the focal length of camera.json too.")] = False,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare depth, table, scale and objects found in the colour of captures with their depth and masks.
+
+    One scale is taken out of the depth error; masks are compared where there is a seg.png or masks.png. Of the folder
+    --other the pictures are listed that are not dropped.
+
+    Example: `tableverse bench picture captures`
+    """
+    from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.bench.picture import bench_other_pictures, bench_pictures, summarize_pictures
+
+    settings = load_config(config, overrides or [])
+    scores = list(bench_pictures(folder, settings, focal))
+    total = summarize_pictures(scores)
+    others = dict(bench_other_pictures(other, settings)) if other else {}
+    if as_json:
+        print_json({"pictures": [asdict(score) for score in scores], "all": asdict(total), "other": others})
+        return
+    _show_scores(scores, total)
+    if others:
+        wrong = [name for name, reason in others.items() if not reason]
+        print(f"without a table: {len(others) - len(wrong)} of {len(others)} dropped; not {', '.join(wrong) or 'one'}")
+
+
+def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
+    columns = (
+        "picture",
+        "depth %",
+        "plane °",
+        "scale %",
+        "σ %",
+        "mean IoU",
+        "recall@0.5",
+        "overlap F",
+        "CPU s",
+        "dropped",
+    )
+    rows: list[tuple[object, ...]] = []
+    for s in scores:
+        shares = (s.depth_error, s.plane_deg / 100, math.expm1(-s.log_scale), s.scale_sigma)
+        rows.append(
+            (s.name, *(_format(100 * share) for share in shares), *_format_masks(s.masks), f"{s.cpu_s:.2f}", s.reason)
+        )
+    figures = _format(100 * total.depth_error), _format(total.plane_deg), _format(100 * total.scale_error), ""
+    rows.append(("all", *figures, *_format_masks(total.masks), f"{total.cpu_s:.2f}", f"{total.dropped}"))
+    print_figures(columns, rows, "depth error in the mean, one scale taken out; angle, scale and CPU s in the median")
+    print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")
+
+
+def _format(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.1f}"
+
+
+def _format_masks(masks: "MaskScore | None") -> tuple[str, str, str]:
+    if masks is None:
+        return "", "", ""
+    return f"{masks.mean_iou:.3f}", f"{masks.recall:.3f}", f"{masks.overlap_f:.3f}"

@@ -1,0 +1,203 @@
+"""Scores of bare pictures: the colour of captures through `observe` and `perceive`, against their depth and masks."""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from schemas.config import Config, ObserveConfig, PerceiveConfig
+from schemas.geometry import DepthImage, IdImage
+from schemas.identity import check_id
+from schemas.manifest import ImageRow, SceneKind
+from schemas.objects import PerceivedObjects
+from schemas.observation import Observation
+from schemas.outcome import Done, Outcome
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.perception import (
+    TRUTH_NAMES,
+    MaskScore,
+    compare_masks,
+    merge_scores,
+    remove_table,
+)
+from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.capture import COLOR_NAMES, read_id_image
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
+
+MIN_PIXELS = 100  # of table and objects, for a scale
+
+
+@dataclass(frozen=True, slots=True)
+class PictureScore:
+    """Score of one bare picture; figures are NaN where it was dropped, or nothing tells the truth."""
+
+    name: str
+    depth_error: float  # mean relative error of the depth of table and objects, one scale taken out
+    log_scale: float  # logarithm of that scale: true over predicted depth
+    scale_sigma: float  # standard deviation that was stated for it
+    plane_deg: float  # angle between the table's normals [°]
+    cpu_s: float  # CPU time of `observe` and `perceive` [s]
+    masks: MaskScore | None = None  # None without true masks
+    reason: str = ""  # why the picture was dropped, or empty
+
+    @property
+    def is_within_sigma(self) -> bool:
+        """Whether the scale is within one stated standard deviation."""
+        return abs(self.log_scale) <= self.scale_sigma
+
+
+@dataclass(frozen=True, slots=True)
+class PictureSummary:
+    """Figures of several bare pictures, over those that were not dropped."""
+
+    pictures: int
+    dropped: int
+    depth_error: float  # mean
+    plane_deg: float  # median [°]
+    scale_error: float  # median of the scale's relative error
+    within_sigma: float  # share of pictures whose scale is within the stated standard deviation
+    cpu_s: float  # median [s]
+    masks: MaskScore | None
+
+
+def bench_pictures(folder: Path, config: Config, with_focal: bool = False) -> Iterator[PictureScore]:
+    """Score the colour of every capture in `folder`, in the order of their names.
+
+    What lies on the table, and where the table is, tells the sensor through the detector `geometric`; objects are those
+    of `seg.png` or `masks.png` where there is one. `with_focal` gives the net the capture's focal length.
+    """
+    names = sorted(path.parent.name for path in folder.glob("*/camera.json"))
+    if not names:
+        raise InputError(f"{str(folder)!r} holds no capture: a folder with color.png, depth.png and camera.json")
+    for name in names:
+        yield score_picture(folder / name, config, with_focal)
+
+
+def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, str]]:
+    """Give the name of every picture in `folder`, which show no table-top, and why it was dropped, or nothing."""
+    names = sorted(path.name for path in folder.iterdir() if path.is_file())
+    if not names:
+        raise InputError(f"{str(folder)!r} holds no picture")
+    for name in names:
+        seen = _observe(SceneKind.IMAGE, folder / name, config)
+        outcome = perceive(seen.value, config, _seed(config), Services(Path())) if isinstance(seen, Done) else seen
+        yield name, getattr(outcome, "reason", "")
+
+
+def score_picture(capture: Path, config: Config, with_focal: bool = False) -> PictureScore:
+    """Run `observe` and `perceive` on the colour of a capture and compare with its depth and masks."""
+    sensor, truth = _perceive_truth(capture, config)
+    if with_focal:
+        focal = config.observe.model_copy(update={"focal_px": sensor.camera.fx})
+        config = config.model_copy(update={"observe": focal})
+    color = next(capture / name for name in COLOR_NAMES if (capture / name).is_file())
+    start = time.process_time()
+    seen = _observe(SceneKind.IMAGE, color, config)
+    outcome = perceive(seen.value, config, _seed(config), Services(Path())) if isinstance(seen, Done) else seen
+    cpu_s = time.process_time() - start
+    ids = _read_objects(capture, sensor, truth, config)
+    found = outcome.value if isinstance(outcome, Done) else None
+    reason = "" if found else str(getattr(outcome, "reason", outcome))
+    masks = None
+    if any((capture / name).is_file() for name in TRUTH_NAMES):
+        own = resize_nearest(found.instance_ids, ids.shape) if found else np.zeros_like(ids)
+        masks = compare_masks(capture.name, ids, own, cpu_s, reason)
+    nothing = float("nan")
+    if found is None or truth is None:
+        return PictureScore(capture.name, nothing, nothing, nothing, nothing, cpu_s, masks, reason)
+    depth = resize_nearest(found.observation.depth, sensor.depth.shape)
+    error, log_scale = compare_depth(depth, sensor.depth, (ids > 0) | (truth.instance_ids == -1))
+    plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))
+    return PictureScore(capture.name, error, log_scale, found.observation.scale_sigma, plane, cpu_s, masks)
+
+
+def compare_depth(depth: DepthImage, true: DepthImage, wanted: np.ndarray) -> tuple[float, float]:
+    """Compare depth where it is `wanted` and both are known, after one scale, the median ratio.
+
+    Returns the mean relative error, and the logarithm of the scale; both NaN for fewer than `MIN_PIXELS`.
+    """
+    both = wanted & (depth > 0) & (true > 0)
+    if int(both.sum()) < MIN_PIXELS:
+        return float("nan"), float("nan")
+    ratio = true[both] / depth[both].astype(np.float64)
+    scale = float(np.median(ratio))
+    return float(np.mean(np.abs(scale / ratio - 1.0))), float(np.log(scale))
+
+
+def get_table_normal(found: PerceivedObjects) -> Float64[np.ndarray, "3"]:
+    """Get the table's normal in the camera frame."""
+    normal: Float64[np.ndarray, "3"] = rotation_matrix(found.camera_to_table.quaternion_wxyz)[2]
+    return normal
+
+
+def measure_angle_deg(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> float:
+    """Measure the angle between two unit vectors [°]."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
+
+
+def summarize_pictures(scores: Sequence[PictureScore]) -> PictureSummary:
+    """Summarise scores; masks are over all true objects, those of dropped pictures too."""
+    known = [score for score in scores if np.isfinite(score.depth_error)]
+    masks = [score.masks for score in scores if score.masks is not None]
+    return PictureSummary(
+        len(scores),
+        sum(bool(score.reason) for score in scores),
+        _average(score.depth_error for score in known),
+        _find_median(score.plane_deg for score in known),
+        _find_median(abs(float(np.expm1(-score.log_scale))) for score in known),
+        _average(score.is_within_sigma for score in known),
+        _find_median(score.cpu_s for score in scores),
+        merge_scores(masks) if masks else None,
+    )
+
+
+def resize_nearest(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Resize an image of ids or depths to (h, w) by the nearest pixels."""
+    rows, columns = ((np.arange(n) + 0.5) * (own / n) for n, own in zip(shape, image.shape, strict=True))
+    return image[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
+
+
+def _perceive_truth(capture: Path, config: Config) -> tuple[Observation, PerceivedObjects | None]:
+    """Read the capture with its sensor's depth, and find its table and objects by that; None without a table."""
+    own = Config(run=config.run, observe=ObserveConfig(), perceive=PerceiveConfig(detector="geometric"))
+    seen = _observe(SceneKind.CAPTURE, capture, own)
+    if not isinstance(seen, Done):
+        raise InputError(f"{capture.name}: {seen}")
+    outcome = perceive(seen.value, own, _seed(config), Services(Path()))
+    return seen.value, outcome.value if isinstance(outcome, Done) else None
+
+
+def _read_objects(capture: Path, sensor: Observation, truth: PerceivedObjects | None, config: Config) -> IdImage:
+    """Read the true objects, or take those that the sensor's depth shows."""
+    none = np.zeros(sensor.depth.shape, dtype=np.int32)
+    by_depth = none if truth is None else truth.instance_ids
+    for name in TRUTH_NAMES:
+        if (capture / name).is_file():
+            ids = read_id_image(str(capture / name), config.observe, sensor.camera)
+            return remove_table(ids, by_depth) if name == TRUTH_NAMES[0] else ids
+    return np.maximum(by_depth, 0)
+
+
+def _observe(kind: SceneKind, path: Path, config: Config) -> Outcome[Observation]:
+    row = ImageRow(scene_id=check_id("picture"), kind=kind, uri=str(path))
+    return observe(row, config, _seed(config), Services(Path()))
+
+
+def _seed(config: Config) -> np.random.Generator:
+    return make_rng(config.run.seed, "picture", "perceive")
+
+
+def _average(values: Iterable[float]) -> float:
+    known = list(values)
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _find_median(values: Iterable[float]) -> float:
+    known = list(values)
+    return float(np.median(known)) if known else float("nan")

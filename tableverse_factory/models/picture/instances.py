@@ -1,0 +1,174 @@
+"""Objects of a prediction: pixels grouped by their votes, cut at boundaries, and merged where surfaces continue."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction
+
+SPREAD_PX = 3.5  # standard deviation of the votes of one object about its middle
+MIN_VOTES = 10  # at a peak of votes
+MIN_PIECE_PX, MIN_OBJECT_PX = 20, 60
+EDGE = 0.5  # probability from which a boundary separates
+ACROSS_PX = 3  # surfaces are compared at this distance from the border of two pieces
+MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
+AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
+SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
+
+
+@dataclass(frozen=True, slots=True)
+class _Border:
+    """What separates two pieces that touch: in the median of their border, but for its length [px]."""
+
+    pieces: tuple[int, int]
+    length: int
+    bend: float
+    boundary: float
+
+
+def segment_prediction(found: PicturePrediction, shape: tuple[int, int]) -> IdImage:
+    """Segment the objects, ids from 1, the largest first, 0 elsewhere, at the size of the picture, (h, w)."""
+    return upsample_ids(_find_objects(found), shape)
+
+
+def _find_objects(found: PicturePrediction) -> IdImage:
+    is_object = found.label.argmax(axis=0) == OBJECT
+    density, middles, nearest = _group_votes(found, is_object)
+    pieces, middle_of = _cut_pieces(nearest, found.boundary < EDGE)
+    pieces = np.where(is_object, _spread(pieces), 0)
+    sizes = np.bincount(pieces.ravel(), minlength=len(middle_of))
+    group = np.arange(len(middle_of))
+    for border in _measure_borders(found, pieces):
+        a, b = border.pieces
+        agreement = _measure_agreement(density, middles[middle_of[a]], middles[middle_of[b]])
+        touches = border.length >= MIN_CONTACT * np.sqrt(min(sizes[a], sizes[b]))
+        limit = CREASED if agreement >= LIKELY else SMOOTH if agreement >= AGREED else 0.0
+        if touches and border.boundary < EDGE and border.bend < limit:
+            group[group == group[b]] = group[a]
+    return _renumber(group[pieces])
+
+
+def _group_votes(found: PicturePrediction, is_object: Mask) -> tuple[Float64[np.ndarray, "h w"], np.ndarray, IdImage]:
+    """Find the density of votes, its peaks as rows and columns, and the peak from 1 nearest to each pixel's vote."""
+    rows, columns = np.nonzero(is_object)
+    height, width = is_object.shape
+    at = np.stack([rows + found.votes[1][is_object], columns + found.votes[0][is_object]], axis=-1)
+    at = np.clip(at, 0, [height - 1, width - 1])
+    counts = np.zeros(is_object.shape)
+    np.add.at(counts, tuple(np.rint(at).astype(np.intp).T), 1.0)
+    density = ndimage.gaussian_filter(counts, SPREAD_PX) * (2.0 * np.pi * SPREAD_PX**2)
+    around = 2 * int(1.5 * SPREAD_PX) + 1
+    middles = np.argwhere((density == ndimage.maximum_filter(density, around)) & (density > MIN_VOTES))
+    nearest = np.zeros(is_object.shape, dtype=np.int32)
+    if len(middles):
+        nearest[is_object] = cKDTree(middles).query(at)[1] + 1
+    return density, middles, nearest
+
+
+def _cut_pieces(nearest: IdImage, inside: Mask) -> tuple[IdImage, np.ndarray]:
+    """Cut each group into connected pieces, numbered from 1, and find the index of each one's middle."""
+    pieces, middle_of = np.zeros(nearest.shape, dtype=np.int32), [0]
+    for middle, window in enumerate(ndimage.find_objects(nearest)):
+        if window is None:
+            continue
+        parts, count = ndimage.label((nearest[window] == middle + 1) & inside[window])
+        sizes = np.bincount(parts.ravel(), minlength=count + 1)
+        for part in range(1, count + 1):
+            if sizes[part] >= MIN_PIECE_PX:
+                pieces[window][parts == part] = len(middle_of)
+                middle_of.append(middle)
+    return pieces, np.array(middle_of)
+
+
+def _spread(pieces: IdImage) -> IdImage:
+    """Give every pixel the nearest piece; 0 where there is none at all."""
+    nearest = ndimage.distance_transform_edt(pieces == 0, return_distances=False, return_indices=True)
+    return pieces[tuple(nearest)]
+
+
+def _measure_agreement(density: Float64[np.ndarray, "h w"], a: np.ndarray, b: np.ndarray) -> float:
+    """Measure the least density of votes between two peaks, as a share of that at the lesser peak."""
+    steps = np.rint(np.linspace(a, b, 9)).astype(np.intp)
+    return float(density[tuple(steps.T)].min() / min(density[tuple(a)], density[tuple(b)]))
+
+
+def _measure_borders(found: PicturePrediction, pieces: IdImage) -> Iterator[_Border]:
+    """Measure the borders of all pairs of pieces that touch, in the order of their numbers."""
+    points = backproject(found.depth, found.camera)
+    smooth = ndimage.uniform_filter(points, (5, 5, 1))
+    normals = np.cross(np.gradient(smooth, axis=0), np.gradient(smooth, axis=1))
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    parts = [
+        _compare_across(*(np.moveaxis(a, axis, 0) for a in (pieces, points, normals, found.boundary)))
+        for axis in (0, 1)
+    ]
+    pairs, bends, edges = (np.concatenate(part) for part in zip(*parts, strict=True))
+    bends *= found.camera.fx
+    keys, index = np.unique(pairs, axis=0, return_inverse=True)
+    for k, (a, b) in enumerate(keys.tolist()):
+        on = index.ravel() == k
+        yield _Border((a, b), int(on.sum()), float(np.median(bends[on])), float(np.median(edges[on])))
+
+
+def _compare_across(
+    pieces: np.ndarray, points: np.ndarray, normals: np.ndarray, boundary: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compare both sides of each border that crosses the first axis: the pieces, the bend and the boundary."""
+    gap = 2 * ACROSS_PX + 1
+    sides, middle = np.s_[:-gap], np.s_[ACROSS_PX : -ACROSS_PX - 1]
+    far = pieces[gap:]
+    crosses = (pieces[sides] == pieces[middle]) & (far == pieces[ACROSS_PX + 1 : -ACROSS_PX])
+    crosses &= (pieces[sides] != far) & (pieces[sides] > 0) & (far > 0)
+    between = points[gap:][crosses] - points[sides][crosses]
+    out = sum(np.abs((normals[part][crosses] * between).sum(axis=-1)) for part in (sides, np.s_[gap:])) / 2.0
+    reach = gap * np.minimum(points[sides][crosses][:, 2], points[gap:][crosses][:, 2])
+    edge = ndimage.maximum_filter1d(boundary, 2 * ACROSS_PX + 1, axis=0)[middle][crosses]
+    pairs = np.sort(np.stack([pieces[sides][crosses], far[crosses]], axis=-1), axis=-1)
+    return pairs, out / reach, edge
+
+
+def _renumber(ids: np.ndarray) -> IdImage:
+    """Number the ids of enough pixels from 1, the largest first; the others become 0."""
+    known, index, sizes = np.unique(ids, return_inverse=True, return_counts=True)
+    sizes[known == 0] = 0
+    order = np.argsort(-sizes, kind="stable")
+    number = np.zeros(len(known), dtype=np.int32)
+    kept = order[sizes[order] >= MIN_OBJECT_PX]
+    number[kept] = np.arange(1, len(kept) + 1)
+    return number[index].reshape(ids.shape)
+
+
+def upsample_ids(ids: IdImage, shape: tuple[int, int]) -> IdImage:
+    """Resize an image of ids: each pixel has the id with the greatest bilinear weight there."""
+    if ids.shape == shape:
+        return ids
+    result, best = np.zeros(shape, dtype=np.int32), np.full(shape, 0.5, dtype=np.float32)
+    down, across = (_make_weights(small, large) for small, large in zip(ids.shape, shape, strict=True))
+    for k, window in enumerate(ndimage.find_objects(ids), start=1):
+        if window is None:
+            continue
+        spans = [
+            np.flatnonzero(weights[:, part].any(axis=1)) for weights, part in zip((down, across), window, strict=True)
+        ]
+        target = tuple(slice(int(span[0]), int(span[-1]) + 1) for span in spans)
+        weight = down[target[0], window[0]] @ (ids[window] == k).astype(np.float32) @ across[target[1], window[1]].T
+        wins = weight > best[target]
+        result[target][wins] = k
+        best[target][wins] = weight[wins]
+    return result
+
+
+def _make_weights(small: int, large: int) -> np.ndarray:
+    """Make the matrix that interpolates `large` pixels from `small` that cover the same length."""
+    places = np.clip((np.arange(large) + 0.5) * (small / large) - 0.5, 0.0, small - 1.0)
+    low = np.minimum(places.astype(np.intp), max(small - 2, 0))
+    weights = np.zeros((large, small), dtype=np.float32)
+    weights[np.arange(large), low] = 1.0 - (places - low)
+    weights[np.arange(large), np.minimum(low + 1, small - 1)] += places - low
+    return weights

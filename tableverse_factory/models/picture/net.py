@@ -1,0 +1,86 @@
+"""The net of bare pictures: an ONNX file in this package, or one that a user trained, run on one CPU thread."""
+
+import hashlib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32
+
+from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.models.local.onnx_session import open_onnx_session, shorten_onnx_error
+
+SHIPPED = Path(__file__).with_name("picture.onnx")
+DIGEST = SHIPPED.with_suffix(".sha256")
+MULTIPLE: Final = 32  # height and width of the input are multiples of it
+INPUTS: Final = {"image": 3, "rays": 3, "depth": 1}  # channels of (1, c, h, w)
+MAPS: Final = {"label": 3, "log_depth": 1, "height": 1, "center": 1, "votes": 2, "boundary": 1}
+VECTORS: Final = {"plane": 4, "table": 1, "log_scale_sigma": 1}  # lengths of (1, n)
+MAX_BYTES = 256 * 1024 * 1024
+
+_Arrays = Mapping[str, Float32[np.ndarray, "..."]]
+
+
+class PictureNet:
+    """A session with the inputs `INPUTS` and the outputs `MAPS` and `VECTORS`."""
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        self._name = path.name
+        self._session = open_onnx_session(data, f"the net {str(path)!r}")
+        inputs, outputs = (
+            {one.name for one in ends} for ends in (self._session.get_inputs(), self._session.get_outputs())
+        )
+        if inputs != {*INPUTS} or not outputs >= {*MAPS, *VECTORS}:
+            raise ModelAccessError(
+                f"{str(path)!r} is another net: it takes {', '.join(sorted(inputs))} and gives "
+                f"{', '.join(sorted(outputs))}; one of {', '.join(INPUTS)} to {', '.join([*MAPS, *VECTORS])} is wanted"
+            )
+
+    def __call__(self, inputs: _Arrays) -> dict[str, Float32[np.ndarray, "..."]]:
+        """Run the net on maps of shape (c, h, w); the outputs come without their first axis.
+
+        Raises:
+            ModelError: if it cannot be run, or an output has another shape or is not finite.
+        """
+        names = [*MAPS, *VECTORS]
+        try:
+            found = self._session.run(names, {name: inputs[name][None] for name in INPUTS})
+        except Exception as error:  # onnxruntime's errors have no common base
+            raise ModelError(f"{self._name} cannot be run: {shorten_onnx_error(error)}") from error
+        size = inputs["image"].shape[1:]
+        shapes = {name: (1, count, *size) for name, count in MAPS.items()} | {n: (1, c) for n, c in VECTORS.items()}
+        for name, array in zip(names, found, strict=True):
+            if array.shape != shapes[name] or not np.isfinite(array).all():
+                raise ModelError(f"{self._name} answers {name} of shape {array.shape}; finite {shapes[name]} is wanted")
+        return {name: array[0].astype(np.float32) for name, array in zip(names, found, strict=True)}
+
+
+@cache
+def load_picture_net(weights: str = "") -> PictureNet:
+    """Load the net in a file, or the one of this package, once per process.
+
+    Raises:
+        ModelAccessError: if the file is missing or damaged, or holds another net.
+    """
+    if not weights:
+        return PictureNet(SHIPPED, _read_shipped(SHIPPED, DIGEST))
+    path = Path(weights)
+    if not path.is_file() or path.stat().st_size > MAX_BYTES:
+        raise ModelAccessError(f"{weights!r} is no file of at most {MAX_BYTES} bytes: give the .onnx file of a net")
+    return PictureNet(path, path.read_bytes())
+
+
+def _read_shipped(path: Path, digest: Path) -> bytes:
+    """Read a file whose SHA-256 stands in `digest`."""
+    try:
+        data, wanted = path.read_bytes(), digest.read_text().strip()
+    except OSError as error:
+        raise ModelAccessError(f"the net of bare pictures is missing: {error}; install the package again") from error
+    found = hashlib.sha256(data).hexdigest()
+    if found != wanted:
+        raise ModelAccessError(
+            f"{path} is damaged: its SHA-256 begins with {found[:12]}, not {wanted[:12]}; install the package again"
+        )
+    return data

@@ -1,0 +1,130 @@
+"""What the net says about a picture: depth, table, objects, and how sure it is."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from PIL import Image
+from scipy.special import expit, softmax
+
+from schemas.geometry import Camera, DepthImage, Frozen, Picture
+from schemas.identity import content_hash
+from tableverse_factory.geometry.math.camera import rescale_camera
+from tableverse_factory.models.picture.net import MULTIPLE, load_picture_net
+
+LEAST_PIXELS, MOST_PIXELS = 76_800, 118_000  # of the net's input: it was trained at 320 x 240 and more
+OTHER, TABLE, OBJECT = range(3)
+_MAX_LOG_DEPTH = 7.0  # a depth of a kilometre: what exceeds it is no room
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PicturePrediction(Frozen):
+    """What the net says, at its working size (h, w).
+
+    Attributes:
+        camera: At this size.
+        depth: Distance along the optical axis [m].
+        label: Probabilities of `OTHER`, `TABLE` and `OBJECT`.
+        center: Logits of being the middle of an object.
+        votes: From each pixel to the middle of its object, x and y [px].
+        boundary: Probability of an edge between objects.
+        normal: Of the table, towards the camera, in the camera frame; a unit vector.
+        distance_m: Of the camera from the table's plane [m].
+        table_probability: That a table-top is shown.
+        scale_sigma: Standard deviation of the logarithm of the scale.
+    """
+
+    camera: Camera
+    depth: Float32[np.ndarray, "h w"]
+    label: Float32[np.ndarray, "3 h w"]
+    center: Float32[np.ndarray, "h w"]
+    votes: Float32[np.ndarray, "2 h w"]
+    boundary: Float32[np.ndarray, "h w"]
+    normal: Float64[np.ndarray, "3"]
+    distance_m: float
+    table_probability: float
+    scale_sigma: float
+
+
+def predict_picture(
+    color: Picture, camera: Camera, depth: DepthImage | None = None, weights: str = ""
+) -> PicturePrediction:
+    """Predict from a picture and its camera; with a sensor's `depth` [m], 0 where unknown, the net reads that too.
+
+    The latest prediction is remembered: two stages ask the same of one picture.
+
+    Raises:
+        ModelAccessError: if the net of `weights`, empty for the one of this package, cannot be loaded.
+        ModelError: if it cannot be run.
+    """
+    sensed = np.zeros(color.shape[:2], np.float32) if depth is None else np.asarray(depth, np.float32)
+    key = content_hash(repr((color.shape, camera, weights)).encode(), color.tobytes(), sensed.tobytes())
+    latest = _get_latest()
+    if key not in latest:
+        made = _predict(color, camera, sensed, weights)
+        latest.clear()
+        latest[key] = made
+    return latest[key]
+
+
+@cache
+def _get_latest() -> dict[str, PicturePrediction]:
+    return {}
+
+
+def choose_working_size(height: int, width: int) -> tuple[int, int]:
+    """Choose rows and columns of the net's input: multiples of `MULTIPLE` that change the aspect least.
+
+    Of sizes that change it alike, the largest; sizes have `LEAST_PIXELS` to `MOST_PIXELS` where the aspect permits.
+    """
+    wanted = np.log(height / width)
+    return min(_list_sizes(), key=lambda size: (round(abs(np.log(size[0] / size[1]) - wanted), 2), -size[0] * size[1]))
+
+
+def _list_sizes() -> Iterator[tuple[int, int]]:
+    steps = range(2 * MULTIPLE, MOST_PIXELS // MULTIPLE, MULTIPLE)
+    return ((rows, columns) for rows in steps for columns in steps if LEAST_PIXELS <= rows * columns <= MOST_PIXELS)
+
+
+def compute_rays(camera: Camera) -> Float32[np.ndarray, "3 h w"]:
+    """Compute unit directions of the pixels, in the camera frame."""
+    v, u = np.indices((camera.height, camera.width), dtype=np.float64)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)])
+    return (rays / np.linalg.norm(rays, axis=0)).astype(np.float32)
+
+
+def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"], weights: str) -> PicturePrediction:
+    net = load_picture_net(weights)
+    rows, columns = choose_working_size(*color.shape[:2])
+    small = rescale_camera(camera, columns, rows)
+    inputs = {"image": _resize_color(color, rows, columns), "rays": compute_rays(small)}
+    out = net({**inputs, "depth": _thin_depth(sensed, rows, columns)[None]})
+    plane = out["plane"].astype(np.float64)
+    return PicturePrediction(
+        small,
+        np.exp(np.minimum(out["log_depth"][0], _MAX_LOG_DEPTH)),
+        softmax(out["label"], axis=0),
+        out["center"][0],
+        out["votes"],
+        expit(out["boundary"][0]),
+        plane[:3] / max(float(np.linalg.norm(plane[:3])), 1e-9),
+        float(plane[3]),
+        float(expit(float(out["table"][0]))),
+        float(out["log_scale_sigma"][0]),
+    )
+
+
+def _resize_color(color: Picture, rows: int, columns: int) -> Float32[np.ndarray, "3 h w"]:
+    """Resize to RGB in 0–1: by the mean of the pixels' areas, or between them where the picture is smaller."""
+    shrinks = rows <= color.shape[0] and columns <= color.shape[1]
+    kind = Image.Resampling.BOX if shrinks else Image.Resampling.BILINEAR
+    small = np.asarray(Image.fromarray(np.asarray(color)).resize((columns, rows), kind), dtype=np.float32)
+    return np.ascontiguousarray(np.moveaxis(small, -1, 0)) / np.float32(255.0)
+
+
+def _thin_depth(depth: Float32[np.ndarray, "h w"], rows: int, columns: int) -> Float32[np.ndarray, "h2 w2"]:
+    """Take the reading nearest to the centre of each pixel of another size: means would lie between surfaces."""
+    at = ((np.arange(n) + 0.5) * (full / n) for n, full in zip((rows, columns), depth.shape, strict=True))
+    return depth[np.ix_(*(places.astype(np.intp) for places in at))]

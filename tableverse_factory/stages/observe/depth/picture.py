@@ -1,0 +1,50 @@
+"""Depth of a bare picture by the net of this package, which also says whether a table-top is shown, and where."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.config import Config, ObserveConfig
+from schemas.manifest import ImageRow
+from tableverse_factory.core.errors import AnswerInvalidError
+from tableverse_factory.models.picture.predict import PicturePrediction, predict_picture
+from tableverse_factory.sources.capture import Capture
+from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, build_capture, create_centered_camera
+from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
+
+
+def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
+    """Estimate depth; the focal length comes from EXIF, `observe.focal_px` or the usual field of view.
+
+    Raises:
+        AnswerInvalidError: reasons `no_table`, `table_out_of_bounds`.
+    """
+    bounds, photo = config.observe, read_rgb_image(item.uri, config.observe)
+    camera = create_centered_camera(photo.get_focal_px(bounds.focal_px), photo.color.shape, photo.color.shape)
+    found = predict_picture(photo.color, camera, weights=bounds.depth_weights)
+    check_table(found, bounds)
+    capture = build_capture(
+        photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=photo.intrinsics_source), bounds
+    )
+    return replace(capture, camera=camera, scale_sigma=found.scale_sigma)
+
+
+def check_table(found: PicturePrediction, bounds: ObserveConfig) -> None:
+    """Raise `AnswerInvalidError` if the net sees no table-top, or one that no camera stands so to."""
+    if found.table_probability < bounds.min_table_probability:
+        raise AnswerInvalidError(
+            f"that the picture shows a table-top has a probability of {found.table_probability:.2f}, under "
+            f"observe.min_table_probability = {bounds.min_table_probability:g}",
+            "no_table",
+        )
+    right, down, forward = found.normal
+    steepness = float(np.degrees(np.arcsin(np.clip(-forward, -1.0, 1.0))))
+    roll = float(np.degrees(np.arctan2(abs(right), np.hypot(down, forward))))
+    low, high = bounds.table_distance_m
+    if not (low <= found.distance_m <= high and steepness >= bounds.min_view_deg and roll <= bounds.max_roll_deg):
+        raise AnswerInvalidError(
+            f"the table's plane would be {found.distance_m:.2f} m from the camera (observe.table_distance_m = {low:g} "
+            f"to {high:g}), seen {steepness:.0f}° down (observe.min_view_deg = {bounds.min_view_deg:g}) and turned by "
+            f"{roll:.0f}° (observe.max_roll_deg = {bounds.max_roll_deg:g})",
+            "table_out_of_bounds",
+        )

@@ -1,0 +1,57 @@
+"""The detector and box segmenter `picture`: objects and table-top from colour, by the net of this package."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from schemas.config import Config, PerceiveConfig
+from schemas.geometry import IdImage, Mask
+from schemas.observation import Observation
+from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
+from tableverse_factory.models.picture.predict import OBJECT, TABLE, PicturePrediction, predict_picture
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, DetectionResult
+from tableverse_factory.stages.perceive.base.object_filter import (
+    keep_objects,
+    keep_regions_over_table,
+    renumber_regions,
+)
+from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
+from tableverse_factory.stages.perceive.depth_segmenter.segment import (
+    assign_regions_to_boxes,
+    fill_holes,
+    to_detections,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
+
+
+def detect_in_picture(view: TableView, config: PerceiveConfig, _services: Services) -> DetectionResult:
+    """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
+    found = predict_observation(view.observation, config)
+    regions = keep_objects(keep_regions_over_table(segment_prediction(found, view.valid.shape), view), view)
+    sizes = np.bincount(regions.ravel())[1:]
+    regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
+    detections = to_detections(regions, find_containers(regions, find_rims(regions, view), view))
+    return replace(detections, shown=_find_label(found, OBJECT, view.valid.shape))
+
+
+def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Config) -> IdImage:
+    """Assign the objects and the table-top that the net sees to the boxes of a detector."""
+    seen = predict_observation(view.observation, config.perceive)
+    ids = assign_regions_to_boxes(segment_prediction(seen, view.valid.shape), found)
+    return np.where((ids == 0) & _find_label(seen, TABLE, view.valid.shape), TABLE_ID, ids)
+
+
+def find_table_top(item: Observation, config: PerceiveConfig) -> Mask:
+    """Find the pixels of the table-top. Shape (h, w)."""
+    return _find_label(predict_observation(item, config), TABLE, item.depth.shape)
+
+
+def predict_observation(item: Observation, config: PerceiveConfig) -> PicturePrediction:
+    """Ask the net, which also reads the depth of a sensor; that of a model would tell it nothing new."""
+    return predict_picture(item.color, item.camera, None if item.bend else item.depth, config.detector_weights)
+
+
+def _find_label(found: PicturePrediction, label: int, shape: tuple[int, int]) -> Mask:
+    return upsample_ids((found.label.argmax(axis=0) == label).astype(np.int32), shape) > 0
