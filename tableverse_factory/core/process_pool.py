@@ -5,10 +5,12 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -46,13 +48,42 @@ def parallel_map(
         return
     # Forked children would share the threads' locks of libraries that are already at work.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(items)), context, _prepare_child) as pool:
-        try:
+    with ProcessPoolExecutor(min(jobs, len(items)), context, _prepare_child) as pool, _translate_death(doing):
+        with _defer_interrupt():
+            results = pool.map(work, items, chunksize=chunk)
+        yield from results
+
+
+def parallel_stream(
+    work: Callable[[Item], Result], items: Iterable[Item], jobs: int, doing: str, ahead: int
+) -> Iterator[Result]:
+    """Do as `parallel_map` for items without end: each of the processes works up to `ahead` items ahead.
+
+    Without `jobs` the work is done here, item by item; one process already works beside the caller.
+    """
+    if not jobs:
+        with threadpool_limits(1):
+            yield from map(work, items)
+        return
+    rest, context = iter(items), multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, _prepare_child)
+    try:
+        with _translate_death(doing):
             with _defer_interrupt():
-                results = pool.map(work, items, chunksize=chunk)
-            yield from results
-        except BrokenProcessPool as error:
-            raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
+                results = deque(pool.submit(work, item) for item in islice(rest, jobs * ahead))
+            while results:
+                yield results.popleft().result()
+                results.extend(pool.submit(work, item) for item in islice(rest, 1))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _translate_death(doing: str) -> Iterator[None]:
+    try:
+        yield
+    except BrokenProcessPool as error:
+        raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
 
 
 def _prepare_child() -> None:
