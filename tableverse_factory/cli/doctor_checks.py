@@ -42,6 +42,7 @@ EXTRAS = {  # of pyproject.toml, without `dev` and `docs`: packages and purpose
         ("torch", "transformers", "onnx"),
         "real models instead of the embedded ones, depth_anything_2 among them; tableverse train",
     ),
+    "training": (("cupy-cuda13x",), "tableverse train picture on a GPU"),
     "bench": (("pandas",), "the comparison of tableverse bench with Ray Data"),
 }
 _SIMULATOR = """

@@ -1,0 +1,180 @@
+"""Training of the network of pictures: the same weights again, also in parts; files of other trainings are refused."""
+
+import importlib.util
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from tableverse_factory.cli.main import app
+from tableverse_factory.core.errors import InputError, ModelError
+from tests.evaluation.training.picture.conftest import SMALL
+
+torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
+from safetensors.torch import load_file  # noqa: E402
+
+from tableverse_factory.evaluation.training.picture import train as train_module  # noqa: E402
+from tableverse_factory.evaluation.training.picture.checkpoint import (  # noqa: E402
+    CHECKPOINT,
+    WEIGHTS,
+    PictureSettings,
+    read_weights,
+)
+from tableverse_factory.evaluation.training.picture.network import make_network  # noqa: E402
+from tableverse_factory.evaluation.training.picture.train import TrainRun, compute_rate, train_pictures  # noqa: E402
+from tableverse_factory.evaluation.training.picture.world import World  # noqa: E402
+
+pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("thin")]
+SETTINGS = PictureSettings(3, **SMALL)
+
+
+def train(folder: Path, pool: Path, settings: PictureSettings = SETTINGS, **run: object) -> list[str]:
+    lines: list[str] = []
+    folder.mkdir(exist_ok=True)
+    options = {"device": "cpu", "validate": False} | run
+    train_pictures(settings, TrainRun(folder, pool, **options), lines.append)
+    return lines
+
+
+def assert_same(one: Path, other: Path) -> None:
+    first, second = (load_file(folder / CHECKPOINT) for folder in (one, other))
+    assert first.keys() == second.keys()
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name]), name
+
+
+def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(pool_file: Path, tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", pool_file)
+    assert sum(" samples/s" in line for line in whole) == 1
+    for _ in range(3):  # no minutes: one step, and a checkpoint
+        train(tmp_path / "parts", pool_file, minutes=0.0)
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    before = (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns
+    train(tmp_path / "parts", pool_file)
+    assert (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns == before, "nothing is left to do"
+    train(tmp_path / "other", pool_file, replace(SETTINGS, seed=1))
+    with pytest.raises(AssertionError):
+        assert_same(tmp_path / "whole", tmp_path / "other")
+
+
+def test_processes_that_make_scenes_change_no_weight(pool_file: Path, tmp_path: Path) -> None:
+    for jobs in (0, 1, 2):
+        train(tmp_path / str(jobs), pool_file, jobs=jobs)
+    assert_same(tmp_path / "0", tmp_path / "1")
+    assert_same(tmp_path / "0", tmp_path / "2")
+
+
+def test_it_learns(pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_module, "LOG_STEPS", 1)
+    settings = replace(SETTINGS, steps=60, batch=8, first=32, fresh=0.0)
+    losses = []
+    for line in train(tmp_path / "net", pool_file, settings):
+        if " label " in line:
+            words = line.partition(": ")[2].partition(";")[0].split()
+            losses.append(sum(float(word) for word in words[1::2]))
+    assert len(losses) == 60
+    assert np.mean(losses[-6:]) < 0.6 * np.mean(losses[:6])
+
+
+def test_checkpoints_of_other_settings_or_another_network_or_of_nothing_are_refused(
+    pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(tmp_path, pool_file, replace(SETTINGS, steps=1))
+    for change in ({"seed": 1}, {"batch": 3}, {"scenes": 3}, {"capacity": 65}):
+        with pytest.raises(InputError, match=r"is of another training, .*: give the same, or another folder"):
+            train(tmp_path, pool_file, replace(SETTINGS, **change))
+    with monkeypatch.context() as older:
+        older.setattr("tableverse_factory.evaluation.training.picture.network.ATTENTION", 2)
+        with pytest.raises(InputError, match="of another network than this version trains"):
+            train(tmp_path, pool_file)
+        with pytest.raises(InputError, match="holds no weights of this network"):
+            read_weights(tmp_path, make_network(0))
+    for name, match in ((CHECKPOINT, "is not a checkpoint"), (WEIGHTS, "holds no weights")):
+        data = (tmp_path / name).read_bytes()
+        for damaged in (b"", b"\x80\x04 no safetensors", data[: len(data) // 2]):
+            (tmp_path / name).write_bytes(damaged)
+            with pytest.raises(InputError, match=match):
+                train(tmp_path, pool_file) if name == CHECKPOINT else read_weights(tmp_path, make_network(0))
+
+
+def test_weights_are_the_averages_in_half_precision(pool_file: Path, tmp_path: Path) -> None:
+    train(tmp_path, pool_file, replace(SETTINGS, steps=1))
+    network, saved = make_network(0), load_file(tmp_path / CHECKPOINT)
+    read_weights(tmp_path, network)
+    for name, tensor in network.state_dict().items():
+        assert torch.allclose(tensor.float(), saved[f"mean.{name}"].float(), rtol=1e-3, atol=1e-6), name
+    assert (tmp_path / WEIGHTS).stat().st_size < 2.2 * sum(p.numel() for p in network.parameters())
+
+
+def test_held_out_views_are_measured_at_a_checkpoint(
+    pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_module, "VALIDATION_VIEWS", 40)
+    lines = train(tmp_path, pool_file, replace(SETTINGS, steps=1), validate=True)
+    figures = {}
+    for line in lines[-2:]:
+        name, _, said = line.partition(" step 1 ")[2].partition(": ")
+        words = said.split()
+        figures[name] = dict(zip(words[::2], map(float, words[1::2]), strict=True))
+    assert figures.keys() == {"picture", "rgbd"}
+    for each in figures.values():
+        assert {*each} == {"depth", "scale", "covered", "normal_deg", "things", "votes_px", "table"}
+        assert all(math.isfinite(value) for value in each.values())
+        assert all(0 <= each[name] <= 1 for name in ("covered", "things", "table"))
+
+
+def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(pool_file: Path, tmp_path: Path) -> None:
+    wild = replace(SETTINGS, rate=1e30)
+    train(tmp_path, pool_file, wild, minutes=0.0)
+    kept = (tmp_path / CHECKPOINT).read_bytes()
+    with pytest.raises(ModelError, match=r"loss of step 2 is not finite: .*; the last checkpoint is kept"):
+        train(tmp_path, pool_file, wild)
+    assert (tmp_path / CHECKPOINT).read_bytes() == kept
+
+
+def test_the_rate_rises_stays_and_falls() -> None:
+    settings = replace(SETTINGS, steps=10_000)
+    rates = [compute_rate(step, settings) / settings.rate for step in range(1, 10_001)]
+    assert rates[0] < 0.01
+    assert rates[399:6_000] == [1.0] * 5_601
+    assert np.all(np.diff(rates[:399]) > 0)
+    assert np.all(np.diff(rates[6_000:]) <= 0)
+    assert 0 < rates[-1] < 0.03
+    sizes = [PictureSettings(100).sample_size(step) for step in (1, 60, 61, 100)]
+    assert sizes == [(320, 240), (320, 240), (384, 288), (384, 288)]
+
+
+def test_the_command_trains_exports_and_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = {name: SMALL[name] for name in ("width", "height", "packages", "patterns", "fresh")}
+    where = "tableverse_factory.evaluation.training.picture.checkpoint.PictureSettings"
+    monkeypatch.setattr(where, partial(PictureSettings, **small))
+    monkeypatch.setattr(train_module, "VALIDATION_VIEWS", 8)
+    options, folder = "--scenes 2 --batch 2 --views 64 --device cpu --jobs 0", tmp_path / "net"
+
+    def run(more: str) -> Result:
+        return CliRunner().invoke(app, ["train", "picture", str(folder), *options.split(), *more.split()])
+
+    answers = [run("--steps 1"), run("--steps 2")]
+    assert [answer.exit_code for answer in answers] == [0, 0], answers[0].output
+    assert "picture.onnx: " in answers[0].stdout
+    assert "1 of 1 steps" in answers[0].stdout
+    assert "2 of 2 steps" in answers[1].stdout
+    assert sorted(path.name for path in folder.iterdir()) == [
+        CHECKPOINT,
+        "meshes_2_0.npz",
+        "picture.onnx",
+        WEIGHTS,
+    ]
+    assert isinstance(run("--seed 1").exception, InputError)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("cupy") is not None, reason="cupy is installed")
+def test_a_gpu_without_its_extra_is_told_in_one_line(world: World) -> None:
+    with pytest.raises(InputError, match=r"needs cupy: pip install 'tableverse-factory\[training\]'") as told:
+        world.make_renderer(SETTINGS, "cuda")
+    assert "\n" not in str(told.value)
