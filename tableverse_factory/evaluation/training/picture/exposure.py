@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from tableverse_factory.evaluation.training.picture.stage import SceneTables
+from tableverse_factory.evaluation.training.picture.builder import SceneTables
 from tableverse_factory.evaluation.training.picture.tables import TABLE_SIDE, TABLE_TOP
 from tableverse_factory.models.local.device import Tensor, import_torch
 

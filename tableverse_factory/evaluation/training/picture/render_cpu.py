@@ -3,8 +3,8 @@
 import numpy as np
 
 from schemas.geometry import Camera, Pose, TriangleMesh
+from tableverse_factory.evaluation.training.picture.builder import SceneTables
 from tableverse_factory.evaluation.training.picture.exposure import Exposure
-from tableverse_factory.evaluation.training.picture.stage import SceneTables
 from tableverse_factory.evaluation.training.picture.tables import TABLE_SIDE, TABLE_TOP, MeshTables
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
 from tableverse_factory.models.local.device import import_torch

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.evaluation.training.picture.builder import SceneTables
 from tableverse_factory.evaluation.training.picture.exposure import Exposure
-from tableverse_factory.evaluation.training.picture.stage import SceneTables
 from tableverse_factory.evaluation.training.picture.tables import MeshTables
 from tableverse_factory.models.local.device import import_torch
 

@@ -6,9 +6,9 @@ from functools import partial
 from itertools import count
 
 from tableverse_factory.core.process_pool import parallel_stream
+from tableverse_factory.evaluation.training.picture.builder import SceneTables
 from tableverse_factory.evaluation.training.picture.exposure import Renderer, Views, develop_views
 from tableverse_factory.evaluation.training.picture.scenes import SceneMaker
-from tableverse_factory.evaluation.training.picture.stage import SceneTables
 from tableverse_factory.evaluation.training.picture.tables import VIEW
 from tableverse_factory.models.local.device import import_torch
 

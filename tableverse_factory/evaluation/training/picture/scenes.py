@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.training.picture.builder import MAX_THINGS, SceneBuilder, SceneTables, join_scenes
 from tableverse_factory.evaluation.training.picture.materials import (
     PLAIN,
     TextureBook,
@@ -13,7 +14,6 @@ from tableverse_factory.evaluation.training.picture.materials import (
     make_thing_material,
 )
 from tableverse_factory.evaluation.training.picture.patterns import pick_skin_color
-from tableverse_factory.evaluation.training.picture.stage import MAX_THINGS, SceneTables, Stage, join_scenes
 from tableverse_factory.evaluation.training.picture.surroundings import (
     add_arms,
     add_far_clutter,
@@ -64,34 +64,34 @@ class SceneMaker:
         return join_scenes([self._make_scene(rng, views) for _ in range(scenes)])
 
     def _make_scene(self, rng: np.random.Generator, views: int) -> SceneTables:
-        stage = Stage(self.tables, self.book)
+        builder = SceneBuilder(self.tables, self.book)
         if rng.random() < NO_TABLE_SHARE:
-            _furnish_without_table(rng, stage)
-            stage.views += _aim_anywhere(rng, stage, self.size, views)
-            return stage.build()
+            _furnish_without_table(rng, builder)
+            builder.views += _aim_anywhere(rng, builder, self.size, views)
+            return builder.build()
         maker = ThingMaker(self.tables, self.pool)
-        self._add_things(rng, stage, maker)
+        self._add_things(rng, builder, maker)
         azimuth = rng.integers(4) * np.pi / 2 + rng.normal(0, 0.25)
         extras = rng.random(2)
         far = rng.uniform(0.4, 1.1) if extras[0] < 0.17 else 0.0
-        add_table(rng, stage, azimuth, far)
-        add_room(rng, stage)
-        add_furniture(rng, stage)
+        add_table(rng, builder, azimuth, far)
+        add_room(rng, builder)
+        add_furniture(rng, builder)
         if far:
-            add_far_clutter(rng, stage, maker, azimuth, far)
+            add_far_clutter(rng, builder, maker, azimuth, far)
         if extras[1] < 0.1:
-            add_arms(rng, stage)
-        low, high = stage.measure_things()
-        add_light(rng, stage, (low + high) / 2)
+            add_arms(rng, builder)
+        low, high = builder.measure_things()
+        add_light(rng, builder, (low + high) / 2)
         spread = 0.5 if far else np.pi
-        stage.views += [
+        builder.views += [
             view
             for _ in range(views)
-            if (view := _aim_at_things(rng, stage, self.size, azimuth + rng.uniform(-spread, spread))) is not None
+            if (view := _aim_at_things(rng, builder, self.size, azimuth + rng.uniform(-spread, spread))) is not None
         ]
-        return stage.build()
+        return builder.build()
 
-    def _add_things(self, rng: np.random.Generator, stage: Stage, maker: ThingMaker) -> None:
+    def _add_things(self, rng: np.random.Generator, builder: SceneBuilder, maker: ThingMaker) -> None:
         kind = rng.random()
         if kind < EMPTY_SHARE:
             return
@@ -105,16 +105,16 @@ class SceneMaker:
             count = int(rng.choice(COUNTS, p=COUNT_SHARES))
             groups = [thing.list_parts() for thing in arrange_things(rng, maker, count)]
         for index, parts in enumerate(groups[:MAX_THINGS]):
-            stage.add_parts(rng, parts, index + 1)
+            builder.add_parts(rng, parts, index + 1)
 
 
-def _furnish_without_table(rng: np.random.Generator, stage: Stage) -> None:
+def _furnish_without_table(rng: np.random.Generator, builder: SceneBuilder) -> None:
     """Make a room, a landscape, or a face-like blob before a wall, where no table is."""
-    row = stage.row
+    row = builder.row
     row[2:7] = 0.0, 0.0, 0.0, 0.01, 0.01
-    row[8] = stage.add_material(make_surface_material(rng, stage.book))
+    row[8] = builder.add_material(make_surface_material(rng, builder.book))
     row[11] = -rng.uniform(0.7, 1.6)
-    add_room(rng, stage)
+    add_room(rng, builder)
     kind = rng.random()
     if kind < 0.35:  # outdoors
         row[9:11], row[12:14] = -60.0, 60.0
@@ -123,40 +123,42 @@ def _furnish_without_table(rng: np.random.Generator, stage: Stage) -> None:
         dimmed = row[25:28] * rng.uniform(0.2, 1.0, 3)
         row[28:31] = np.clip(dimmed + rng.uniform(0, 0.3) * np.array([0, 0.2, 0.6]), 0, 2)
         for slot in (15, 16):
-            material = make_surface_material(rng, stage.book)
+            material = make_surface_material(rng, builder.book)
             material[2:4] *= rng.uniform(0.05, 0.5)
-            row[slot] = stage.add_material(material)
+            row[slot] = builder.add_material(material)
     if kind < 0.7:
-        add_furniture(rng, stage, 14)
+        add_furniture(rng, builder, 14)
     else:
-        _add_portrait(rng, stage)
-    add_light(rng, stage, np.array([0.0, 0.0, float(row[11]) / 2]))
+        _add_portrait(rng, builder)
+    add_light(rng, builder, np.array([0.0, 0.0, float(row[11]) / 2]))
 
 
-def _add_portrait(rng: np.random.Generator, stage: Stage) -> None:
+def _add_portrait(rng: np.random.Generator, builder: SceneBuilder) -> None:
     """Add a few large blobs at eye level: head, shoulders, hair; skin, fur or cloth."""
-    shapes = stage.tables.find("blob", "cushion", "limb", "lathe", "box")
+    shapes = builder.tables.find("blob", "cushion", "limb", "lathe", "box")
     skin = pick_skin_color(rng)
     for index in range(int(rng.integers(2, 14))):
         mesh = shapes[int(rng.integers(len(shapes)))]
-        low, high = stage.tables.low[mesh], stage.tables.high[mesh]
-        material = make_thing_material(rng, stage.book, low, high)
+        low, high = builder.tables.low[mesh], builder.tables.high[mesh]
+        material = make_thing_material(rng, builder.book, low, high)
         if rng.random() < 0.5:
             material[6:9], material[12], material[25] = skin, PLAIN, 2.0
         size = rng.uniform(0.1, 0.5, 3) if index < 3 else rng.uniform(0.02, 0.15, 3)
         place = rng.normal(0, 0.18, 3) + np.array([0, 0, 0.1])
         turn = make_turn(0, rng.uniform(0, 6.3)) @ make_turn(1, rng.uniform(0, 6.3))
-        stage.add_mesh(mesh, turn @ np.diag(size), place, stage.add_material(material))
+        builder.add_mesh(mesh, turn @ np.diag(size), place, builder.add_material(material))
 
 
-def _aim_at_things(rng: np.random.Generator, stage: Stage, size: tuple[int, int], azimuth: float) -> np.ndarray | None:
+def _aim_at_things(
+    rng: np.random.Generator, builder: SceneBuilder, size: tuple[int, int], azimuth: float
+) -> np.ndarray | None:
     """Aim a camera at all things, or closely at one; None if no try stays within the room."""
-    low, high = stage.measure_things()
+    low, high = builder.measure_things()
     for _ in range(TRIES):
         focal = size[0] * float(np.exp(rng.uniform(*np.log(FOCAL_RANGE))))
         elevation = np.radians(rng.uniform(20, 72) if rng.random() < 0.85 else rng.uniform(10, 89))
-        close = rng.random() < CLOSE_SHARE and stage.boxes
-        box = stage.boxes[int(rng.integers(len(stage.boxes)))] if close else np.stack([low, high])
+        close = rng.random() < CLOSE_SHARE and builder.boxes
+        box = builder.boxes[int(rng.integers(len(builder.boxes)))] if close else np.stack([low, high])
         middle, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         if close:
             distance = max(0.14, focal * radius / (size[1] * rng.uniform(0.3, 0.75)))
@@ -168,16 +170,18 @@ def _aim_at_things(rng: np.random.Generator, stage: Stage, size: tuple[int, int]
         target[2] *= 0.6
         toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         eye = target + distance * np.array(toward)
-        inside = (eye > stage.row[9:12] + 0.06).all() and (eye < stage.row[12:15] - 0.06).all()
+        inside = (eye > builder.row[9:12] + 0.06).all() and (eye < builder.row[12:15] - 0.06).all()
         if 0.08 < eye[2] < 1.6 and inside:
             return _make_view(rng, eye, target, focal, size)
     return None
 
 
-def _aim_anywhere(rng: np.random.Generator, stage: Stage, size: tuple[int, int], count: int) -> list[np.ndarray]:
+def _aim_anywhere(
+    rng: np.random.Generator, builder: SceneBuilder, size: tuple[int, int], count: int
+) -> list[np.ndarray]:
     """Aim cameras from about eye level to any side."""
     views = []
-    low, high = stage.row[9:12] + 0.3, stage.row[12:15] - 0.3
+    low, high = builder.row[9:12] + 0.3, builder.row[12:15] - 0.3
     for _ in range(count):
         focal = size[0] * float(np.exp(rng.uniform(*np.log(FOCAL_RANGE))))
         angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2.5)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tableverse_factory.evaluation.training.picture.builder import SceneBuilder
 from tableverse_factory.evaluation.training.picture.materials import (
     BOXED,
     TEXTURED,
@@ -10,7 +11,6 @@ from tableverse_factory.evaluation.training.picture.materials import (
     make_thing_material,
 )
 from tableverse_factory.evaluation.training.picture.patterns import pick_color, pick_skin_color
-from tableverse_factory.evaluation.training.picture.stage import Stage
 from tableverse_factory.evaluation.training.picture.tables import LIGHT, TABLE_TOP
 from tableverse_factory.evaluation.training.picture.things import ThingMaker, make_turn
 
@@ -18,12 +18,12 @@ SLAB, DISC = 1.0, 2.0
 SHEET_M = 0.0015  # thickest cloth or sheet of paper, part of the table
 
 
-def add_table(rng: np.random.Generator, stage: Stage, azimuth: float, far_m: float) -> None:
+def add_table(rng: np.random.Generator, builder: SceneBuilder, azimuth: float, far_m: float) -> None:
     """Add a table under the things: slab, small round one or school desk, its legs, and often cloths or paper.
 
     `far_m` is how far it goes on behind the things, seen from a camera at `azimuth` [rad].
     """
-    low, high = stage.measure_things()
+    low, high = builder.measure_things()
     middle, half = (low + high)[:2] / 2, (high - low)[:2] / 2
     kind = rng.random()
     margin = rng.uniform(0.02, 0.25)
@@ -33,59 +33,59 @@ def add_table(rng: np.random.Generator, stage: Stage, azimuth: float, far_m: flo
     if far_m > 0.0:
         center = center - 0.5 * far_m * np.array([np.cos(azimuth), np.sin(azimuth)])
         size = size + 0.5 * far_m * np.abs([np.cos(azimuth), np.sin(azimuth)])
-    row = stage.row
+    row = builder.row
     row[7], row[4] = SLAB, rng.uniform(0.015, 0.07)
     if kind < 0.14 and far_m == 0.0:
         row[7], center = DISC, middle
         size = np.full(2, np.hypot(*half) + 0.02 + (rng.uniform(0, 0.12) if kind < 0.08 else rng.uniform(0, 0.5)))
     floor = rng.uniform(0.35, 0.95) if rng.random() < 0.9 else rng.uniform(0.04, 0.3)
     row[2:4], row[5:7], row[11] = center, size, -floor
-    row[8] = stage.add_material(make_surface_material(rng, stage.book, table=True))
-    _add_legs(rng, stage, floor, is_desk=kind > 0.86)
+    row[8] = builder.add_material(make_surface_material(rng, builder.book, table=True))
+    _add_legs(rng, builder, floor, is_desk=kind > 0.86)
     if rng.random() < 0.22:
-        _add_sheets(rng, stage, middle, half)
+        _add_sheets(rng, builder, middle, half)
 
 
-def _add_legs(rng: np.random.Generator, stage: Stage, floor: float, is_desk: bool) -> None:
-    row = stage.row
+def _add_legs(rng: np.random.Generator, builder: SceneBuilder, floor: float, is_desk: bool) -> None:
+    row = builder.row
     (x, y), thick, (half_x, half_y) = row[2:4], float(row[4]), row[5:7]
     clear = max(floor - thick - 0.002, 0.01)
-    material = stage.add_material(make_surface_material(rng, stage.book))
+    material = builder.add_material(make_surface_material(rng, builder.book))
     if row[7] == DISC:
         width = rng.uniform(0.03, 0.1)
-        stage.add_box((width, width, clear), (x, y, -floor), material)
+        builder.add_box((width, width, clear), (x, y, -floor), material)
         return
     if is_desk and clear > 0.2:  # a shelf under the top, open to one side
         gap = rng.uniform(0.08, 0.18)
-        stage.add_box((2 * half_x, 2 * half_y, 0.015), (x, y, -thick - gap), material)
+        builder.add_box((2 * half_x, 2 * half_y, 0.015), (x, y, -thick - gap), material)
         for side in (-1, 1):
-            stage.add_box((0.015, 2 * half_y, gap), (x + side * (half_x - 0.008), y, -thick - gap), material)
+            builder.add_box((0.015, 2 * half_y, gap), (x + side * (half_x - 0.008), y, -thick - gap), material)
     if rng.random() < 0.7 and clear > 0.2:
         width = rng.uniform(0.02, 0.08)
         for side in (-1, 1):
             for end in (-1, 1):
                 place = (x + side * (half_x - width), y + end * (half_y - width), -floor)
-                stage.add_box((width, width, clear), place, material)
+                builder.add_box((width, width, clear), place, material)
 
 
-def _add_sheets(rng: np.random.Generator, stage: Stage, middle: np.ndarray, half: np.ndarray) -> None:
+def _add_sheets(rng: np.random.Generator, builder: SceneBuilder, middle: np.ndarray, half: np.ndarray) -> None:
     """Lay cloths, place mats, paper or marker boards: they are table."""
-    box = stage.tables.find("box")[0]
+    box = builder.tables.find("box")[0]
     for _ in range(int(rng.integers(1, 4))):
         size = rng.uniform(0.1, 0.5, 2) if rng.random() < 0.6 else 2 * half * rng.uniform(0.6, 1.2, 2)
-        size = np.minimum(size, 1.7 * stage.row[5:7])
+        size = np.minimum(size, 1.7 * builder.row[5:7])
         place = middle + rng.uniform(-1, 1, 2) * half
-        row = make_surface_material(rng, stage.book)
+        row = make_surface_material(rng, builder.book)
         if rng.random() < 0.6:
-            row[0], row[1], row[12], row[31] = stage.book.pick_pattern(rng), BOXED, TEXTURED, 0.0
+            row[0], row[1], row[12], row[31] = builder.book.pick_pattern(rng), BOXED, TEXTURED, 0.0
             row[17:20], row[20:23] = 1.0, (-0.5, -0.5, 0.0)
         map_ = make_turn(2, rng.uniform(0, 2 * np.pi)) @ np.diag([*size, rng.uniform(0.0003, SHEET_M)])
-        stage.add_mesh(box, map_, np.array([*place, 0.0]), stage.add_material(row), TABLE_TOP)
+        builder.add_mesh(box, map_, np.array([*place, 0.0]), builder.add_material(row), TABLE_TOP)
 
 
-def add_room(rng: np.random.Generator, stage: Stage) -> None:
+def add_room(rng: np.random.Generator, builder: SceneBuilder) -> None:
     """Add floor, walls and ceiling about the table, sometimes with a wall close to it."""
-    row = stage.row
+    row = builder.row
     (x, y), (half_x, half_y) = row[2:4], row[5:7]
     reach = rng.uniform(0.9, 3.5, 4)
     if rng.random() < 0.4:
@@ -93,28 +93,28 @@ def add_room(rng: np.random.Generator, stage: Stage) -> None:
     row[9:11] = x - half_x - reach[0], y - half_y - reach[1]
     row[12:15] = x + half_x + reach[2], y + half_y + reach[3], rng.uniform(1.4, 2.7)
     for slot in (15, 16, 17, 18):
-        row[slot] = stage.add_material(make_surface_material(rng, stage.book))
+        row[slot] = builder.add_material(make_surface_material(rng, builder.book))
     if rng.random() < 0.6:
         row[18] = row[16]
     if rng.random() < 0.35:
-        _add_carpet(rng, stage)
+        _add_carpet(rng, builder)
 
 
-def _add_carpet(rng: np.random.Generator, stage: Stage) -> None:
+def _add_carpet(rng: np.random.Generator, builder: SceneBuilder) -> None:
     row = make_plain(pick_color(rng))
-    row[16], row[0], row[1], row[12] = stage.book.count, stage.book.pick_pattern(rng), BOXED, TEXTURED
+    row[16], row[0], row[1], row[12] = builder.book.count, builder.book.pick_pattern(rng), BOXED, TEXTURED
     row[17:20], row[20:23] = 1.0, (-0.5, -0.5, 0.0)
     repeats = int(rng.integers(1, 4))
     row[17:19] = 1.0 / repeats
     size = (*rng.uniform(1.0, 3.2, 2), 0.008)
-    place = stage.row[2:4] + rng.normal(0, 0.4, 2)
-    stage.add_box(size, (*place, float(stage.row[11])), stage.add_material(row), rng.uniform(0, 2 * np.pi))
+    place = builder.row[2:4] + rng.normal(0, 0.4, 2)
+    builder.add_box(size, (*place, float(builder.row[11])), builder.add_material(row), rng.uniform(0, 2 * np.pi))
 
 
-def add_furniture(rng: np.random.Generator, stage: Stage, most: int = 9) -> None:
+def add_furniture(rng: np.random.Generator, builder: SceneBuilder, most: int = 9) -> None:
     """Put boxes, shapes and chairs on the floor beside the table."""
-    row = stage.row
-    shapes = stage.tables.find("cushion", "blob", "lathe", "prism", "limb")
+    row = builder.row
+    shapes = builder.tables.find("cushion", "blob", "lathe", "prism", "limb")
     for _ in range(int(rng.integers(0, most))):
         size = np.exp(rng.uniform(np.log(0.1), np.log(0.9), 3)) * [1, 1, 1.3]
         places = rng.uniform(row[9:11], row[12:14], (8, 2))
@@ -123,20 +123,20 @@ def add_furniture(rng: np.random.Generator, stage: Stage, most: int = 9) -> None
             continue
         place = np.array([*places[beside.argmax()], row[11]])
         kind, yaw = rng.random(), rng.uniform(0, 2 * np.pi)
-        mesh = stage.tables.find("box")[0] if kind < 0.45 else shapes[int(rng.integers(len(shapes)))]
-        low, high = stage.tables.low[mesh], stage.tables.high[mesh]
-        material = stage.add_material(make_thing_material(rng, stage.book, low, high))
+        mesh = builder.tables.find("box")[0] if kind < 0.45 else shapes[int(rng.integers(len(shapes)))]
+        low, high = builder.tables.low[mesh], builder.tables.high[mesh]
+        material = builder.add_material(make_thing_material(rng, builder.book, low, high))
         if kind < 0.8:
-            stage.add_mesh(mesh, make_turn(2, yaw) @ np.diag(size), place, material)
+            builder.add_mesh(mesh, make_turn(2, yaw) @ np.diag(size), place, material)
         else:
-            _add_chair(stage, place, yaw, material)
+            _add_chair(builder, place, yaw, material)
 
 
-def _add_chair(stage: Stage, place: np.ndarray, yaw: float, material: int) -> None:
+def _add_chair(builder: SceneBuilder, place: np.ndarray, yaw: float, material: int) -> None:
     turn = make_turn(2, yaw)
 
     def put(size: tuple[float, float, float], offset: tuple[float, float, float]) -> None:
-        stage.add_box(size, place + turn @ np.array(offset), material, yaw)
+        builder.add_box(size, place + turn @ np.array(offset), material, yaw)
 
     put((0.42, 0.42, 0.05), (0, 0, 0.42))
     put((0.05, 0.42, 0.5), (0.2, 0, 0.45))
@@ -145,30 +145,32 @@ def _add_chair(stage: Stage, place: np.ndarray, yaw: float, material: int) -> No
             put((0.03, 0.03, 0.42), (x, y, 0))
 
 
-def add_far_clutter(rng: np.random.Generator, stage: Stage, maker: ThingMaker, azimuth: float, far_m: float) -> None:
+def add_far_clutter(
+    rng: np.random.Generator, builder: SceneBuilder, maker: ThingMaker, azimuth: float, far_m: float
+) -> None:
     """Put screens, piles and boxes at the table's far end: nobody asks for these, they are no things."""
-    low, high = stage.measure_things()
+    low, high = builder.measure_things()
     middle, toward = (low + high)[:2] / 2, np.array([np.cos(azimuth), np.sin(azimuth)])
     reach = float(np.abs(toward) @ (high - low)[:2] / 2)
     across = np.array([-toward[1], toward[0]])
     for _ in range(int(rng.integers(1, 8))):
-        aside = rng.uniform(-0.9, 0.9) * float(np.abs(across) @ stage.row[5:7])
+        aside = rng.uniform(-0.9, 0.9) * float(np.abs(across) @ builder.row[5:7])
         place = middle - toward * (reach + rng.uniform(0.28, max(0.3, far_m))) + across * aside
         thing, grow = maker.make(rng), rng.uniform(0.9, 2.4)
         turn = make_turn(2, rng.uniform(0, 2 * np.pi)) * grow
         for part in thing.parts:
-            bounds = stage.tables.low[part.mesh], stage.tables.high[part.mesh]
-            material = stage.add_material(make_thing_material(rng, stage.book, *bounds))
+            bounds = builder.tables.low[part.mesh], builder.tables.high[part.mesh]
+            material = builder.add_material(make_thing_material(rng, builder.book, *bounds))
             offset = turn @ part.offset + [*place, 0.0]
-            stage.add_mesh(part.mesh, turn @ part.map_, offset, material)
+            builder.add_mesh(part.mesh, turn @ part.map_, offset, material)
 
 
-def add_arms(rng: np.random.Generator, stage: Stage) -> None:
+def add_arms(rng: np.random.Generator, builder: SceneBuilder) -> None:
     """Reach one or two arms over the table: sleeve, forearm, hand and fingers."""
-    low, high = stage.measure_things()
+    low, high = builder.measure_things()
     skin = make_plain(pick_skin_color(rng))
-    hand = stage.add_material(skin)
-    sleeve = stage.add_material(make_surface_material(rng, stage.book) if rng.random() < 0.7 else skin)
+    hand = builder.add_material(skin)
+    sleeve = builder.add_material(make_surface_material(rng, builder.book) if rng.random() < 0.7 else skin)
     for _ in range(int(rng.integers(1, 3))):
         angle = rng.uniform(0, 2 * np.pi)
         out = np.array([np.cos(angle), np.sin(angle)])
@@ -178,18 +180,18 @@ def add_arms(rng: np.random.Generator, stage: Stage) -> None:
         elbow = wrist + np.array([*(out * rng.uniform(0.2, 0.3)), rng.uniform(0.0, 0.15)])
         shoulder = elbow + np.array([*(out * rng.uniform(0.15, 0.35)), rng.uniform(0.1, 0.4)])
         thick = rng.uniform(0.025, 0.04)
-        stage.add_limb(palm, wrist, thick * 1.1, hand)
-        stage.add_limb(wrist, elbow, thick * 1.2, hand if rng.random() < 0.4 else sleeve)
-        stage.add_limb(elbow, shoulder, thick * 1.6, sleeve)
+        builder.add_limb(palm, wrist, thick * 1.1, hand)
+        builder.add_limb(wrist, elbow, thick * 1.2, hand if rng.random() < 0.4 else sleeve)
+        builder.add_limb(elbow, shoulder, thick * 1.6, sleeve)
         for spread in np.linspace(-0.5, 0.5, int(rng.integers(3, 6))):
             turn = make_turn(2, spread)[:2, :2] @ -out
             tip = palm + np.array([*(turn * rng.uniform(0.04, 0.09)), rng.uniform(-0.04, 0.01)])
-            stage.add_limb(palm + np.array([*(turn * 0.02), 0.0]), tip, rng.uniform(0.007, 0.011), hand)
+            builder.add_limb(palm + np.array([*(turn * 0.02), 0.0]), tip, rng.uniform(0.007, 0.011), hand)
 
 
-def add_light(rng: np.random.Generator, stage: Stage, middle: np.ndarray) -> None:
+def add_light(rng: np.random.Generator, builder: SceneBuilder, middle: np.ndarray) -> None:
     """Add one to four ceiling panels, windows and lamps, and an ambient term."""
-    row = stage.row
+    row = builder.row
     tone = 1 + rng.normal(0, 0.06, 3)
     row[21:24] = rng.uniform(0.08, 0.55) * tone * (1 + rng.normal(0, 0.05, 3))
     count = int(rng.choice([1, 2, 3, 4], p=[0.35, 0.3, 0.2, 0.15]))
@@ -204,7 +206,7 @@ def add_light(rng: np.random.Generator, stage: Stage, middle: np.ndarray) -> Non
         light = np.zeros(LIGHT, dtype=np.float32)
         light[:3], light[3:6], light[6:9] = place, u, v
         light[9:12] = np.clip(1 + rng.normal() * np.array([0.12, 0, -0.14]), 0.4, 1.6) * share / gain
-        stage.lights.append(light)
+        builder.lights.append(light)
 
 
 def _place_light(

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.training.picture.builder import SceneTables
 from tableverse_factory.evaluation.training.picture.materials import TextureBook
 from tableverse_factory.evaluation.training.picture.patterns import BLOCKS, FACES, draw_block, make_textures
 from tableverse_factory.evaluation.training.picture.pool import MeshPool, make_pool
 from tableverse_factory.evaluation.training.picture.scenes import SceneMaker
 from tableverse_factory.evaluation.training.picture.shapes import make_shapes
-from tableverse_factory.evaluation.training.picture.stage import SceneTables
 from tableverse_factory.evaluation.training.picture.tables import (
     LEAF,
     MAX_TRIANGLES,

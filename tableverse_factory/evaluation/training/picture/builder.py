@@ -33,7 +33,7 @@ class SceneTables(Frozen):
     views: Float32[np.ndarray, "v 20"]
 
 
-class Stage:
+class SceneBuilder:
     """Collects instances, materials, lights and views of one scene in the table's frame, z up [m]."""
 
     def __init__(self, tables: MeshTables, book: TextureBook) -> None:
