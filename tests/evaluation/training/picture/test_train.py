@@ -1,6 +1,7 @@
 """Training of the network of pictures: the same weights again, also in parts; files of other trainings are refused."""
 
 import importlib.util
+import json
 import math
 from dataclasses import replace
 from functools import partial
@@ -16,6 +17,7 @@ from tableverse_factory.core.errors import InputError, ModelError
 from tests.evaluation.training.picture.conftest import SMALL
 
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
+from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
 
 from tableverse_factory.evaluation.training.picture import train as train_module  # noqa: E402
@@ -54,6 +56,8 @@ def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(pool_fil
     for _ in range(3):  # no minutes: one step, and a checkpoint
         train(tmp_path / "parts", pool_file, minutes=0.0)
     assert_same(tmp_path / "whole", tmp_path / "parts")
+    with safe_open(tmp_path / "whole" / CHECKPOINT, "pt") as file:
+        assert json.loads(file.metadata()["position"])["made"] > SETTINGS.capacity, "some views were replaced"
     before = (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns
     train(tmp_path / "parts", pool_file)
     assert (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns == before, "nothing is left to do"
