@@ -23,7 +23,29 @@ def _check_variable_name(name: str) -> str:
 MODEL_LOAD_S = 1200.0  # wall time in which a model downloads and loads its weights, and its process starts [s]
 MAX_SLOW_MESHES = 30  # objects of a scene that may each take the whole `place.mesh_timeout_s`; most take much less
 
+# What a detector with a vocabulary is asked for, besides the table and people
+VOCABULARY = (
+    *("cup", "mug", "glass", "bottle", "can", "jar", "bowl", "plate", "tray", "basket", "box", "carton", "bag", "tin"),
+    *("pot", "pan", "kettle", "teapot", "cutting board", "knife", "fork", "spoon", "chopsticks", "spatula", "napkin"),
+    *("fruit", "vegetable", "bread", "cake", "book", "notebook", "paper", "pen", "scissors", "tape", "stapler"),
+    *("phone", "laptop", "keyboard", "computer mouse", "remote control", "headphones", "lamp", "clock", "camera"),
+    *("toy", "ball", "vase", "plant", "candle", "glasses", "wallet", "keys", "tool", "screwdriver", "hammer", "drill"),
+)
+MAX_VOCABULARY = 200
+
+
+def _check_vocabulary(labels: tuple[str, ...]) -> tuple[str, ...]:
+    twice = sorted({label for label in labels if labels.count(label) > 1})
+    if twice:
+        raise ValueError(f"{twice[0]!r} stands twice")
+    return labels
+
+
 KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_check_variable_name)]
+VocabularyLabel = Annotated[str, Field(max_length=60, pattern=r"^[a-z0-9]+([ '-][a-z0-9]+)*$")]
+Vocabulary = Annotated[
+    tuple[VocabularyLabel, ...], Field(min_length=1, max_length=MAX_VOCABULARY), AfterValidator(_check_vocabulary)
+]
 Weights = Annotated[str, Field(max_length=4096), AfterValidator(os.path.expanduser)]
 ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
 
@@ -138,18 +160,27 @@ class ObserveConfig(StageSection):
 class PerceiveConfig(RemoteModelSection):
     """Detector, segmenter and limits on objects."""
 
-    detector: Literal["auto", "geometric", "picture", "learned", "replay", "openai", "gemini"] = "auto"
+    detector: Literal["auto", "geometric", "picture", "learned", "replay", "grounding_dino", "openai", "gemini"] = "auto"
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `geometric`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `learned` is a net of
-    `tableverse train segmenter`, `openai` any server of OpenAI's chat completions, `gemini` Google's own protocol.
+    `tableverse train segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of
+    OpenAI's chat completions, `gemini` Google's own protocol.
     """
     detector_weights: Weights = ""
-    """The `.onnx` file of `learned`, or of `picture`, whose own is in the package."""
+    """The `.onnx` file of `learned`, or of `picture`, whose own is in the package; of `grounding_dino` a folder, or
+    `owner/name` or `owner/name@revision` on the Hub, empty for the published ones.
+    """
+    vocabulary: Vocabulary = VOCABULARY
+    """What `grounding_dino` looks for: English nouns in lower case. The table and people are found besides."""
+    detector_score: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
+    """Least score of a box of `grounding_dino`."""
+    detector_overlap: Annotated[float, Field(gt=0.0, le=1.0)] = 0.7
+    """Of two boxes of `grounding_dino` with a larger intersection over union, the one with the higher score stays."""
     box_order: Literal["auto", "xyxy", "yxyx"] = "auto"
     """Coordinate order of the model's boxes; `auto` is yxyx for `gemini`, else xyxy."""
     segmenter: Literal["geometric", "picture", "sam2", "sam3"] = "geometric"
-    """Converts boxes to masks, for detectors that give boxes: `replay` without `masks.png`, `openai`, `gemini`. Our own
-    from depth, our net of bare pictures, or a model with weights.
+    """Converts boxes to masks, for detectors that give boxes: `replay` without `masks.png`, `grounding_dino`, `openai`,
+    `gemini`. Our own from depth, our net of bare pictures, or a model with weights.
     """
     segmenter_weights: Weights = ""
     """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; empty for the published ones."""
@@ -167,7 +198,8 @@ class PerceiveConfig(RemoteModelSection):
 
     @property
     def _extra_s(self) -> float:
-        return 0.0 if self.segmenter in ("geometric", "picture") else MODEL_LOAD_S
+        loads = (self.segmenter not in ("geometric", "picture")) + (self.detector == "grounding_dino")
+        return MODEL_LOAD_S * loads
 
     @model_validator(mode="after")
     def _check_required_keys(self) -> "PerceiveConfig":
@@ -181,7 +213,7 @@ class PerceiveConfig(RemoteModelSection):
             raise ValueError(
                 f"the detector {self.detector!r} gives masks, not boxes{where}, so perceive.segmenter "
                 f"{self.segmenter!r} would do nothing: set perceive.detector to 'replay' (the boxes of "
-                "detections.json), 'openai' or 'gemini', or leave the segmenter 'geometric'"
+                "detections.json), 'grounding_dino', 'openai' or 'gemini', or leave the segmenter 'geometric'"
             )
         return self
 

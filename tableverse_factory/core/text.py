@@ -1,10 +1,15 @@
 """Text of messages: untrusted text as one bounded line without control characters, plurals, errors of libraries."""
 
 import json
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
+
+_TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
+_QUERY = re.compile(r"\?[^\s\"'<>)]*")
+_USER = re.compile(r"(?<=://)[^/\s@]*@")
 
 
 def sanitize_line(text: str, limit: int = 200) -> str:
@@ -12,6 +17,12 @@ def sanitize_line(text: str, limit: int = 200) -> str:
     shown = text[: limit + 1]
     shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in shown)
     return shown if len(shown) <= limit else shown[: limit - 1] + "…"
+
+
+def redact_secrets(text: str) -> str:
+    """Reduce a text to one short line without tokens, users in addresses, and queries, which may be signatures."""
+    plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
+    return sanitize_line(plain, 300)
 
 
 def pluralize(number: int, noun: str) -> str:

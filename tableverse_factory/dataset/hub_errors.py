@@ -1,16 +1,12 @@
 """Errors of the Hugging Face Hub as one line that says what to do and holds no token and no signed address."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tableverse_factory.core.errors import StoreError
 from tableverse_factory.core.retry import parse_retry_after
-from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.text import redact_secrets
 
-_TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
-_QUERY = re.compile(r"\?[^\s\"'<>)]*")
-_USER = re.compile(r"(?<=://)[^/\s@]*@")
 _GO_ON = "What was uploaded stays: run the same command again"
 
 _CHANGED = 412
@@ -71,9 +67,3 @@ def get_retry_after(error: BaseException) -> float | None:
     """Get the wait that the Hub asks for [s]; None if it asks for none."""
     response = getattr(unwrap_error(error), "response", None)
     return None if response is None else parse_retry_after(response.headers.get("retry-after"))
-
-
-def redact_secrets(text: str) -> str:
-    """Reduce a text to one short line without tokens, users in addresses, and queries, which may be signatures."""
-    plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
-    return sanitize_line(plain, 300)

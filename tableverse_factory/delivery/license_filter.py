@@ -155,10 +155,10 @@ def redact_config(config: Mapping[str, Any]) -> dict[str, Any]:
     The robot's file, local weights and programs keep their last name; weights of the hub stay as they are. A redacted
     configuration stays unchanged.
     """
-    return {key: _redact_value(key, value) for key, value in config.items()}
+    return {key: _redact_value(key, value, config) for key, value in config.items()}
 
 
-def _redact_value(key: str, value: Any) -> Any:
+def _redact_value(key: str, value: Any, section: Mapping[str, Any]) -> Any:
     if isinstance(value, Mapping):
         return redact_config(value)
     if key.endswith(_PRIVATE_SUFFIXES):
@@ -166,7 +166,8 @@ def _redact_value(key: str, value: Any) -> Any:
     if key.endswith("_command"):
         return [_redact_program(str(word)) if place == 0 else _REDACTED for place, word in enumerate(value)]
     if key.endswith("_weights"):
-        on_hub = key != "detector_weights" and parse_hub_name(str(value)) is not None
+        is_file = key == "detector_weights" and section.get("detector") == "learned"
+        on_hub = not is_file and parse_hub_name(str(value)) is not None
         return value if on_hub else _strip_folders(str(value))
     return redact_uri(str(value)) if key == "robot" else value
 

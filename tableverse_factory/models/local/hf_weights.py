@@ -8,22 +8,14 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelAccessError
 from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.core.text import redact_secrets
 from tableverse_factory.core.timeouts import call_with_timeout
+from tableverse_factory.models.local.catalogue import BY_REPOSITORY
 
-# Default weights by backend.
-DEFAULT_WEIGHTS = {
-    "sam2": "facebook/sam2.1-hiera-large",
-    "sam3": "facebook/sam3",
-    "depth_anything_2": "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf",
-    "depth_anything_3": "depth-anything/DA3METRIC-LARGE",
-    "depth_anything_3_nested": "depth-anything/DA3NESTED-GIANT-LARGE-1.1",
-    "moge_2": "Ruicheng/moge-2-vitl",
-}
 HUB_TIMEOUT_S = 60.0  # limit for the hub to resolve a revision [s]
 
 _NAME = re.compile(r"(?P<name>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_MAX_WORDS = 300
 _UNREACHABLE = {
     *("LocalEntryNotFoundError", "OfflineModeIsEnabled", "RevisionResolutionError", "ConnectError"),
     *("ConnectTimeout", "ReadTimeout", "TimeoutError", "ConnectionError"),
@@ -109,6 +101,19 @@ def pin_commit(weights: str, key: str) -> str:
 
 def describe_load_error(error: BaseException, weights: str, key: str) -> str:
     """Describe in one line why weights cannot be loaded, and what to do."""
+    name, _, revision = weights.partition("@")
+    if refusal := describe_refusal(error, weights, key):
+        return refusal
+    if {type(cause).__name__ for cause in _list_causes(error)} & _UNREACHABLE:
+        return (
+            f"{key} = {weights!r} is not on this machine and the hub cannot be reached: fetch it once with a network "
+            f"(`{_suggest_fetch(name, revision)}`), or name a folder that holds it"
+        )
+    return f"{key} = {weights!r} cannot be loaded: {shorten_error(error)}"
+
+
+def describe_refusal(error: BaseException, weights: str, key: str) -> str:
+    """Describe why the hub refuses weights, and what to do; empty if it does not."""
     causes = {type(cause).__name__ for cause in _list_causes(error)}
     head = f"{key} = {weights!r}"
     name, _, revision = weights.partition("@")
@@ -121,19 +126,19 @@ def describe_load_error(error: BaseException, weights: str, key: str) -> str:
     if "RepositoryNotFoundError" in causes or "not a valid model identifier" in str(error):
         shown = "the hub knows no such model, or shows it only to a token (HF_TOKEN)"
         return f"{head}: {shown}; a folder here is written './{name}'"
-    if causes & _UNREACHABLE:
-        at = f" --revision {revision}" if revision else ""
-        return (
-            f"{head} is not on this machine and the hub cannot be reached: fetch it once with a network "
-            f"(`hf download {name}{at}`), or name a folder that holds it"
-        )
-    return f"{head} cannot be loaded: {shorten_error(error)}"
+    return ""
 
 
 def shorten_error(error: BaseException) -> str:
     """Return the type and the start of the message of an error."""
-    words = " ".join(str(error).split())
-    return f"{type(error).__name__}: {words[:_MAX_WORDS]}"
+    return f"{type(error).__name__}: {redact_secrets(str(error))}"
+
+
+def _suggest_fetch(name: str, revision: str) -> str:
+    listed = BY_REPOSITORY.get(name)
+    if listed is not None and listed.files and revision == listed.revision:
+        return f"tableverse models fetch {listed.name}"
+    return f"hf download {name}" + (f" --revision {revision}" if revision else "")
 
 
 def _list_causes(error: BaseException | None) -> list[BaseException]:

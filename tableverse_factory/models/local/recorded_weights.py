@@ -6,11 +6,16 @@ from typing import Any
 
 from schemas.config import Config
 from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.models.local.catalogue import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.fingerprint import DISTRIBUTED_BY, identify_model, identify_onnx_model
-from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS, pin_commit, resolve_hub_name
+from tableverse_factory.models.local.hf_weights import pin_commit, resolve_hub_name
 
 # Section and key of the configuration that name weights of the Hub, by the part of run.json that records them.
-_KEYS = {"depth": ("observe", "depth_weights"), "segmenter": ("perceive", "segmenter_weights")}
+_KEYS = {
+    "depth": ("observe", "depth_weights"),
+    "detector": ("perceive", "detector_weights"),
+    "segmenter": ("perceive", "segmenter_weights"),
+}
 
 
 def record_weights(part: str, backend: str, config: Config, before: Mapping[str, Any]) -> dict[str, Any]:

@@ -51,12 +51,7 @@ def load_pretrained(
         ModelAccessError: without transformers or weights, or with weights of another model.
     """
     import_torch()
-    try:
-        transformers: Any = import_extra("transformers", f"{key} = {weights!r}", "models")
-    except InputError as error:
-        raise ModelAccessError(str(error)) from None
-    transformers.utils.logging.set_verbosity_error()
-    transformers.utils.logging.disable_progress_bar()
+    transformers = _import_transformers(weights, key)
     kind = getattr(transformers, architecture)
     name, at = resolve_source(weights, key)
     try:
@@ -74,6 +69,46 @@ def load_pretrained(
         what = f"{len(missing)} of its weights are not there" if missing else f"it describes a {described!r}"
         raise ModelAccessError(f"{key} = {weights!r} holds no {architecture}: {what}; name weights of that model")
     return move_to_device(model, device, exact)
+
+
+def load_tokenizer(weights: str, key: str, numbers: Mapping[str, int]) -> Any:
+    """Load the tokenizer beside the weights of a model, as `load_pretrained` does; without code from the hub.
+
+    `numbers` holds tokens with their numbers: without its files transformers makes a tokenizer that knows no words.
+
+    Raises:
+        ModelAccessError: without transformers, or a tokenizer with these numbers.
+    """
+    transformers = _import_transformers(weights, key)
+    name, at = resolve_source(weights, key)
+
+    def load(*, local_only: bool) -> Any:
+        found = transformers.AutoTokenizer.from_pretrained(
+            name, **at, trust_remote_code=False, local_files_only=local_only
+        )
+        if found.convert_tokens_to_ids([*numbers]) != [*numbers.values()]:
+            raise ValueError(f"it has no tokens {', '.join(numbers)} of these numbers")
+        return found
+
+    try:
+        return load(local_only=True)
+    except _UNREADABLE as error:
+        if Path(name).exists():
+            raise ModelAccessError(f"{key} = {weights!r} holds no tokenizer: {shorten_error(error)}") from error
+    try:
+        return load(local_only=False)
+    except _UNREADABLE as error:
+        raise ModelAccessError(describe_load_error(error, weights, key)) from error
+
+
+def _import_transformers(weights: str, key: str) -> Any:
+    try:
+        transformers: Any = import_extra("transformers", f"{key} = {weights!r}", "models")
+    except InputError as error:
+        raise ModelAccessError(str(error)) from None
+    transformers.utils.logging.set_verbosity_error()
+    transformers.utils.logging.disable_progress_bar()
+    return transformers
 
 
 def move_to_device(model: Any, device: Device, exact: Collection[str] = ()) -> Any:

@@ -42,7 +42,7 @@ def perceive(
     view = find_scaled_table(item, rng, find_table_top(item, config.perceive) if name == "picture" else None)
     if isinstance(view, Dropped):
         return view
-    found = DETECTORS[name](view, config.perceive, services)
+    found = DETECTORS[name](view, config, services)
     if isinstance(found, Dropped):
         return found
     if found.table_box is not None:

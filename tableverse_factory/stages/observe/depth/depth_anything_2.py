@@ -11,8 +11,8 @@ from schemas.geometry import Picture
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.batches import run_in_batches
+from tableverse_factory.models.local.catalogue import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.device import Device, import_torch, select_device
-from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.pixels import IMAGENET, compute_pixel_values, upload_image
 from tableverse_factory.models.local.weights import load_once, load_pretrained
 from tableverse_factory.sources.capture import Capture

@@ -14,8 +14,9 @@ from schemas.config import Config
 from schemas.geometry import Picture
 from schemas.manifest import ImageRow
 from tableverse_factory.models.local.batches import run_in_batches
+from tableverse_factory.models.local.catalogue import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.device import import_torch, select_device
-from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS, resolve_source
+from tableverse_factory.models.local.hf_weights import resolve_source
 from tableverse_factory.models.local.weights import load_foreign, load_once
 from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, build_capture, parse_intrinsics

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from schemas.config import Config, PerceiveConfig
+from schemas.config import Config
 from schemas.detection import DetectionRecord
 from schemas.geometry import Frozen, IdImage, Mask
 from schemas.outcome import Dropped
@@ -40,7 +40,7 @@ class DetectionResult(Frozen):
 class Detector(Protocol):
     """Finds the objects on the table."""
 
-    def __call__(self, view: TableView, config: PerceiveConfig, services: Services, /) -> DetectionResult | Dropped:
+    def __call__(self, view: TableView, config: Config, services: Services, /) -> DetectionResult | Dropped:
         """Detect the objects, or tell why the picture is unusable."""
         ...
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-from schemas.config import PerceiveConfig
+from schemas.config import Config
 from schemas.detection import Box, Detections
 from schemas.geometry import IdImage
 from schemas.outcome import Dropped
@@ -15,7 +15,7 @@ from tableverse_factory.stages.perceive.base.table_view import TableView
 TABLE_LABELS = ("table", "desk", "countertop", "work surface")
 
 
-def replay_detections(view: TableView, _config: PerceiveConfig, _services: Services) -> DetectionResult | Dropped:
+def replay_detections(view: TableView, _config: Config, _services: Services) -> DetectionResult | Dropped:
     """Return the recorded detections; with `masks.png` their masks, else boxes only."""
     recorded, ids = view.observation.recorded_detections, view.observation.recorded_ids
     if recorded is None:

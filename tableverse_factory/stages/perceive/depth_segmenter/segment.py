@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import ndimage
 
-from schemas.config import Config, PerceiveConfig
+from schemas.config import Config
 from schemas.geometry import IdImage
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.box_overlap import compute_area
@@ -39,7 +39,7 @@ MOSTLY_INSIDE = 0.6
 MAX_HOLE_PX = 60
 
 
-def detect_from_depth(view: TableView, _config: PerceiveConfig, _services: Services) -> DetectionResult:
+def detect_from_depth(view: TableView, _config: Config, _services: Services) -> DetectionResult:
     """Detect every region of `segment_depth` as an unnamed candidate, the largest in the picture first."""
     return to_detections(*segment_depth(view))
 

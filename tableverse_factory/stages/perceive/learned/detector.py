@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from schemas.config import PerceiveConfig
+from schemas.config import Config
 from schemas.geometry import IdImage, Mask, Points
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
@@ -37,9 +37,9 @@ REACH_M = 0.02
 LEAST_HEIGHT_M = 0.003
 
 
-def detect_with_network(view: TableView, config: PerceiveConfig, _services: Services) -> DetectionResult:
+def detect_with_network(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect every object that the network's votes agree on as an unnamed candidate, the largest first."""
-    return to_detections(*segment_with_network(view, load_net(config.detector_weights)))
+    return to_detections(*segment_with_network(view, load_net(config.perceive.detector_weights)))
 
 
 def segment_with_network(view: TableView, net: SegmentationNet) -> tuple[IdImage, dict[int, int]]:

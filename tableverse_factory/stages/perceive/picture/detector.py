@@ -26,9 +26,9 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import (
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
 
 
-def detect_in_picture(view: TableView, config: PerceiveConfig, _services: Services) -> DetectionResult:
+def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
-    found = predict_observation(view.observation, config)
+    found = predict_observation(view.observation, config.perceive)
     regions = keep_objects(keep_regions_over_table(segment_prediction(found, view.valid.shape), view), view)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))

@@ -8,9 +8,9 @@ import numpy as np
 
 from schemas.geometry import IdImage
 from tableverse_factory.models.local.batches import run_in_batches
+from tableverse_factory.models.local.catalogue import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.cuda_graph import CudaGraphRunner
 from tableverse_factory.models.local.device import Device, Tensor, import_torch
-from tableverse_factory.models.local.hf_weights import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.pixels import HALF, IMAGENET, Normalization, compute_pixel_values, upload_image
 from tableverse_factory.models.local.weights import load_pretrained
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, clip_boxes, compute_id_image

@@ -5,7 +5,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from schemas.config import PerceiveConfig
+from schemas.config import Config, PerceiveConfig
 from schemas.curation import AnswerOrigin
 from schemas.detection import DetectionRecord
 from schemas.geometry import Picture
@@ -32,20 +32,20 @@ MIN_SIDE_PX, MAX_SIDE_PX = 1280, 1536
 _JPEG_QUALITY = 92
 
 
-def detect_with_vlm(view: TableView, config: PerceiveConfig, services: Services) -> DetectionResult | Dropped:
+def detect_with_vlm(view: TableView, config: Config, services: Services) -> DetectionResult | Dropped:
     """Detect boxes with the model, by the rules of the paper's appendix A.
 
     Drops: `detector_answer_invalid` (no usable answer, also after a round of repair), `detector_answer_refused` (the
     model refuses this picture), `no_table_detected`.
     """
     try:
-        record = request_detections(view.observation.color, config, services)
+        record = request_detections(view.observation.color, config.perceive, services)
     except AnswerInvalidError as error:
         return Dropped(NO_TABLE if error.reason == NO_TABLE else f"detector_{error.reason}", str(error))
     found = to_detection_result(record.answer, None, view.valid.shape)
     if found.table_box is None:
         lost = [remark.detail for remark in record.remarks if remark.rule == "behind_person"]
-        return Dropped(NO_TABLE, f"{config.model} sees no table-top" + (f": {lost[-1]}" if lost else ""))
+        return Dropped(NO_TABLE, f"{config.perceive.model} sees no table-top" + (f": {lost[-1]}" if lost else ""))
     return DetectionResult(found.candidates, found.table_box, record)
 
 

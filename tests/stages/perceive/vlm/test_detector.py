@@ -289,7 +289,7 @@ def test_what_ends_a_scene_and_what_ends_a_build(server, tmp_path, capture, monk
     def perceived(*said, **options):
         server.say(*said)
         services = Services(tmp_path / str(len(paid)))
-        return detect_with_vlm(view, configured(server, **options).perceive, services)
+        return detect_with_vlm(view, configured(server, **options), services)
 
     paid = []
     for said, reason in (
