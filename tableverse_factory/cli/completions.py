@@ -55,5 +55,12 @@ def complete_textures(context: Context, incomplete: str) -> list[str]:  # noqa: 
     return _filter_prefix((f"{family}-" for family in FAMILIES), incomplete)
 
 
+def complete_models(context: Context, incomplete: str) -> list[str]:  # noqa: ARG001 as above
+    """List the names of the models."""
+    from tableverse_factory.models.local.catalogue import CATALOGUE
+
+    return _filter_prefix((model.name for model in CATALOGUE), incomplete)
+
+
 def _filter_prefix(words: Iterable[str], incomplete: str) -> list[str]:
     return [word for word in words if word.startswith(incomplete)][:MAX_WORDS]

@@ -18,6 +18,7 @@ from tableverse_factory.cli.extract import extract
 from tableverse_factory.cli.failures import failures
 from tableverse_factory.cli.init import init
 from tableverse_factory.cli.manifest import manifest
+from tableverse_factory.cli.models import models
 from tableverse_factory.cli.publish import publish
 from tableverse_factory.cli.query import query
 from tableverse_factory.cli.report import report
@@ -58,6 +59,7 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
         "build": build,
         "trajectories": trajectories,
         "textures": textures,
+        "models": models,
         "train": train,
     },
     "Run: follow it, plan it, mend it": {

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
 _QUERY = re.compile(r"\?[^\s\"'<>)]*")
-_USER = re.compile(r"(?<=://)[^/\s@]*@")
+_HOST = re.compile(r"(?<=://)[^/\s\"'<>)?]*")
 
 
 def sanitize_line(text: str, limit: int = 200) -> str:
@@ -20,8 +20,8 @@ def sanitize_line(text: str, limit: int = 200) -> str:
 
 
 def redact_secrets(text: str) -> str:
-    """Reduce a text to one short line without tokens, users in addresses, and queries, which may be signatures."""
-    plain = _QUERY.sub("", _TOKEN.sub("…", _USER.sub("", " ".join(text.split()))))
+    """Reduce a text to one short line without tokens, hosts, users, and queries of addresses, which may be signed."""
+    plain = _QUERY.sub("", _TOKEN.sub("…", _HOST.sub("…", " ".join(text.split()))))
     return sanitize_line(plain, 300)
 
 

@@ -211,5 +211,5 @@ def test_a_segmenter_that_would_be_given_no_boxes_is_refused(detector, says):
     overrides = [f"perceive.detector={detector}", "perceive.detector_weights=net.onnx", "perceive.segmenter=sam2"]
     with pytest.raises(ConfigError, match=re.escape(says)) as told:
         load_config(None, overrides)
-    assert "set perceive.detector to 'replay' (the boxes of detections.json), 'openai' or 'gemini'" in str(told.value)
+    assert "to 'replay' (the boxes of detections.json), 'grounding_dino', 'openai' or 'gemini'" in str(told.value)
     load_config(None, [*overrides, "perceive.detector=replay"])

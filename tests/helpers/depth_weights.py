@@ -1,7 +1,7 @@
 """Depth Anything V2, tiny and with random weights, as a folder that the real loading code reads."""
 
 
-def save_tiny_depth(folder, kind="metric", seed=0):
+def save_tiny_depth(folder, kind="metric", seed=0, max_depth=20):
     """The true architecture, saved as its authors' are."""
     import torch
     import transformers
@@ -12,7 +12,7 @@ def save_tiny_depth(folder, kind="metric", seed=0):
     )  # fmt: skip
     config = transformers.DepthAnythingConfig(
         backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 8, 8], fusion_hidden_size=8,
-        head_hidden_size=8, depth_estimation_type=kind, max_depth=20 if kind == "metric" else 1,
+        head_hidden_size=8, depth_estimation_type=kind, max_depth=max_depth if kind == "metric" else 1,
     )  # fmt: skip
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -1,6 +1,7 @@
 """Catalogue of the models that the line can use: address, pinned commit, files, licence and what it forbids.
 
-Commits, sizes and hashes are those that the Hub publishes; None or empty where unknown.
+Commits, sizes and hashes are those of the Hub, as at least two unrelated public projects record each of them; None or
+empty where that is not so. No weights have been fetched by them here: docs/models.md says what that means.
 """
 
 from dataclasses import dataclass
@@ -125,7 +126,7 @@ CATALOGUE = (
         name="depth-anything-v2-small",
         role="depth",
         backend="depth_anything_2",
-        purpose="metric depth indoors, small enough for a CPU; needs a focal length",
+        purpose="metric depth indoors without a camera, small enough for a CPU",
         repository="depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf",
         revision="8078d68a9c75a972131914f6afd0c1723be0da7f",
         licence="Apache-2.0",
@@ -139,7 +140,7 @@ CATALOGUE = (
         name="da3-metric-large",
         role="depth",
         backend="depth_anything_3",
-        purpose="metric depth; needs a focal length",
+        purpose="metric depth without a camera",
         repository="depth-anything/DA3METRIC-LARGE",
         revision="4010e39f3634a45bc60553321fb49fb760bd594e",
         licence="Apache-2.0",
@@ -171,7 +172,7 @@ CATALOGUE = (
         backend="moge_2",
         purpose="metric depth and camera",
         repository="Ruicheng/moge-2-vitl",
-        revision="",
+        revision="39c4d5e957afe587e04eec59dc2bcc3be5ecd968",
         licence="MIT",
         forbids="",
         loaded_by="MoGe's own package, whose weights are a pickle (docs/models.md)",

@@ -12,10 +12,10 @@ from tableverse_factory.core.text import redact_secrets
 from tableverse_factory.core.timeouts import call_with_timeout
 from tableverse_factory.models.local.catalogue import BY_REPOSITORY
 
+GIT_HASH = re.compile(r"[0-9a-f]{40}")  # of a commit, and of a small file
 HUB_TIMEOUT_S = 60.0  # limit for the hub to resolve a revision [s]
 
 _NAME = re.compile(r"(?P<name>[\w.-]+/[\w.-]+)(@(?P<revision>[\w./-]+))?", re.ASCII)
-_COMMIT = re.compile(r"[0-9a-f]{40}")
 _UNREACHABLE = {
     *("LocalEntryNotFoundError", "OfflineModeIsEnabled", "RevisionResolutionError", "ConnectError"),
     *("ConnectTimeout", "ReadTimeout", "TimeoutError", "ConnectionError"),
@@ -76,7 +76,7 @@ def pin_commit(weights: str, key: str) -> str:
         ModelAccessError: if the hub has no such weights or cannot be reached, or its client is too old.
     """
     hub = resolve_hub_name(weights, key)
-    if hub is None or _COMMIT.fullmatch(hub.revision):
+    if hub is None or GIT_HASH.fullmatch(hub.revision):
         return weights
     try:
         module: Any = import_extra("huggingface_hub", f"{key} = {weights!r}", "models")

@@ -95,10 +95,7 @@ def load_tokenizer(weights: str, key: str, numbers: Mapping[str, int]) -> Any:
     except _UNREADABLE as error:
         if Path(name).exists():
             raise ModelAccessError(f"{key} = {weights!r} holds no tokenizer: {shorten_error(error)}") from error
-    try:
-        return load(local_only=False)
-    except _UNREADABLE as error:
-        raise ModelAccessError(describe_load_error(error, weights, key)) from error
+    return load_foreign(lambda: load(local_only=False), weights, key)
 
 
 def _import_transformers(weights: str, key: str) -> Any:

@@ -29,6 +29,7 @@ CANNOT = (
     (r".*judge=gemini", "needs a key for a model"),
     (r".*--max-usd", "needs a model that is paid"),
     (r"tableverse (bench|train) ", "takes minutes"),
+    (r".*--config recipes/", "needs weights; tests/integration/builds has small ones"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
     (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluation has some"),
     (r"tableverse textures index ", "needs textures that somebody photographed"),
