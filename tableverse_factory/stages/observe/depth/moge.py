@@ -1,6 +1,6 @@
 """MoGe-2 (Wang et al. 2025): metric depth, a mask of valid pixels and the camera, at the picture's size.
 
-The package is on git alone and was never run: its interface follows its code; `build_moge_estimate` is tested.
+Held to the authors' code, version 2.0, with random weights; published weights have not been run.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ def estimate_moge_2(item: ImageRow, config: Config) -> Capture:
 
     def run(pictures: Sequence[Picture], _: int) -> list[dict[str, Any]]:
         torch = import_torch()
-        planes = (torch.from_numpy(np.ascontiguousarray(p)).to(device.torch_device).permute(2, 0, 1) for p in pictures)
+        planes = (torch.tensor(p).to(device.torch_device).permute(2, 0, 1) for p in pictures)
         half = device.precision != "float32"
         return [model.infer(plane.to(torch.float32) / 255.0, use_fp16=half) for plane in planes]
 

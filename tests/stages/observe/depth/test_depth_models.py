@@ -13,6 +13,7 @@ from schemas.config import Config
 from schemas.geometry import Camera
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
+from tableverse_factory.core.config import build_config
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.models.local.weights import release_models
@@ -24,10 +25,12 @@ from tableverse_factory.stages.observe.depth.depth_anything_3 import (
     scale_to_metres,
 )
 from tableverse_factory.stages.observe.depth.from_git import PACKAGES, import_git_package
-from tableverse_factory.stages.observe.depth.moge import build_moge_estimate
+from tableverse_factory.stages.observe.depth.moge import build_moge_estimate, estimate_moge_2
 from tableverse_factory.stages.observe.observe import DEPTH_MODELS, observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tests.helpers.depth_weights import save_tiny_depth
+from tests.helpers.moge_models import save_thin_moge
+from tests.helpers.weights_hub import Model, weights_hub
 
 PUBLIC_GIT_ONLY = ("depth_anything_3", "depth_anything_3_nested", "moge_2")
 
@@ -35,6 +38,14 @@ PUBLIC_GIT_ONLY = ("depth_anything_3", "depth_anything_3_nested", "moge_2")
 def photo(path, seed=0, size=(60, 80)):
     Image.fromarray(np.random.default_rng(seed).integers(0, 255, (*size, 3), dtype=np.uint8)).save(path)
     return path
+
+
+def hide_packages(monkeypatch):
+    """Have no package of `PACKAGES`, also where one is installed."""
+    for name in [name for name in sys.modules if name.partition(".")[0] in PACKAGES]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in PACKAGES:
+        monkeypatch.setitem(sys.modules, name, None)
 
 
 def observed(path, **config):
@@ -97,12 +108,14 @@ def test_points_of_moge_come_out_of_its_depth_and_camera():
 
 
 @pytest.mark.parametrize("name", PUBLIC_GIT_ONLY)
-def test_without_its_package_the_build_stops_and_says_what_to_install(tmp_path, name):
+def test_without_its_package_the_build_stops_and_says_what_to_install(tmp_path, monkeypatch, name):
+    hide_packages(monkeypatch)
     with pytest.raises(ModelAccessError, match=r"pip install 'git\+https://github.com/"):
         observed(photo(tmp_path / "a.png"), depth=name, focal_px=100.0, max_file_bytes=10**6)
 
 
-def test_every_model_that_is_on_git_alone_says_where():
+def test_every_model_that_is_on_git_alone_says_where(monkeypatch):
+    hide_packages(monkeypatch)
     for module in PACKAGES:
         with pytest.raises(ModelAccessError, match="is not installed"):
             import_git_package(f"{module}.api")
@@ -129,21 +142,49 @@ def test_a_strip_is_dropped_before_any_model_sees_it(tmp_path, size):
     assert outcome.reason == "picture_too_narrow"
 
 
+@pytest.mark.heavy
+@pytest.mark.filterwarnings("ignore:In CPU autocast", "ignore:xFormers")
+@pytest.mark.parametrize("from_hub", [False, True])
+def test_moge_gives_the_points_of_its_own_package(tmp_path, monkeypatch, from_hub):
+    """Runs where its package is installed, with random weights."""
+    package = pytest.importorskip("moge.model.v2", reason="MoGe's own package is not installed")
+    torch = pytest.importorskip("torch")
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    save_thin_moge(folder)
+    path = photo(tmp_path / "a.png", size=(90, 120))
+    with weights_hub(monkeypatch, tmp_path / "cache") as hub:
+        hub.models["someone/moge"] = Model()
+        named = f"someone/moge@{hub.models['someone/moge'].commit(folder)}" if from_hub else str(folder)
+        config = build_config({"observe": {"depth": "moge_2", "depth_weights": named}, "models": {"device": "cpu"}})
+        found = estimate_moge_2(ImageRow(scene_id="a", kind=SceneKind.IMAGE, uri=str(path)), config)
+    model = package.MoGeModel.from_pretrained(str(folder / "model.pt")).eval()
+    pixels = torch.from_numpy(np.array(Image.open(path))).permute(2, 0, 1) / 255.0
+    theirs = model.infer(pixels, use_fp16=False)
+    kept = theirs["mask"].numpy() & (found.depth > 0)
+    assert kept.mean() > 0.5
+    points = backproject(found.depth, found.camera)[kept]
+    np.testing.assert_allclose(points, theirs["points"].numpy()[kept], atol=1e-5)
+    release_models()
+
+
 MOGE = """
 class MoGeModel:
-    def from_pretrained(name):
+    def from_pretrained(name, **at):
         raise OSError("not a repository")
 """
 
 
 @pytest.mark.parametrize("weights", ["", "folder"])
 def test_weights_of_a_package_on_git_that_cannot_be_had_stop_the_build(tmp_path, monkeypatch, weights):
-    """The package is a stand-in: the real one is not within reach."""
+    """The package is a stand-in: the real one would ask the hub."""
     (tmp_path / "moge" / "model").mkdir(parents=True)
+    for package in ("moge", "moge/model"):
+        (tmp_path / package / "__init__.py").touch()
     (tmp_path / "moge" / "model" / "v2.py").write_text(MOGE)
     monkeypatch.syspath_prepend(tmp_path)
-    for module in ("moge", "moge.model", "moge.model.v2"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
+    for module in [name for name in sys.modules if name.partition(".")[0] == "moge"]:
+        monkeypatch.delitem(sys.modules, module)
     named = str(tmp_path / weights) if weights else ""
     (tmp_path / "folder").mkdir()
     with pytest.raises(ModelAccessError, match=r"observe\.depth_weights.* cannot be loaded: OSError: not a repository"):
