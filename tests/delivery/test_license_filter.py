@@ -197,6 +197,19 @@ def test_what_the_public_cannot_open_becomes_a_name(uri, public):
     assert redact_uri(uri) == public
 
 
+@pytest.mark.parametrize(
+    ("detector", "weights", "public"),
+    [
+        ("learned", "acme/net.onnx", "net.onnx"),
+        ("grounding_dino", "acme/dino@v1", "acme/dino@v1"),
+        ("grounding_dino", "/home/me/dino", "dino"),
+    ],
+)
+def test_a_published_record_names_weights_of_the_hub_and_no_folder(detector, weights, public):
+    section = {"detector": detector, "detector_weights": weights}
+    assert redact_config({"perceive": section}) == {"perceive": {**section, "detector_weights": public}}
+
+
 def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
     curate = {"base_url": "https://models.intern.example/v1", "replay_dir": "/home/me/answers"}
     config = {**Config().model_dump(mode="json")}
