@@ -1,7 +1,7 @@
 """Catalogue of the models that the line can use: address, pinned commit, files, licence and what it forbids.
 
-Commits, sizes and hashes are those of the Hub, as at least two unrelated public projects record each of them; None or
-empty where that is not so. No weights have been fetched by them here: docs/models.md says what that means.
+Commits and hashes are those of the Hub as at least two unrelated public projects record them, sizes as at least one
+does; None or empty where they are unknown. No download of our own has confirmed them (docs/models.md).
 """
 
 from dataclasses import dataclass
