@@ -160,9 +160,9 @@ class ObserveConfig(StageSection):
 class PerceiveConfig(RemoteModelSection):
     """Detector, segmenter and limits on objects."""
 
-    detector: Literal[
-        "auto", "geometric", "picture", "learned", "replay", "grounding_dino", "openai", "gemini"
-    ] = "auto"
+    detector: Literal["auto", "geometric", "picture", "learned", "replay", "grounding_dino", "openai", "gemini"] = (
+        "auto"
+    )
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `geometric`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `learned` is a net of
     `tableverse train segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of

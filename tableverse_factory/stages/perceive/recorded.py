@@ -12,10 +12,10 @@ def record_detector(config: Config, before: Mapping[str, Any]) -> dict[str, Any]
     """Record the prompt of a detector that asks a model, or the weights of one that has any."""
     if config.perceive.protocol:
         return {"prompt_sha256": hash_detection_prompt(choose_box_order(config.perceive))}
-    if config.perceive.detector_weights:
-        return record_onnx("perceive.detector_weights", config.perceive.detector_weights)
     if config.perceive.detector == "grounding_dino":
         return record_weights("detector", "grounding_dino", config, before)
+    if config.perceive.detector_weights:
+        return record_onnx("perceive.detector_weights", config.perceive.detector_weights)
     return None
 
 
