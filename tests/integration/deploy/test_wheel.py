@@ -1,6 +1,7 @@
 """The wheel: what is in it, and that it runs where nothing of the checkout is in reach."""
 
 import email
+import hashlib
 import json
 import os
 import re
@@ -20,6 +21,7 @@ from tests.helpers.paths import ROOT
 PACKAGES = ("schemas", "tableverse_factory", "workers")
 BUILD = "import sys, hatchling.build; hatchling.build.build_wheel(sys.argv[1])"
 """What `make build` has pip do, without pip's own environment, for which an index would be asked."""
+SUFFIXES = (".py", ".typed", ".html", ".css", ".js", ".svg", ".json", ".yaml", ".onnx", ".sha256")
 ELSEWHERE = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
 
 
@@ -63,7 +65,7 @@ def tracked() -> Iterator[str]:
     """What is in the repository of the packages; a copy without history has everything but what tools left."""
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*"):
-            if path.is_file() and path.suffix in (".py", ".typed", ".html", ".css", ".js", ".svg", ".json", ".yaml"):
+            if path.is_file() and path.suffix in SUFFIXES:
                 yield str(path.relative_to(ROOT))
 
 
@@ -78,6 +80,12 @@ def test_it_holds_all_of_the_packages_and_nothing_else(names):
     ):
         assert name in names
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+
+
+def test_it_holds_the_net_of_bare_pictures_undamaged(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        net, digest = (archive.read(f"tableverse_factory/models/picture/picture.{end}") for end in ("onnx", "sha256"))
+    assert hashlib.sha256(net).hexdigest() == digest.decode().strip()
 
 
 def test_it_says_what_it_is(wheel):

@@ -1,0 +1,107 @@
+"""`bench picture`: what a capture's colour gives, against its own depth; a folder without captures is refused."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage
+from PIL import Image
+
+from tableverse_factory.evaluation.bench.picture import (
+    PictureScore,
+    compare_depth,
+    measure_angle_deg,
+    resize_nearest,
+    summarize_pictures,
+)
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
+
+DATA = Path(skimage.__file__).parent / "data"
+
+
+def make_score(**changed: object) -> PictureScore:
+    given = {"name": "a", "depth_error": 0.02, "log_scale": 0.1, "scale_sigma": 0.2, "plane_deg": 1.0, "cpu_s": 0.5}
+    return PictureScore(**{**given, **changed})
+
+
+def test_one_scale_is_taken_out_of_the_depth() -> None:
+    true = np.random.default_rng(0).uniform(0.5, 1.5, (40, 50)).astype(np.float32)
+    wanted = np.ones(true.shape, bool)
+    error, log_scale = compare_depth(true / 1.25, true, wanted)
+    assert error == pytest.approx(0.0, abs=1e-6)
+    assert log_scale == pytest.approx(math.log(1.25), abs=1e-6)
+    off = np.where(np.indices(true.shape).sum(axis=0) % 4 == 0, 1.1, 1.0)
+    assert compare_depth((true * off).astype(np.float32), true, wanted)[0] == pytest.approx(0.025, abs=1e-3)
+
+
+def test_depth_is_compared_where_both_know_it_and_it_is_wanted() -> None:
+    true, found = np.ones((40, 50), np.float32), np.ones((40, 50), np.float32)
+    true[:20], found[20:30], wanted = 0.0, 0.0, np.ones((40, 50), bool)
+    wanted[38:] = False
+    found[38:] = 9.0
+    assert compare_depth(found, true, wanted) == (0.0, 0.0)
+    wanted[31:] = False
+    assert np.isnan(compare_depth(found, true, wanted)).all(), "50 pixels tell no scale"
+
+
+def test_angles_and_sizes() -> None:
+    up, tilted = np.array([0.0, 0.0, 1.0]), np.array([0.0, math.sin(0.1), math.cos(0.1)])
+    assert measure_angle_deg(up, tilted) == pytest.approx(math.degrees(0.1))
+    assert measure_angle_deg(up, -up) == pytest.approx(180.0)
+    image = np.arange(12).reshape(3, 4)
+    np.testing.assert_array_equal(resize_nearest(np.kron(image, np.ones((5, 5), int)), (3, 4)), image)
+
+
+def test_the_summary_counts_what_was_dropped_and_averages_the_rest() -> None:
+    nothing = float("nan")
+    dropped = {"depth_error": nothing, "log_scale": nothing, "scale_sigma": nothing, "plane_deg": nothing}
+    scores = [
+        make_score(),
+        make_score(depth_error=0.04, log_scale=-0.3, plane_deg=3.0),
+        make_score(**dropped, reason="no_table"),
+    ]
+    total = summarize_pictures(scores)
+    assert (total.pictures, total.dropped, total.masks) == (3, 1, None)
+    assert (total.depth_error, total.plane_deg, total.within_sigma) == pytest.approx((0.03, 2.0, 0.5))
+    assert total.scale_error == pytest.approx((abs(math.expm1(-0.1)) + math.expm1(0.3)) / 2)
+
+
+@pytest.mark.heavy
+@pytest.mark.shared
+def test_the_table_of_a_real_capture(tmp_path, run, shared_dir) -> None:
+    captures = tmp_path / "captures"
+    captures.mkdir()
+    (captures / "osd_test14").symlink_to(shared_dir / "captures" / "osd_test14")
+    others = tmp_path / "others"
+    others.mkdir()
+    Image.open(DATA / "rocket.jpg").save(others / "rocket.png")
+    code, said, errors = run("bench", "picture", captures, "--other", others)
+    assert code == 0, errors
+    for word in ("osd_test14", "depth %", "scale %", "mean IoU", "CPU s", "within one stated standard deviation"):
+        assert word in said
+    assert "without a table: 1 of 1 dropped; not one" in said
+    code, said, errors = run("bench", "picture", captures, "--json")
+    assert code == 0, errors
+    (score,) = json.loads(said)["pictures"]
+    assert not score["reason"]
+    assert 0 < score["depth_error"] < 0.1
+    assert score["scale_sigma"] > 0
+    assert score["plane_deg"] < 15
+
+
+def test_a_folder_without_captures_is_refused(tmp_path, run) -> None:
+    code, _, errors = run("bench", "picture", tmp_path)
+    assert code != 0
+    assert "holds no capture" in errors
+    assert "camera.json" in errors
+
+
+@pytest.mark.heavy
+def test_a_folder_without_other_pictures_is_refused(tmp_path, run) -> None:
+    synthesize_captures(tmp_path / "captures", 1, 0)
+    (tmp_path / "others").mkdir()
+    code, _, errors = run("bench", "picture", tmp_path / "captures", "--other", tmp_path / "others")
+    assert code != 0
+    assert "holds no picture" in errors

@@ -1,0 +1,136 @@
+"""Objects of predictions made up on paper: what is cut at a boundary, what is merged, and how they are numbered."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from schemas.geometry import Camera
+from tableverse_factory.models.picture.instances import MIN_OBJECT_PX, segment_prediction, upsample_ids
+from tableverse_factory.models.picture.predict import OBJECT, TABLE, PicturePrediction
+
+ROWS, COLUMNS = 96, 128
+LEFT, RIGHT = (slice(30, 60), slice(30, 60)), (slice(30, 60), slice(60, 90))  # they touch
+LARGE = (slice(10, 50), slice(5, 55))
+
+
+def make_prediction(*things: tuple[slice, slice]) -> PicturePrediction:
+    """Things on a table parallel to the picture, all at one distance; each votes for its middle."""
+    label, votes = np.zeros((3, ROWS, COLUMNS), np.float32), np.zeros((2, ROWS, COLUMNS), np.float32)
+    label[TABLE] = 1.0
+    for thing in things:
+        label[:, *thing] = np.eye(3, dtype=np.float32)[OBJECT][:, None, None]
+        vote_for(votes, thing, *(0.5 * (part.start + part.stop - 1) for part in thing))
+    return PicturePrediction(
+        Camera(120.0, 120.0, 63.5, 47.5, COLUMNS, ROWS),
+        np.ones((ROWS, COLUMNS), np.float32),
+        label,
+        np.zeros((ROWS, COLUMNS), np.float32),
+        votes,
+        np.zeros((ROWS, COLUMNS), np.float32),
+        np.array([0.0, 0.0, -1.0]),
+        1.0,
+        0.9,
+        0.1,
+    )
+
+
+def vote_for(votes: np.ndarray, thing: tuple[slice, slice], row: float, column: float) -> None:
+    rows, columns = np.mgrid[thing]
+    votes[:, *thing] = np.stack([column - columns, row - rows])
+
+
+def draw_boundary(found: PicturePrediction, *columns: int) -> PicturePrediction:
+    boundary = found.boundary.copy()
+    boundary[30:60, list(columns)] = 1.0
+    return replace(found, boundary=boundary)
+
+
+def segment(found: PicturePrediction) -> np.ndarray:
+    return segment_prediction(found, (ROWS, COLUMNS))
+
+
+def vote_in_halves(spread_px: float) -> PicturePrediction:
+    """One box of 30 x 60 whose halves vote for two middles, `spread_px` apart."""
+    found = make_prediction((slice(30, 60), slice(30, 90)))
+    votes = found.votes.copy()
+    vote_for(votes, LEFT, 44.5, 59.5 - spread_px / 2)
+    vote_for(votes, RIGHT, 44.5, 59.5 + spread_px / 2)
+    return replace(found, votes=votes)
+
+
+def test_two_boxes_with_a_boundary_between_them_stay_apart() -> None:
+    ids = segment(draw_boundary(make_prediction(LEFT, RIGHT), 59, 60))
+    assert np.unique(ids[LEFT]).tolist() == [ids[40, 40]]
+    assert np.unique(ids[RIGHT]).tolist() == [ids[40, 80]]
+    assert {ids[40, 40], ids[40, 80]} == {1, 2}
+
+
+def test_the_votes_alone_keep_two_boxes_apart_whose_middles_are_far() -> None:
+    ids = segment(make_prediction(LEFT, RIGHT))
+    assert {*np.unique(ids[LEFT])} | {*np.unique(ids[RIGHT])} == {1, 2}
+    assert ids[40, 40] != ids[40, 80]
+
+
+def test_a_boundary_alone_separates_what_votes_for_one_middle() -> None:
+    found = make_prediction((slice(30, 60), slice(30, 90)))
+    assert segment(found).max() == 1
+    assert segment(draw_boundary(found, 59, 60)).max() == 2
+
+
+def test_one_box_with_two_peaks_of_votes_and_no_boundary_is_one() -> None:
+    votes = vote_in_halves(14.0)
+    rng = np.random.default_rng(0)
+    found = replace(votes, votes=(votes.votes + rng.normal(0.0, 4.0, votes.votes.shape)).astype(np.float32))
+    ids = segment(found)
+    assert np.unique(ids[30:60, 30:90]).tolist() == [1]
+    assert segment(draw_boundary(found, 58, 59, 60, 61)).max() == 2, "the boundary forbids what the votes permit"
+
+
+def test_a_crease_between_two_peaks_separates() -> None:
+    """The same votes on two surfaces, one far before the other."""
+    votes = vote_in_halves(14.0)
+    rng = np.random.default_rng(0)
+    found = replace(votes, votes=(votes.votes + rng.normal(0.0, 4.0, votes.votes.shape)).astype(np.float32))
+    depth = found.depth.copy()
+    depth[:, 60:] = 1.5
+    ids = segment(replace(found, depth=depth))
+    assert ids[40, 40] != ids[40, 80]
+
+
+def test_ids_are_dense_from_one_the_largest_first() -> None:
+    small, tiny = (slice(60, 80), slice(70, 100)), (slice(20, 32), slice(100, 112))
+    ids = segment(make_prediction(tiny, small, LARGE))
+    sizes = np.bincount(ids.ravel())
+    assert sizes[1:].tolist() == [2000, 600, 144]
+    assert [int(ids[part][0, 0]) for part in (LARGE, small, tiny)] == [1, 2, 3]
+    assert ids.dtype == np.int32
+
+
+def test_where_no_object_is_there_is_none() -> None:
+    assert not segment(make_prediction()).any()
+    assert segment_prediction(make_prediction(), (480, 640)).shape == (480, 640)
+
+
+def test_objects_are_found_where_the_label_says_and_nowhere_else() -> None:
+    ids = segment(make_prediction(LEFT, LARGE))
+    wanted = np.zeros(ids.shape, bool)
+    wanted[LEFT] = wanted[LARGE] = True
+    np.testing.assert_array_equal(ids > 0, wanted)
+
+
+def test_specks_are_no_objects() -> None:
+    side = int(MIN_OBJECT_PX**0.5)
+    assert side * side < MIN_OBJECT_PX
+    assert not segment(make_prediction((slice(20, 20 + side), slice(20, 20 + side)))).any()
+    assert segment(make_prediction((slice(20, 22 + side), slice(20, 22 + side)))).any()
+
+
+@pytest.mark.parametrize("factor", [2, 5])
+def test_ids_keep_their_places_at_another_size(factor: int) -> None:
+    ids = segment(make_prediction(LEFT, LARGE))
+    large = upsample_ids(ids, (factor * ROWS, factor * COLUMNS))
+    plain = np.kron(ids, np.ones((factor, factor), np.int32))
+    assert {*np.unique(large)} == {*np.unique(ids)}
+    assert (large == plain).mean() > 0.98
+    np.testing.assert_array_equal(upsample_ids(ids, ids.shape), ids)

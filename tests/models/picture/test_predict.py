@@ -1,0 +1,160 @@
+"""The net says the same of the same picture, something of every picture, and the mirrored of a mirrored one."""
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from schemas.geometry import Camera
+from tableverse_factory.models.picture.predict import (
+    LEAST_PIXELS,
+    MOST_PIXELS,
+    OBJECT,
+    PicturePrediction,
+    choose_working_size,
+    compute_rays,
+    predict_picture,
+)
+from tests.helpers.paths import ROOT
+from tests.helpers.tabletop_views import Box, look
+
+THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08), color=(40, 90, 200)))
+
+
+def draw() -> np.ndarray:
+    """Two boxes on a table in a room, (480, 640, 3)."""
+    return look(THINGS, floor_z=-0.7, wall_y=1.5)[0].color
+
+
+def make_camera(color: np.ndarray, focal_px: float = 577.0) -> Camera:
+    height, width = color.shape[:2]
+    return Camera(focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, width, height)
+
+
+def predict(color: np.ndarray, focal_px: float = 577.0) -> PicturePrediction:
+    return predict_picture(color, make_camera(color, focal_px))
+
+
+def digest(found: PicturePrediction) -> str:
+    parts = (np.asarray(getattr(found, one.name)).tobytes() for one in fields(found) if one.name != "camera")
+    return hashlib.sha256(b"".join(parts) + repr(found.camera).encode()).hexdigest()
+
+
+def check_sound(found: PicturePrediction, rows: int, columns: int) -> None:
+    """Every field has its shape and its bounds."""
+    assert found.depth.shape == found.center.shape == found.boundary.shape == (rows, columns)
+    assert found.label.shape == (3, rows, columns)
+    assert found.votes.shape == (2, rows, columns)
+    for one in fields(found):
+        if one.name != "camera":
+            assert np.isfinite(getattr(found, one.name)).all(), one.name
+    assert (found.depth > 0).all()
+    np.testing.assert_allclose(found.label.sum(axis=0), 1.0, atol=1e-5)
+    assert 0 <= found.boundary.min() <= found.boundary.max() <= 1
+    assert 0 <= found.table_probability <= 1
+    assert np.linalg.norm(found.normal) == pytest.approx(1.0)
+    assert found.scale_sigma > 0
+
+
+@pytest.mark.heavy
+def test_two_processes_say_the_same_to_the_byte() -> None:
+    code = "from tests.models.picture.test_predict import *; print(digest(predict(draw())))"
+    said = [
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        for _ in range(2)
+    ]
+    assert said[0] == said[1]
+    assert len(said[0].strip()) == 64
+
+
+@pytest.mark.parametrize(
+    ("picture", "size"),
+    [
+        ((480, 640), (288, 384)),
+        ((3000, 4000), (288, 384)),
+        ((640, 480), (384, 288)),
+        ((1080, 1920), (256, 448)),
+        ((1920, 1080), (448, 256)),
+        ((500, 500), (320, 320)),
+        ((8, 8), (320, 320)),
+        ((100, 800), (96, 800)),
+    ],
+    ids=str,
+)
+def test_the_working_size_keeps_the_aspect(picture: tuple[int, int], size: tuple[int, int]) -> None:
+    assert choose_working_size(*picture) == size
+
+
+def test_working_sizes_of_every_aspect_are_ones_that_the_net_can_have() -> None:
+    for aspect in np.geomspace(1 / 8, 8, 201):
+        rows, columns = choose_working_size(round(1000 * aspect**0.5), round(1000 / aspect**0.5))
+        assert rows % 32 == columns % 32 == 0
+        assert LEAST_PIXELS <= rows * columns <= MOST_PIXELS
+        is_usual = 1 / 6 <= aspect <= 6
+        assert abs(np.log(rows / columns / aspect)) < (0.05 if is_usual else 0.09)
+
+
+def test_rays_are_unit_and_mirror_about_the_axis() -> None:
+    rays = compute_rays(Camera(50.0, 60.0, 15.5, 11.5, 32, 24))
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=0), 1.0, atol=1e-6)
+    np.testing.assert_allclose(rays[:, :, ::-1], rays * np.array([-1, 1, 1])[:, None, None], atol=1e-6)
+    np.testing.assert_allclose(rays[:2, 0, 0] / rays[2, 0, 0], [-15.5 / 50, -11.5 / 60], atol=1e-6)
+
+
+@pytest.mark.heavy
+def test_the_mirrored_picture_has_the_mirrored_depth_and_things() -> None:
+    color = draw()
+    found, mirrored = predict(color), predict(np.ascontiguousarray(color[:, ::-1]))
+    off = np.abs(mirrored.depth[:, ::-1] / found.depth * np.median(found.depth / mirrored.depth[:, ::-1]) - 1)
+    assert np.median(off) < 0.05
+    assert np.quantile(off, 0.95) < 0.15
+    things, others = found.label.argmax(axis=0) == OBJECT, mirrored.label.argmax(axis=0)[:, ::-1] == OBJECT
+    assert (things & others).sum() > 0.9 * (things | others).sum() > 0
+    assert (things & (mirrored.label.argmax(axis=0) == OBJECT)).sum() < 0.5 * things.sum()
+    np.testing.assert_allclose(mirrored.normal * [-1, 1, 1], found.normal, atol=0.05)
+
+
+@pytest.mark.heavy
+def test_a_picture_upside_down_is_answered() -> None:
+    color = draw()
+    turned = predict(np.ascontiguousarray(color[::-1, ::-1]))
+    check_sound(turned, 288, 384)
+    assert turned.table_probability < predict(color).table_probability
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (8, 64), (480, 640)], ids=str)
+@pytest.mark.parametrize("value", [0, 255])
+def test_a_tiny_or_single_coloured_picture_is_answered(size: tuple[int, int], value: int) -> None:
+    found = predict(np.full((*size, 3), value, np.uint8), float(max(size)))
+    check_sound(found, *choose_working_size(*size))
+    assert found.table_probability < 0.5
+
+
+@pytest.mark.heavy
+def test_a_prediction_is_remembered_for_this_picture_and_camera_alone() -> None:
+    color = draw()
+    first = predict(color)
+    assert predict(color.copy()) is first
+    nearer = predict(color, 700.0)
+    assert nearer is not first
+    assert not np.array_equal(nearer.depth, first.depth)
+    again = predict(color)
+    assert again is not first, "only the latest is kept"
+    assert digest(again) == digest(first)
+    spotted = color.copy()
+    spotted[0, 0] ^= 1
+    assert predict(spotted) is not again
+
+
+@pytest.mark.heavy
+def test_the_depth_of_a_sensor_is_another_question() -> None:
+    seen = look(THINGS, floor_z=-0.7, wall_y=1.5)[0]
+    bare, sensed = predict_picture(seen.color, seen.camera), predict_picture(seen.color, seen.camera, seen.depth)
+    assert sensed is not bare
+    assert predict_picture(seen.color, seen.camera, seen.depth.copy()) is sensed
+    wrong = predict_picture(seen.color, seen.camera, np.roll(seen.depth, 40, axis=1))
+    assert wrong is not sensed

@@ -1,0 +1,117 @@
+"""A bare picture through `observe` and `perceive`: its table, its boxes, and where its metres come from."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from schemas.config import Config
+from schemas.geometry import IdImage
+from schemas.manifest import ImageRow, SceneKind
+from schemas.objects import PerceivedObjects
+from schemas.outcome import Done, Outcome
+from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
+from tests.helpers.tabletop_views import CAMERA, Box, best_overlaps, camera_above, look
+
+THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08), color=(40, 90, 200)))
+POSE = camera_above()  # 0.6 m over the table
+HEIGHT = json.dumps({"kind": "camera_height", "length_m": 0.6})
+
+
+@pytest.fixture(scope="module")
+def view(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, IdImage]:
+    """The colour of two boxes on a table in a room, with a camera's noise, and the true ids."""
+    seen, ids = look(THINGS, POSE, floor_z=-0.7, wall_y=1.5)
+    noise = np.random.default_rng(0).normal(0.0, 6.0, seen.color.shape)
+    path = tmp_path_factory.mktemp("view") / "table.png"
+    Image.fromarray(np.clip(seen.color + noise, 0, 255).astype(np.uint8)).save(path)
+    return path, ids
+
+
+def see(path: Path, known_length: str = "", **sections: dict[str, object]) -> Outcome[PerceivedObjects]:
+    row = ImageRow(scene_id="x", kind=SceneKind.IMAGE, uri=str(path), known_length=known_length)
+    config = Config.model_validate(sections)
+    seen = observe(row, config, np.random.default_rng(0), Services(Path()))
+    assert isinstance(seen, Done), seen
+    return perceive(seen.value, config, np.random.default_rng(0), Services(Path()))
+
+
+def find(path: Path, known_length: str = "", **sections: dict[str, object]) -> PerceivedObjects:
+    outcome = see(path, known_length, **sections)
+    assert isinstance(outcome, Done), outcome
+    return outcome.value
+
+
+@pytest.mark.heavy
+def test_the_boxes_are_found_on_the_table(view: tuple[Path, IdImage]) -> None:
+    path, ids = view
+    found = find(path)
+    assert len(found.objects) == 2
+    assert min(best_overlaps(ids, found.instance_ids)) > 0.8
+    assert {o.object_id for o in found.objects} == {o.object_id for o in find(path).objects}
+    np.testing.assert_array_equal(find(path).instance_ids, found.instance_ids)
+    normal, true = (rotation_matrix(pose.quaternion_wxyz)[2] for pose in (found.camera_to_table, POSE))
+    assert normal @ true > np.cos(np.radians(8.0))
+
+
+@pytest.mark.heavy
+def test_the_scale_is_estimated_and_says_how_sure_it_is(view: tuple[Path, IdImage]) -> None:
+    found = find(view[0])
+    seen = found.observation
+    assert (seen.scale_source, seen.intrinsics_source) == ("estimated", "assumed")
+    assert 0.05 < seen.scale_sigma < 1.0
+    height = found.camera_to_table.position[2]
+    assert abs(np.log(height / 0.6)) < 2 * seen.scale_sigma
+
+
+@pytest.mark.heavy
+def test_the_height_of_the_camera_measures_the_scale(view: tuple[Path, IdImage]) -> None:
+    path, ids = view
+    estimated, measured = find(path), find(path, HEIGHT, observe={"focal_px": CAMERA.fx})
+    assert measured.observation.scale_source == "measured"
+    assert 0 < measured.observation.scale_sigma < 0.1 < estimated.observation.scale_sigma
+    assert measured.camera_to_table.position[2] == pytest.approx(0.6, rel=0.02)
+    assert estimated.camera_to_table.position[2] != pytest.approx(0.6, rel=0.02)
+    assert min(best_overlaps(ids, measured.instance_ids)) > 0.8
+    distance = np.linalg.norm(measured.camera_to_table.position)
+    assert distance == pytest.approx(np.linalg.norm(POSE.position), rel=0.25)
+
+
+@pytest.mark.heavy
+def test_the_net_reads_the_depth_of_a_sensor_too(view: tuple[Path, IdImage]) -> None:
+    """`detector: picture` on a capture, whose metres stay the sensor's."""
+    path, ids = view
+    folder = path.parent / "capture"
+    folder.mkdir()
+    seen, _ = look(THINGS, POSE, floor_z=-0.7, wall_y=1.5)
+    Image.open(path).save(folder / "color.png")
+    Image.fromarray(np.rint(seen.depth * 1000).astype(np.uint16)).save(folder / "depth.png")
+    camera = {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+    (folder / "camera.json").write_text(json.dumps(camera | {"depth_scale": 0.001}))
+    row = ImageRow(scene_id="x", kind=SceneKind.CAPTURE, uri=str(folder))
+    config = Config.model_validate({"perceive": {"detector": "picture"}})
+    sensed = observe(row, config, np.random.default_rng(0), Services(Path()))
+    assert isinstance(sensed, Done), sensed
+    outcome = perceive(sensed.value, config, np.random.default_rng(0), Services(Path()))
+    assert isinstance(outcome, Done), outcome
+    assert outcome.value.observation.scale_source == "sensor"
+    assert outcome.value.camera_to_table.position[2] == pytest.approx(0.6, rel=0.01)
+    assert min(best_overlaps(ids, outcome.value.instance_ids)) > 0.7
+
+
+@pytest.mark.heavy
+def test_the_colour_of_synthetic_captures_shows_most_of_their_objects(tmp_path: Path) -> None:
+    overlaps: list[float] = []
+    for folder in synthesize_captures(tmp_path / "captures", 3, 0):
+        found = find(folder / "color.png")
+        true = np.asarray(Image.open(folder / "masks.png")).astype(np.int32)
+        overlaps += best_overlaps(np.where(true > 0, true + 1, 0), found.instance_ids)
+        assert found.observation.scale_source == "estimated"
+        assert found.observation.scale_sigma > 0
+    assert np.mean(np.array(overlaps) > 0.5) >= 0.5
