@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
+from tableverse_factory.models.picture.instances import upsample_ids
 from tableverse_factory.models.picture.predict import (
     LEAST_PIXELS,
     MOST_PIXELS,
@@ -111,8 +112,10 @@ def test_the_mirrored_picture_has_the_mirrored_depth_and_things() -> None:
     off = np.abs(mirrored.depth[:, ::-1] / found.depth * np.median(found.depth / mirrored.depth[:, ::-1]) - 1)
     assert np.median(off) < 0.05
     assert np.quantile(off, 0.95) < 0.15
+    true = upsample_ids((look(THINGS)[1] > 1).astype(np.int32), found.depth.shape) > 0
     things, others = found.label.argmax(axis=0) == OBJECT, mirrored.label.argmax(axis=0)[:, ::-1] == OBJECT
     assert (things & others).sum() > 0.9 * (things | others).sum() > 0
+    assert (things & true).sum() > 0.8 * (things | true).sum()
     assert (things & (mirrored.label.argmax(axis=0) == OBJECT)).sum() < 0.5 * things.sum()
     np.testing.assert_allclose(mirrored.normal * [-1, 1, 1], found.normal, atol=0.05)
 

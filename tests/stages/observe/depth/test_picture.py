@@ -111,7 +111,8 @@ def test_the_coffee_cup_stands_on_a_table() -> None:
 
 @pytest.mark.heavy
 def test_the_least_probability_decides() -> None:
-    assert isinstance(see(DATA / "rocket.jpg", min_table_probability=0.0), Done | Dropped)
+    taken = see(DATA / "rocket.jpg", min_table_probability=0.0)
+    assert getattr(taken, "reason", "") != "no_table"
     refused = see(DATA / "coffee.png", min_table_probability=1.0)
     assert isinstance(refused, Dropped)
     assert refused.reason == "no_table"

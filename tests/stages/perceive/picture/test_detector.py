@@ -12,6 +12,7 @@ from schemas.geometry import IdImage
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.outcome import Done, Outcome
+from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
@@ -103,6 +104,13 @@ def test_the_net_reads_the_depth_of_a_sensor_too(view: tuple[Path, IdImage]) -> 
     assert outcome.value.observation.scale_source == "sensor"
     assert outcome.value.camera_to_table.position[2] == pytest.approx(0.6, rel=0.01)
     assert min(best_overlaps(ids, outcome.value.instance_ids)) > 0.7
+
+
+@pytest.mark.heavy
+def test_weights_that_are_missing_stop_the_build_and_drop_no_picture(view: tuple[Path, IdImage]) -> None:
+    for section in ({"observe": {"depth_weights": "missing.onnx"}}, {"perceive": {"detector_weights": "missing.onnx"}}):
+        with pytest.raises(ModelAccessError, match=r"'missing\.onnx' is no file"):
+            see(view[0], **section)
 
 
 @pytest.mark.heavy
