@@ -123,3 +123,20 @@ def test_the_colour_of_synthetic_captures_shows_most_of_their_objects(tmp_path: 
         assert found.observation.scale_source == "estimated"
         assert found.observation.scale_sigma > 0
     assert np.mean(np.array(overlaps) > 0.5) >= 0.5
+
+
+@pytest.mark.heavy
+def test_the_boxes_of_a_detector_get_masks(tmp_path: Path) -> None:
+    (folder,) = synthesize_captures(tmp_path / "captures", 1, 0)
+    true = np.asarray(Image.open(folder / "masks.png")).astype(np.int32)
+    (folder / "masks.png").unlink()
+    row = ImageRow(scene_id="x", kind=SceneKind.CAPTURE, uri=str(folder))
+    perceived = {"detector": "replay", "segmenter": "picture", "min_explained": 0.0}
+    config = Config.model_validate({"perceive": perceived})
+    seen = observe(row, config, np.random.default_rng(0), Services(Path()))
+    assert isinstance(seen, Done), seen
+    outcome = perceive(seen.value, config, np.random.default_rng(0), Services(Path()))
+    assert isinstance(outcome, Done), outcome
+    overlaps = best_overlaps(np.where(true > 0, true + 1, 0), outcome.value.instance_ids)
+    assert np.mean(np.array(overlaps) > 0.5) > 0.5
+    assert len({o.label for o in outcome.value.objects}) > 1
