@@ -22,7 +22,9 @@ def bench_perception(
         Path,
         typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
     ],
-    detector: Annotated[str, typer.Option(help="Detector to measure: geometric, picture, learned or replay.")] = "geometric",
+    detector: Annotated[
+        str, typer.Option(help="Detector to measure: geometric, picture, learned or replay.")
+    ] = "geometric",
     weights: Annotated[str, typer.Option(metavar="FILE", help="The .onnx file of `learned`.")] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,

@@ -37,7 +37,8 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, IdImage]:
 
 def see(path: Path, known_length: str = "", **sections: dict[str, object]) -> Outcome[PerceivedObjects]:
     row = ImageRow(scene_id="x", kind=SceneKind.IMAGE, uri=str(path), known_length=known_length)
-    config = Config.model_validate(sections)
+    own = {"min_table_probability": 0.5, **sections.get("observe", {})}  # plain boxes are no photograph of a table
+    config = Config.model_validate({**sections, "observe": own})
     seen = observe(row, config, np.random.default_rng(0), Services(Path()))
     assert isinstance(seen, Done), seen
     return perceive(seen.value, config, np.random.default_rng(0), Services(Path()))
