@@ -160,11 +160,12 @@ class ObserveConfig(StageSection):
 class PerceiveConfig(RemoteModelSection):
     """Detector, segmenter and limits on objects."""
 
-    detector: Literal["auto", "geometric", "picture", "learned", "replay", "grounding_dino", "openai", "gemini"] = (
-        "auto"
-    )
+    detector: Literal[
+        "auto", "geometric", "picture", "ensemble", "learned", "replay", "grounding_dino", "openai", "gemini"
+    ] = "auto"
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `geometric`
-    where a sensor measured depth, and `picture`, our own net, where a model estimated it. `learned` is a net of
+    where a sensor measured depth, and `picture`, our own net, where a model estimated it. `ensemble` chooses between
+    these two for each pile, where a sensor measured depth. `learned` is a net of
     `tableverse train segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of
     OpenAI's chat completions, `gemini` Google's own protocol.
     """
@@ -210,7 +211,7 @@ class PerceiveConfig(RemoteModelSection):
             names.append("perceive.detector_weights")
         if names:
             raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
-        if self.detector in ("auto", "geometric", "picture", "learned") and self.segmenter != "geometric":
+        if self.detector in ("auto", "geometric", "picture", "ensemble", "learned") and self.segmenter != "geometric":
             where = " where a capture has no detections.json" if self.detector == "auto" else ""
             raise ValueError(
                 f"the detector {self.detector!r} gives masks, not boxes{where}, so perceive.segmenter "

@@ -23,7 +23,7 @@ def bench_perception(
         typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
     ],
     detector: Annotated[
-        str, typer.Option(help="Detector to measure: geometric, picture, learned or replay.")
+        str, typer.Option(help="Detector to measure: geometric, picture, ensemble, learned or replay.")
     ] = "geometric",
     weights: Annotated[str, typer.Option(metavar="FILE", help="The .onnx file of `learned`.")] = "",
     config: ConfigFile = None,

@@ -75,7 +75,7 @@ def test_numbers_are_read_as_people_write_them(text):
         ("run.seed=!!python/object/apply:os.system [id]", ["run.seed", "no YAML value"]),
         ("rectify.clearance_m=.nan", ["rectify.clearance_m", "nan", "at least 0, at most 100"]),
         ("rectify.clearance_m=.inf", ["rectify.clearance_m", "inf"]),
-        ("perceive.detector=magic", ["'magic'", "one of auto, geometric, picture, learned, replay"]),
+        ("perceive.detector=magic", ["'magic'", "one of auto, geometric, picture, ensemble, learned, replay"]),
         ("seed=3", ["section.key=value"]),
         ("run.seed", ["section.key=value"]),
         ("a.b.c=1", ["section.key=value"]),

@@ -1,0 +1,95 @@
+"""The detector `ensemble`: each pile from `geometric` or from `picture`, as the boundaries that our net sees decide."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32
+from PIL import Image
+from scipy import ndimage
+
+from schemas.config import Config
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.models.services import Services
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
+from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, predict_observation
+
+BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
+REACH_PX = 2  # a boundary this near is that of a border
+INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
+LEAST_PROBABILITY = 0.02
+FAVOUR = 0.4  # log-likelihood per pixel of border by which `picture` must be better: the depth is measured
+
+Probabilities = Float32[np.ndarray, "h w"]
+
+
+def detect_with_both(view: TableView, config: Config, services: Services) -> DetectionResult:
+    """Detect objects by depth and by the net, and choose one answer for each pile."""
+    answers = detect_from_depth(view, config, services), detect_in_picture(view, config, services)
+    ids = [_get_ids(answer) for answer in answers]
+    seen = predict_observation(view.observation, config.perceive).boundary
+    height, width = view.valid.shape
+    boundary = np.asarray(Image.fromarray(seen).resize((width, height), Image.Resampling.BILINEAR))
+    near = ndimage.binary_dilation((ids[0] > 0) | (ids[1] > 0), iterations=BESIDE_PX)
+    piles, count = ndimage.label(near)
+    by_net = np.zeros(count + 1, dtype=bool)
+    for pile, window in enumerate(ndimage.find_objects(piles), start=1):
+        inside = piles[window] == pile
+        by_net[pile] = prefer_second([part[window] * inside for part in ids], boundary[window], inside)
+    return _merge_answers(answers, ids, piles, by_net)
+
+
+def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
+    """Decide whether the second of two segmentations of a pile explains the boundaries so much better that it is taken.
+
+    `boundary` is their probability at each pixel.
+    """
+    borders = [_find_borders(each) & inside for each in ids]
+    first, second = (_score_borders(border, boundary, inside) for border in borders)
+    return bool(second - first > FAVOUR * max(1, *(int(border.sum()) for border in borders)))
+
+
+def _score_borders(border: Mask, boundary: Probabilities, inside: Mask) -> float:
+    """Compute the log-likelihood of the boundaries: probable on the borders, improbable within."""
+    highest = 1.0 - LEAST_PROBABILITY
+    near = np.clip(ndimage.maximum_filter(boundary, 2 * REACH_PX + 1), LEAST_PROBABILITY, highest)
+    within = inside & ~ndimage.binary_dilation(border, iterations=REACH_PX + 1)
+    empty = 1.0 - np.clip(boundary, LEAST_PROBABILITY, highest)
+    return float(np.log(near[border]).sum() + INNER_WEIGHT * np.log(empty[within]).sum())
+
+
+def _find_borders(ids: IdImage) -> Mask:
+    """Find the pixels on both sides of a change of id."""
+    border = np.zeros(ids.shape, dtype=bool)
+    for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        differs = ids[first] != ids[second]
+        border[first] |= differs
+        border[second] |= differs
+    return border
+
+
+def _merge_answers(
+    answers: Sequence[DetectionResult], ids: Sequence[IdImage], piles: IdImage, by_net: np.ndarray
+) -> DetectionResult:
+    """Take from each answer the candidates in its piles; a container lies in the pile of its contents."""
+    merged = np.zeros_like(ids[0])
+    kept: list[Candidate] = []
+    for source, answer in enumerate(answers):
+        place: dict[int, int] = {}  # of a candidate among those that are kept
+        for index, candidate in enumerate(answer.candidates):
+            mask = ids[source] == candidate.instance
+            if not mask.any() or by_net[piles[mask][0]] != source:
+                continue
+            place[index] = len(kept)
+            merged[mask] = len(kept) + 1
+            container = None if candidate.container is None else place.get(candidate.container)
+            kept.append(replace(candidate, instance=len(kept) + 1, container=container))
+    return DetectionResult(tuple(kept), ids=merged)
+
+
+def _get_ids(answer: DetectionResult) -> IdImage:
+    if answer.ids is None:
+        raise TypeError("both detectors answer with an image of ids")
+    return answer.ids

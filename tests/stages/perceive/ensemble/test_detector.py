@@ -1,0 +1,68 @@
+"""The detector `ensemble`: which of two answers a pile gets, and that what it takes stays whole."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from schemas.config import Config
+from schemas.manifest import ImageRow, SceneKind
+from schemas.outcome import Done
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.ensemble.detector import detect_with_both, prefer_second
+from tableverse_factory.stages.perceive.table import find_table
+
+SHAPE = (80, 120)
+ONE = np.zeros(SHAPE, dtype=np.int32)
+ONE[20:60, 20:100] = 1
+FOUR = ONE.copy()
+for part in range(1, 4):
+    FOUR[20:60, 20 + 20 * part : 100] = part + 1
+SEAMS = tuple(np.s_[20:60, column - 2 : column + 2] for column in (40, 60, 80))
+
+
+def draw_boundary(*lines: tuple[slice, slice]) -> np.ndarray:
+    """Draw probable boundaries around the whole, and along lines."""
+    boundary = np.full(SHAPE, 0.02, dtype=np.float32)
+    boundary[19:61, 19:101] = 0.95
+    boundary[22:58, 22:98] = 0.02
+    for line in lines:
+        boundary[line] = 0.95
+    return boundary
+
+
+EVERYWHERE = np.ones(SHAPE, dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "boundary", "second_wins"),
+    [
+        (ONE, FOUR, draw_boundary(*SEAMS), True),
+        (FOUR, ONE, draw_boundary(), True),
+        (FOUR, ONE, draw_boundary(*SEAMS), False),
+        (ONE, FOUR, draw_boundary(), False),
+        (FOUR, FOUR, draw_boundary(), False),
+        (ONE, np.zeros_like(ONE), draw_boundary(), False),
+    ],
+    ids=["seams are seen", "no seam is seen", "seams stay", "nothing to part", "both alike", "one sees nothing"],
+)
+def test_the_answer_whose_borders_are_seen_is_taken(first, second, boundary, second_wins):
+    assert prefer_second([first, second], boundary, EVERYWHERE) is second_wins
+
+
+@pytest.mark.heavy
+def test_ids_are_dense_and_containers_come_first(tmp_path: Path) -> None:
+    services, config = Services(Path()), Config()
+    for folder in synthesize_captures(tmp_path / "captures", 3, 11):
+        row = ImageRow(scene_id="x", kind=SceneKind.CAPTURE, uri=str(folder))
+        seen = observe(row, config, np.random.default_rng(0), services)
+        assert isinstance(seen, Done), seen
+        view = find_table(seen.value, np.random.default_rng(0))
+        found = detect_with_both(view, config, services)
+        assert found.ids is not None
+        assert set(np.unique(found.ids)) == {*range(len(found.candidates) + 1)}
+        for index, candidate in enumerate(found.candidates):
+            assert candidate.instance == index + 1
+            assert candidate.container is None or candidate.container < index
