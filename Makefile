@@ -48,7 +48,8 @@ demo: setup ## captures and bare pictures -> dataset (Ray) with trajectories -> 
 	$(BIN)/tableverse synth $(DEMO)/captures --scenes $(SCENES) --seed 7
 	$(BIN)/tableverse synth $(DEMO)/other --scenes 1 --seed 8
 	mkdir $(DEMO)/pictures && mv $(DEMO)/other/*/color.png $(DEMO)/pictures/table.png
-	$(BIN)/python -c 'import skimage.data, shutil; shutil.copy(skimage.data.data_dir + "/coffee.png", "$(DEMO)/pictures")'
+	$(BIN)/python -c 'import skimage.data as data; from PIL import Image; \
+		Image.fromarray(data.coffee()).save("$(DEMO)/pictures/coffee.png")'
 	$(BIN)/tableverse manifest $(DEMO)/captures $(DEMO)/pictures --out $(DEMO)/images.parquet
 	$(BIN)/tableverse build $(DEMO)/images.parquet $(DEMO)/out --executor ray \
 		--stages +trajectories --set trajectories.max_tasks=$(TASKS)
