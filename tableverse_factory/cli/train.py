@@ -86,6 +86,10 @@ def train_picture(
         int, typer.Option("--scenes", "-n", min=1, max=3_000, help="Settled scenes whose meshes are used.")
     ] = 1_200,
     seed: Annotated[int, typer.Option(min=0, help="Seed of scenes, order and first weights.")] = 0,
+    start: Annotated[
+        Path | None,
+        typer.Option("--from", dir_okay=False, help="Start from the weights.safetensors of another training."),
+    ] = None,
     device: TrainDevice = "auto",
     jobs: Annotated[
         int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make scenes; one per CPU by default.")
@@ -119,7 +123,7 @@ def train_picture(
     if not pool.is_file():
         with count_progress("scenes", scenes) as made:
             make_pool(scenes, seed + 1, made, processes).write(pool)
-    run = TrainRun(folder, pool, where, processes, math.inf if minutes is None else minutes)
+    run = TrainRun(folder, pool, where, processes, math.inf if minutes is None else minutes, start=start)
     done = train_pictures(settings, run, lambda line: print(line, file=sys.stderr, flush=True))
     path = folder / "picture.onnx"
     difference = export_network(folder, path)

@@ -28,6 +28,7 @@ class PictureSettings:
         samples: Rays per pixel.
         packages, patterns: Textures, of which a package has three.
         rate: Peak of the learning rate.
+        start: SHA-256 of the weights that the training starts from; empty if it starts from random ones.
     """
 
     steps: int
@@ -44,6 +45,7 @@ class PictureSettings:
     packages: int = 320
     patterns: int = 900
     rate: float = 1.2e-3
+    start: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -129,10 +131,9 @@ def write_weights(average: Any, folder: Path) -> None:
     partial.rename(folder / WEIGHTS)
 
 
-def read_weights(folder: Path, network: Any) -> None:
-    """Load what `write_weights` wrote."""
+def read_weights(path: Path, network: Any) -> None:
+    """Load the weights that `write_weights` wrote."""
     safetensors = import_extra("safetensors", "training", "models")
-    path = folder / WEIGHTS
     try:
         with safetensors.safe_open(path, "pt") as file:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping

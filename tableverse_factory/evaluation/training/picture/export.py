@@ -8,7 +8,7 @@ import numpy as np
 
 from tableverse_factory.core.errors import ModelError
 from tableverse_factory.core.optional_imports import import_extra
-from tableverse_factory.evaluation.training.picture.checkpoint import read_weights
+from tableverse_factory.evaluation.training.picture.checkpoint import WEIGHTS, read_weights
 from tableverse_factory.evaluation.training.picture.network import make_network
 from tableverse_factory.models.local.device import import_torch
 from tableverse_factory.models.picture.net import INPUTS, MAPS, VECTORS, PictureNet
@@ -27,7 +27,7 @@ def export_network(folder: Path, path: Path) -> float:
     """
     onnx: Any = import_extra("onnx", "training", "models")
     network = make_network(0)
-    read_weights(folder, network)
+    read_weights(folder / WEIGHTS, network)
     partial = path.with_suffix(".partial")
     _trace(network.eval(), partial)
     model = onnx.load(partial)

@@ -1,10 +1,11 @@
 """Training of the network of pictures on views that are rendered beside it."""
 
 import copy
+import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from tableverse_factory.evaluation.training.picture.checkpoint import (
     PictureSettings,
     TrainPosition,
     load_checkpoint,
+    read_weights,
     save_checkpoint,
     write_weights,
 )
@@ -42,7 +44,7 @@ Log = Callable[[str], object]
 
 @dataclass(frozen=True, slots=True)
 class TrainRun:
-    """How a training is run; none of it changes the weights, but the device.
+    """How a training is run; none of it changes the weights, but the device and `start`.
 
     Attributes:
         folder: Of the checkpoint and of the weights.
@@ -52,6 +54,7 @@ class TrainRun:
         minutes: After which to stop with a checkpoint.
         save_minutes: Between checkpoints.
         validate: Whether to measure held-out views at every checkpoint.
+        start: Weights to start from, as `write_weights` writes them; random ones without.
     """
 
     folder: Path
@@ -61,6 +64,7 @@ class TrainRun:
     minutes: float = math.inf
     save_minutes: float = 4.0
     validate: bool = True
+    start: Path | None = None
 
 
 def train_pictures(settings: PictureSettings, run: TrainRun, log: Log) -> int:
@@ -84,8 +88,14 @@ class _Trainer:
 
     def __init__(self, settings: PictureSettings, run: TrainRun, log: Log) -> None:
         self._started = time.monotonic()
-        self._settings, self._run, self._log = settings, run, log
-        self._network = make_network(settings.seed).to(run.device, memory_format=torch.channels_last).train()
+        self._run, self._log = run, log
+        network = make_network(settings.seed)
+        if run.start is not None:
+            read_weights(run.start, network)
+            with run.start.open("rb") as file:
+                settings = replace(settings, start=hashlib.file_digest(file, "sha256").hexdigest())
+        self._settings = settings
+        self._network = network.to(run.device, memory_format=torch.channels_last).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
         position = load_checkpoint(run.folder, self._network, self._average, self._optimizer, settings, run.device)

@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="the extra `models` is not installed
 onnx = pytest.importorskip("onnx", reason="the extra `models` is not installed")
 from tableverse_factory.core.errors import ModelError  # noqa: E402
 from tableverse_factory.evaluation.training.picture import export as export_module  # noqa: E402
-from tableverse_factory.evaluation.training.picture.checkpoint import read_weights, write_weights  # noqa: E402
+from tableverse_factory.evaluation.training.picture.checkpoint import WEIGHTS, read_weights, write_weights  # noqa: E402
 from tableverse_factory.evaluation.training.picture.export import export_network  # noqa: E402
 from tableverse_factory.evaluation.training.picture.network import make_network  # noqa: E402
 from tableverse_factory.models.picture.net import INPUTS, MAPS, VECTORS, load_picture_net  # noqa: E402
@@ -36,7 +36,7 @@ def test_the_file_says_what_the_network_says_at_any_size_and_has_the_same_bytes_
     export_network(folder, path)
     assert path.read_bytes() == first
     network = make_network(0).eval()
-    read_weights(folder, network)
+    read_weights(folder / WEIGHTS, network)
     net = load_picture_net(str(path))
     for height, width in ((32, 64), (96, 48)):
         ys, xs = np.mgrid[:height, :width] / width - 0.5

@@ -97,22 +97,38 @@ def test_checkpoints_of_other_settings_or_another_network_or_of_nothing_are_refu
         with pytest.raises(InputError, match="of another network than this version trains"):
             train(tmp_path, pool_file)
         with pytest.raises(InputError, match="holds no weights of this network"):
-            read_weights(tmp_path, make_network(0))
+            read_weights(tmp_path / WEIGHTS, make_network(0))
     for name, match in ((CHECKPOINT, "is not a checkpoint"), (WEIGHTS, "holds no weights")):
         data = (tmp_path / name).read_bytes()
         for damaged in (b"", b"\x80\x04 no safetensors", data[: len(data) // 2]):
             (tmp_path / name).write_bytes(damaged)
             with pytest.raises(InputError, match=match):
-                train(tmp_path, pool_file) if name == CHECKPOINT else read_weights(tmp_path, make_network(0))
+                train(tmp_path, pool_file) if name == CHECKPOINT else read_weights(tmp_path / WEIGHTS, make_network(0))
 
 
 def test_weights_are_the_averages_in_half_precision(pool_file: Path, tmp_path: Path) -> None:
     train(tmp_path, pool_file, replace(SETTINGS, steps=1))
     network, saved = make_network(0), load_file(tmp_path / CHECKPOINT)
-    read_weights(tmp_path, network)
+    read_weights(tmp_path / WEIGHTS, network)
     for name, tensor in network.state_dict().items():
         assert torch.allclose(tensor.float(), saved[f"mean.{name}"].float(), rtol=1e-3, atol=1e-6), name
     assert (tmp_path / WEIGHTS).stat().st_size < 2.2 * sum(p.numel() for p in network.parameters())
+
+
+def test_a_training_starts_from_the_weights_of_another_and_continues_from_no_others(
+    pool_file: Path, tmp_path: Path
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    train(first, pool_file)
+    settings = replace(SETTINGS, seed=1, rate=1e-9)
+    train(second, pool_file, settings, start=first / WEIGHTS)
+    old, new = (load_file(folder / WEIGHTS) for folder in (first, second))
+    convolutions = [name for name in old if name.endswith("convolve.weight")]
+    assert all(torch.allclose(old[name].float(), new[name].float(), atol=1e-5) for name in convolutions)
+    with pytest.raises(InputError, match="is of another training"):
+        train(second, pool_file, settings)
+    with pytest.raises(InputError, match="is of another training"):
+        train(second, pool_file, settings, start=second / WEIGHTS)
 
 
 def test_held_out_views_are_measured_at_a_checkpoint(
