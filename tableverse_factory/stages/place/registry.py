@@ -7,6 +7,7 @@ import numpy as np
 
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.stages.place.completion.overlap import remove_overlaps
 from tableverse_factory.stages.place.completion.select_shape import complete_by_carving
 from tableverse_factory.stages.place.interfaces import Completion, MeshModel
 from tableverse_factory.stages.place.mesh_service.model_completion import complete_with_model
@@ -42,8 +43,15 @@ def complete_one_by_one(
     return answers
 
 
+def complete_scene_by_carving(
+    scene: PerceivedObjects, views: Sequence[ObjectView], *_: object
+) -> list[Completion | GeometryError]:
+    """Complete the objects of a scene one by one, then remove the overlaps of what nobody saw."""
+    return remove_overlaps(scene, views, complete_one_by_one(complete_by_carving, scene, views))
+
+
 MESH_MODELS: dict[str, MeshModel] = {
-    "carved": partial(complete_one_by_one, complete_by_carving),
+    "carved": complete_scene_by_carving,
     "replay": partial(complete_one_by_one, replay_mesh),
     "sam3d": complete_with_model,
     "triposr": complete_with_model,

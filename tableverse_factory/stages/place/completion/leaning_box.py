@@ -22,6 +22,7 @@ MIN_SECOND_SHARE = 0.08
 THICKNESS_M = 0.008  # initial length of a hidden side [m]
 SINK_WEIGHT = 0.2  # weight of corners below the support, against the misfit of rays
 MAX_SINK_M = 0.05  # from which a corner counts no more [m]
+FLOAT_WEIGHT = 0.05  # weight of the height of the lowest corner above the support, which has to be touched
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
@@ -44,7 +45,11 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
         half, axes = _decode_half_size(x), base_axes @ rotation_matrix(_decode_turn(x))
         heights = x[2] + _CORNERS @ (half * axes[2])
         sunk = np.minimum(np.maximum(view.support_z - heights, 0.0), MAX_SINK_M).mean()
-        return compute_misfit(rays, intersect_box(rays, x[:3], axes, half)) + SINK_WEIGHT * float(sunk)
+        return (
+            compute_misfit(rays, intersect_box(rays, x[:3], axes, half))
+            + SINK_WEIGHT * float(sunk)
+            + FLOAT_WEIGHT * max(float(heights.min()) - view.support_z, 0.0)
+        )
 
     for scale, calls in ((1.0, 300), (0.4, 200)):
         simplex = np.vstack([start, start + np.diag(scale * steps)])
