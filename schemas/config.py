@@ -165,9 +165,9 @@ class PerceiveConfig(RemoteModelSection):
     ] = "auto"
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `geometric`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `ensemble` chooses between
-    these two for each pile, where a sensor measured depth. `learned` is a net of
-    `tableverse train segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of
-    OpenAI's chat completions, `gemini` Google's own protocol.
+    these two for each pile where a sensor measured depth; else it is `picture`. `learned` is a net of `tableverse train
+    segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of OpenAI's chat
+    completions, `gemini` Google's own protocol.
     """
     detector_weights: Weights = ""
     """The `.onnx` file of `learned`, or of `picture`, whose own is in the package; of `grounding_dino` a folder, or
@@ -186,7 +186,9 @@ class PerceiveConfig(RemoteModelSection):
     `gemini`. Our own from depth, our net of bare pictures, or a model with weights.
     """
     segmenter_weights: Weights = ""
-    """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; empty for the published ones."""
+    """Folder, or `owner/name` or `owner/name@revision` on the hub, of the segmenter; an `.onnx` file of `picture`.
+    Empty for the published ones.
+    """
     segmenter_batch: Annotated[int, Field(ge=1, le=256)] = 8
     """Pictures per batch of the segmenter on a GPU."""
     max_objects: Annotated[int, Field(ge=1, le=200)] = 60

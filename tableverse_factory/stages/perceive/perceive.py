@@ -39,7 +39,8 @@ def perceive(
 ) -> Outcome[PerceivedObjects]:
     """Find the table and the objects on it; their points are denoised, in the camera frame."""
     name = choose_detector(item, config.perceive)
-    view = find_scaled_table(item, rng, find_table_top(item, config.perceive) if name == "picture" else None)
+    table_top = find_table_top(item, config.perceive.detector_weights) if name == "picture" else None
+    view = find_scaled_table(item, rng, table_top)
     if isinstance(view, Dropped):
         return view
     found = DETECTORS[name](view, config, services)
@@ -78,11 +79,13 @@ def perceive(
 
 def choose_detector(item: Observation, config: PerceiveConfig) -> str:
     """Choose the backend; only a model's depth is bent, and that of a bare picture."""
-    if config.detector != "auto":
+    if config.detector not in ("auto", "ensemble"):
         return config.detector
-    if item.recorded_detections is not None:
+    if config.detector == "auto" and item.recorded_detections is not None:
         return "replay"
-    return "picture" if item.bend else "geometric"
+    if item.bend:
+        return "picture"
+    return "geometric" if config.detector == "auto" else "ensemble"
 
 
 def segment_boxes(view: TableView, found: DetectionResult, config: Config) -> IdImage:

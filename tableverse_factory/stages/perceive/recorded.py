@@ -21,5 +21,7 @@ def record_detector(config: Config, before: Mapping[str, Any]) -> dict[str, Any]
 
 def record_segmenter(config: Config, before: Mapping[str, Any]) -> dict[str, Any] | None:
     """Record the weights of a segmenter that has any (see `record_weights`)."""
-    backend = config.perceive.segmenter
-    return None if backend in ("geometric", "picture") else record_weights("segmenter", backend, config, before)
+    backend, weights = config.perceive.segmenter, config.perceive.segmenter_weights
+    if backend == "picture":
+        return record_onnx("perceive.segmenter_weights", weights) if weights else None
+    return None if backend == "geometric" else record_weights("segmenter", backend, config, before)

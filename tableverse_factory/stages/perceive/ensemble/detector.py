@@ -11,7 +11,7 @@ from scipy import ndimage
 from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
 from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, predict_observation
@@ -29,7 +29,7 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
     """Detect objects by depth and by the net, and choose one answer for each pile."""
     answers = detect_from_depth(view, config, services), detect_in_picture(view, config, services)
     ids = [_get_ids(answer) for answer in answers]
-    seen = predict_observation(view.observation, config.perceive).boundary
+    seen = predict_observation(view.observation, config.perceive.detector_weights).boundary
     height, width = view.valid.shape
     boundary = np.asarray(Image.fromarray(seen).resize((width, height), Image.Resampling.BILINEAR))
     near = ndimage.binary_dilation((ids[0] > 0) | (ids[1] > 0), iterations=BESIDE_PX)
@@ -73,20 +73,24 @@ def _find_borders(ids: IdImage) -> Mask:
 def _merge_answers(
     answers: Sequence[DetectionResult], ids: Sequence[IdImage], piles: IdImage, by_net: np.ndarray
 ) -> DetectionResult:
-    """Take from each answer the candidates in its piles; a container lies in the pile of its contents."""
-    merged = np.zeros_like(ids[0])
-    kept: list[Candidate] = []
-    for source, answer in enumerate(answers):
-        place: dict[int, int] = {}  # of a candidate among those that are kept
-        for index, candidate in enumerate(answer.candidates):
-            mask = ids[source] == candidate.instance
-            if not mask.any() or by_net[piles[mask][0]] != source:
-                continue
-            place[index] = len(kept)
-            merged[mask] = len(kept) + 1
-            container = None if candidate.container is None else place.get(candidate.container)
-            kept.append(replace(candidate, instance=len(kept) + 1, container=container))
-    return DetectionResult(tuple(kept), ids=merged)
+    """Take from each answer what lies in its piles; `by_net` says for each pile whether that is the second one."""
+    chosen = by_net[piles]
+    shares = [np.where(chosen == source, own, 0) for source, own in enumerate(ids)]
+    kept = [
+        (source, index)
+        for source, answer in enumerate(answers)
+        for index, candidate in enumerate(answer.candidates)
+        if (shares[source] == candidate.instance).any()
+    ]
+    instances = {key: k for k, key in enumerate(kept, start=1)}
+    merged, candidates = np.zeros_like(ids[0]), []
+    for (source, index), instance in instances.items():
+        candidate = answers[source].candidates[index]
+        merged[shares[source] == candidate.instance] = instance
+        holder = None if candidate.container is None else instances.get((source, candidate.container))
+        container = None if holder is None else holder - 1
+        candidates.append(replace(candidate, instance=instance, container=container))
+    return DetectionResult(tuple(candidates), ids=merged)
 
 
 def _get_ids(answer: DetectionResult) -> IdImage:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from schemas.config import Config, PerceiveConfig
+from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
@@ -28,29 +28,31 @@ from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_cont
 
 def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
-    found = predict_observation(view.observation, config.perceive)
+    found = predict_observation(view.observation, config.perceive.detector_weights)
     regions = keep_objects(keep_regions_over_table(segment_prediction(found, view.valid.shape), view), view)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
     detections = to_detections(regions, find_containers(regions, find_rims(regions, view), view))
+    if not view.observation.bend:  # a sensor's depth tells by itself what stands on the table
+        return detections
     return replace(detections, shown=_find_label(found, OBJECT, view.valid.shape))
 
 
 def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Config) -> IdImage:
     """Assign the objects and the table-top that the net sees to the boxes of a detector."""
-    seen = predict_observation(view.observation, config.perceive)
+    seen = predict_observation(view.observation, config.perceive.segmenter_weights)
     ids = assign_regions_to_boxes(segment_prediction(seen, view.valid.shape), found)
     return np.where((ids == 0) & _find_label(seen, TABLE, view.valid.shape), TABLE_ID, ids)
 
 
-def find_table_top(item: Observation, config: PerceiveConfig) -> Mask:
+def find_table_top(item: Observation, weights: str) -> Mask:
     """Find the pixels of the table-top. Shape (h, w)."""
-    return _find_label(predict_observation(item, config), TABLE, item.depth.shape)
+    return _find_label(predict_observation(item, weights), TABLE, item.depth.shape)
 
 
-def predict_observation(item: Observation, config: PerceiveConfig) -> PicturePrediction:
+def predict_observation(item: Observation, weights: str) -> PicturePrediction:
     """Ask the net, which also reads the depth of a sensor; that of a model would tell it nothing new."""
-    return predict_picture(item.color, item.camera, None if item.bend else item.depth, config.detector_weights)
+    return predict_picture(item.color, item.camera, None if item.bend else item.depth, weights)
 
 
 def _find_label(found: PicturePrediction, label: int, shape: tuple[int, int]) -> Mask:

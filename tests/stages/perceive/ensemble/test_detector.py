@@ -1,5 +1,6 @@
-"""The detector `ensemble`: which of two answers a pile gets, and that what it takes stays whole."""
+"""The detector `ensemble`: which of two answers a pile gets, and that what it takes overlaps nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,11 @@ from schemas.outcome import Done
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
-from tableverse_factory.stages.perceive.ensemble.detector import detect_with_both, prefer_second
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
+from tableverse_factory.stages.perceive.ensemble.detector import _merge_answers, detect_with_both, prefer_second
+from tableverse_factory.stages.perceive.perceive import choose_detector
 from tableverse_factory.stages.perceive.table import find_table
+from tests.helpers.tabletop_views import look
 
 SHAPE = (80, 120)
 ONE = np.zeros(SHAPE, dtype=np.int32)
@@ -50,6 +54,28 @@ EVERYWHERE = np.ones(SHAPE, dtype=bool)
 )
 def test_the_answer_whose_borders_are_seen_is_taken(first, second, boundary, second_wins):
     assert prefer_second([first, second], boundary, EVERYWHERE) is second_wins
+
+
+def test_every_pixel_comes_from_the_answer_of_its_pile_and_containers_stay() -> None:
+    """One object of the first answer lies in both piles; contents are listed before their container."""
+    piles = np.array([[1, 1, 1, 0, 2, 2, 2]], dtype=np.int32)
+    ids = [np.array([[2, 1, 1, 0, 1, 1, 1]], dtype=np.int32), np.array([[1, 1, 1, 0, 3, 2, 2]], dtype=np.int32)]
+    box = (0.0, 0.0, 1.0, 1.0)
+    first = [Candidate("spoon", 1.0, box, 1, container=1), Candidate("cup", 1.0, box, 2)]
+    second = [Candidate(name, 1.0, box, k) for k, name in enumerate(("lost", "box", "lid"), start=1)]
+    second[1] = replace(second[1], container=0)
+    answers = [DetectionResult(tuple(each), ids=own) for each, own in zip((first, second), ids, strict=True)]
+    merged = _merge_answers(answers, ids, piles, np.array([False, False, True]))
+    assert merged.ids is not None
+    assert merged.ids.tolist() == [[2, 1, 1, 0, 4, 3, 3]]
+    told = [(item.label, item.instance, item.container) for item in merged.candidates]
+    assert told == [("spoon", 1, 1), ("cup", 2, None), ("box", 3, None), ("lid", 4, None)]
+
+
+@pytest.mark.parametrize(("bend", "chosen"), [(0.0, "ensemble"), (0.015, "picture")])
+def test_without_the_depth_of_a_sensor_there_is_nothing_to_choose_from(bend: float, chosen: str) -> None:
+    config = Config.model_validate({"perceive": {"detector": "ensemble"}})
+    assert choose_detector(replace(look([])[0], bend=bend), config.perceive) == chosen
 
 
 @pytest.mark.heavy

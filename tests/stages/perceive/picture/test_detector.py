@@ -11,13 +11,16 @@ from schemas.config import Config
 from schemas.geometry import IdImage
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
-from schemas.outcome import Done, Outcome
-from tableverse_factory.core.errors import ModelAccessError
+from schemas.outcome import Done, Dropped, Outcome
+from tableverse_factory.core.errors import ConfigError, ModelAccessError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.perceive.picture.detector import detect_in_picture
+from tableverse_factory.stages.perceive.recorded import record_segmenter
+from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import CAMERA, Box, best_overlaps, camera_above, look
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08), color=(40, 90, 200)))
@@ -105,6 +108,9 @@ def test_the_net_reads_the_depth_of_a_sensor_too(view: tuple[Path, IdImage]) -> 
     assert outcome.value.observation.scale_source == "sensor"
     assert outcome.value.camera_to_table.position[2] == pytest.approx(0.6, rel=0.01)
     assert min(best_overlaps(ids, outcome.value.instance_ids)) > 0.7
+    alone = find_table(sensed.value, np.random.default_rng(0), None)
+    assert not isinstance(alone, Dropped)
+    assert detect_in_picture(alone, config, Services(Path())).shown is None, "the sensor tells what has to be explained"
 
 
 @pytest.mark.heavy
@@ -132,7 +138,7 @@ def test_the_boxes_of_a_detector_get_masks(tmp_path: Path) -> None:
     true = np.asarray(Image.open(folder / "masks.png")).astype(np.int32)
     (folder / "masks.png").unlink()
     row = ImageRow(scene_id="x", kind=SceneKind.CAPTURE, uri=str(folder))
-    perceived = {"detector": "replay", "segmenter": "picture", "min_explained": 0.0}
+    perceived = {"detector": "replay", "segmenter": "picture", "min_explained": 0.0, "detector_weights": "another/net"}
     config = Config.model_validate({"perceive": perceived})
     seen = observe(row, config, np.random.default_rng(0), Services(Path()))
     assert isinstance(seen, Done), seen
@@ -141,3 +147,9 @@ def test_the_boxes_of_a_detector_get_masks(tmp_path: Path) -> None:
     overlaps = best_overlaps(np.where(true > 0, true + 1, 0), outcome.value.instance_ids)
     assert np.mean(np.array(overlaps) > 0.5) > 0.5
     assert len({o.label for o in outcome.value.objects}) > 1
+    assert record_segmenter(config, {}) is None, "its weights are part of the code"
+    named = Config.model_validate({"perceive": {**perceived, "segmenter_weights": str(tmp_path / "own.onnx")}})
+    with pytest.raises(ConfigError, match=r"perceive\.segmenter_weights: .*own\.onnx' is not there"):
+        record_segmenter(named, {})
+    with pytest.raises(ModelAccessError, match=r"own\.onnx' is no file"):
+        perceive(seen.value, named, np.random.default_rng(0), Services(Path()))
