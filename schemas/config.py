@@ -1,53 +1,15 @@
 """Configuration, a section per stage. Every key has a default and a docstring; unknown keys are errors."""
 
-import os
-import re
 from abc import abstractmethod
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from schemas.address import ModelUrl
-
-Metres = Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
-
-def _check_variable_name(name: str) -> str:
-    """Check the name of an environment variable; the error does not show it, since it may be a misplaced key."""
-    if name and not re.fullmatch(r"[A-Z_][A-Z0-9_]{0,63}", name):
-        raise ValueError("must be the NAME of an environment variable, in capitals; never the key itself")
-    return name
-
+from schemas.config_values import VOCABULARY, Interval, KeyVariable, Metres, ModelName, Positive, Vocabulary, Weights
 
 MODEL_LOAD_S = 1200.0  # wall time in which a model downloads and loads its weights, and its process starts [s]
 MAX_SLOW_MESHES = 30  # objects of a scene that may each take the whole `place.mesh_timeout_s`; most take much less
-
-# What a detector with a vocabulary is asked for, besides the table and people
-VOCABULARY = (
-    *("cup", "mug", "glass", "bottle", "can", "jar", "bowl", "plate", "tray", "basket", "box", "carton", "bag", "tin"),
-    *("pot", "pan", "kettle", "teapot", "cutting board", "knife", "fork", "spoon", "chopsticks", "spatula", "napkin"),
-    *("fruit", "vegetable", "bread", "cake", "book", "notebook", "paper", "pen", "scissors", "tape", "stapler"),
-    *("phone", "laptop", "keyboard", "computer mouse", "remote control", "headphones", "lamp", "clock", "camera"),
-    *("toy", "ball", "vase", "plant", "candle", "glasses", "wallet", "keys", "tool", "screwdriver", "hammer", "drill"),
-)
-MAX_VOCABULARY = 200
-
-
-def _check_vocabulary(labels: tuple[str, ...]) -> tuple[str, ...]:
-    twice = sorted({label for label in labels if labels.count(label) > 1})
-    if twice:
-        raise ValueError(f"{twice[0]!r} stands twice")
-    return labels
-
-
-KeyVariable = Annotated[str, Field(max_length=4096), AfterValidator(_check_variable_name)]
-VocabularyLabel = Annotated[str, Field(max_length=60, pattern=r"^[a-z0-9]+([ '-][a-z0-9]+)*$")]
-Vocabulary = Annotated[
-    tuple[VocabularyLabel, ...], Field(min_length=1, max_length=MAX_VOCABULARY), AfterValidator(_check_vocabulary)
-]
-Weights = Annotated[str, Field(max_length=4096), AfterValidator(os.path.expanduser)]
-ModelName = Annotated[str, Field(max_length=200, pattern=r"^[A-Za-z0-9._:/@+-]*$")]
 
 
 class Section(BaseModel):
@@ -145,12 +107,12 @@ class ObserveConfig(StageSection):
     """Focal length of bare pictures that neither the model nor EXIF gives [px]; null: 58 degrees on the longer side."""
     min_table_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.9
     """`picture`: least probability that a table-top is shown; else the picture is dropped as `no_table`."""
-    table_distance_m: tuple[Positive, Positive] = (0.1, 4.0)
+    table_distance_m: Interval = (0.1, 4.0)
     """`picture`: least and greatest distance of the camera from the table's plane [m]."""
     min_view_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 8.0
     """`picture`: least angle between the camera's axis and the table [degrees]."""
     max_roll_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 40.0
-    """`picture`: greatest angle by which the table is turned about the camera's axis [degrees]."""
+    """`picture`: greatest angle between the table's normal and the camera's vertical plane [degrees]."""
 
     @property
     def _extra_s(self) -> float:

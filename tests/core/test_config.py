@@ -76,6 +76,7 @@ def test_numbers_are_read_as_people_write_them(text):
         ("rectify.clearance_m=.nan", ["rectify.clearance_m", "nan", "at least 0, at most 100"]),
         ("rectify.clearance_m=.inf", ["rectify.clearance_m", "inf"]),
         ("perceive.detector=magic", ["'magic'", "one of auto, geometric, picture, ensemble, learned, replay"]),
+        ("observe.table_distance_m=[4, 0.1]", ["observe.table_distance_m", "4, must be less than the second, 0.1"]),
         ("seed=3", ["section.key=value"]),
         ("run.seed", ["section.key=value"]),
         ("a.b.c=1", ["section.key=value"]),

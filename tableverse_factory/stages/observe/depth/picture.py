@@ -44,7 +44,7 @@ def check_table(found: PicturePrediction, bounds: ObserveConfig) -> None:
     if not (low <= found.distance_m <= high and steepness >= bounds.min_view_deg and roll <= bounds.max_roll_deg):
         raise AnswerInvalidError(
             f"the table's plane would be {found.distance_m:.2f} m from the camera (observe.table_distance_m = {low:g} "
-            f"to {high:g}), seen {round(steepness)}° down (observe.min_view_deg = {bounds.min_view_deg:g}) and turned "
-            f"by {round(roll)}° (observe.max_roll_deg = {bounds.max_roll_deg:g})",
+            f"to {high:g}), seen {round(steepness)}° down (observe.min_view_deg = {bounds.min_view_deg:g}) and tilted "
+            f"sideways by {round(roll)}° (observe.max_roll_deg = {bounds.max_roll_deg:g})",
             "table_out_of_bounds",
         )

@@ -147,7 +147,7 @@ def test_the_plane_has_bounds() -> None:
         ({"distance_m": 4.5}, "4.50 m from the camera"),
         ({"normal": level}, "seen 1° down"),
         ({"normal": -steep}, "seen -90° down"),
-        ({"normal": turned}, "turned by 46°"),
+        ({"normal": turned}, "tilted sideways by 46°"),
     ):
         with pytest.raises(AnswerInvalidError, match=words) as refused:
             check_table(replace(found, **wrong), bounds)

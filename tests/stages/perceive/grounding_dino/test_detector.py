@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.config import VOCABULARY, Config
+from schemas.config import Config
+from schemas.config_values import VOCABULARY
 from schemas.outcome import Done
 from tableverse_factory.core.config import build_config
 from tableverse_factory.core.errors import ConfigError, ModelAccessError
