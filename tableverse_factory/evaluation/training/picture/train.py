@@ -167,8 +167,10 @@ class _Trainer:
             torch._foreach_copy_(list(self._average.buffers()), list(self._network.buffers()))
 
     def _save(self) -> None:
-        """Save, and measure the held-out views."""
+        """Save, and measure the held-out views; weights that are not finite are refused."""
         ring, folder = self._ring, self._run.folder
+        if not all(torch.isfinite(each).all() for each in self._average.parameters()):
+            raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
         position = TrainPosition(self._step, ring.packs_done, ring.made, tuple(ring.past))
         save_checkpoint(folder, self._network, self._average, self._optimizer, self._settings, position)
         write_weights(self._average, folder)

@@ -155,6 +155,11 @@ def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(po
     with pytest.raises(ModelError, match=r"loss of step 2 is not finite: .*; the last checkpoint is kept"):
         train(tmp_path, pool_file, wild)
     assert (tmp_path / CHECKPOINT).read_bytes() == kept
+    for path in tmp_path.iterdir():
+        path.unlink()
+    with pytest.raises(ModelError, match=r"weights of step 2 are not finite; the last checkpoint is kept"):
+        train(tmp_path, pool_file, wild, save_minutes=0.0)  # between two looks at the loss
+    assert (tmp_path / CHECKPOINT).read_bytes() == kept
 
 
 def test_the_rate_rises_stays_and_falls() -> None:
