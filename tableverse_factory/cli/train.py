@@ -17,21 +17,24 @@ train = typer.Typer(name="train", help="Train networks on synthetic scenes.", no
 TrainFolder = Annotated[
     Path, typer.Argument(metavar="DIR", callback=require_local_path, help="New folder, or one to continue.")
 ]
+TrainSteps = Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps, of --batch views each.")]
+TrainBatch = Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")]
+TrainSeed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of scenes, order and first weights.")]
 TrainDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device to train on.")]
+TrainJobs = Annotated[
+    int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make views; one per CPU by default.")
+]
 
 
 @train.command("segmenter")
 def train_segmenter(
     folder: TrainFolder,
     scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, max=1_000_000, help="Training scenes.")] = 2000,
-    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps, of --batch views each.")] = 20_000,
-    batch: Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")] = 16,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of scenes, order and first weights.")] = 0,
+    steps: TrainSteps = 20_000,
+    batch: TrainBatch = 16,
+    seed: TrainSeed = 0,
     device: TrainDevice = "auto",
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", "-j", min=0, help="Processes that make and augment views; one per CPU by default."),
-    ] = None,
+    jobs: TrainJobs = None,
 ) -> None:
     """Train the network of the detector `learned` on depth images of synthetic scenes.
 
@@ -74,26 +77,24 @@ def train_segmenter(
 @train.command("picture")
 def train_picture(
     folder: TrainFolder,
-    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps, of --batch samples each.")] = 7_900,
+    steps: TrainSteps = 7_900,
     minutes: Annotated[
         float | None, typer.Option(min=0.1, help="Stop with a checkpoint after so many; the command again continues.")
     ] = None,
-    batch: Annotated[int, typer.Option(min=1, max=1024, help="Samples per step.")] = 64,
+    batch: TrainBatch = 64,
     views: Annotated[
         int, typer.Option(min=64, max=1_000_000, help="Views that are kept to draw from, 1.3 MB of the GPU each.")
     ] = 24_000,
     scenes: Annotated[
         int, typer.Option("--scenes", "-n", min=1, max=3_000, help="Settled scenes whose meshes are used.")
     ] = 1_200,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of scenes, order and first weights.")] = 0,
+    seed: TrainSeed = 0,
     start: Annotated[
         Path | None,
         typer.Option("--from", dir_okay=False, help="Start from the weights.safetensors of another training."),
     ] = None,
     device: TrainDevice = "auto",
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make scenes; one per CPU by default.")
-    ] = None,
+    jobs: TrainJobs = None,
 ) -> None:
     """Train the network of pictures, with a sensor's depth and without, on views that a GPU renders beside it.
 
@@ -104,7 +105,6 @@ def train_picture(
     """
     import math
 
-    from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.core.process_pool import count_available_cpus
 
@@ -113,22 +113,30 @@ def train_picture(
         import_extra("cupy", "rendering on a GPU", "training")
     from tableverse_factory.evaluation.training.picture.checkpoint import PictureSettings  # these import torch
     from tableverse_factory.evaluation.training.picture.export import export_network
-    from tableverse_factory.evaluation.training.picture.pool import make_pool
     from tableverse_factory.evaluation.training.picture.train import TrainRun, train_pictures
 
     processes = count_available_cpus() if jobs is None else jobs
     settings = PictureSettings(steps, scenes, seed, batch, capacity=views, first=min(views, 2_000))
-    pool = folder / f"meshes_{scenes}_{seed}.npz"
-    folder.mkdir(parents=True, exist_ok=True)
-    if not pool.is_file():
-        with count_progress("scenes", scenes) as made:
-            make_pool(scenes, seed + 1, made, processes).write(pool)
+    pool = _provide_pool(folder, scenes, seed, processes)
     run = TrainRun(folder, pool, where, processes, math.inf if minutes is None else minutes, start=start)
     done = train_pictures(settings, run, lambda line: print(line, file=sys.stderr, flush=True))
     path = folder / "picture.onnx"
     difference = export_network(folder, path)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, within {difference:.0e} of the net in torch")
     print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
+
+
+def _provide_pool(folder: Path, scenes: int, seed: int, jobs: int) -> Path:
+    """Settle the scenes whose meshes are used, unless an earlier command did, and return their file."""
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.evaluation.training.picture.pool import make_pool
+
+    path = folder / f"meshes_{scenes}_{seed}.npz"
+    folder.mkdir(parents=True, exist_ok=True)
+    if not path.is_file():
+        with count_progress("scenes", scenes) as made:
+            make_pool(scenes, seed + 1, made, jobs).write(path)  # + 1: so was the network of the package trained
+    return path
 
 
 def _prepare_training(device: Literal["auto", "cpu", "cuda"]) -> "Device":

@@ -159,7 +159,8 @@ def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(po
         path.unlink()
     with pytest.raises(ModelError, match=r"weights of step 2 are not finite; the last checkpoint is kept"):
         train(tmp_path, pool_file, wild, save_minutes=0.0)  # between two looks at the loss
-    assert (tmp_path / CHECKPOINT).read_bytes() == kept
+    with safe_open(tmp_path / CHECKPOINT, "pt") as file:
+        assert json.loads(file.metadata()["position"])["step"] == 1
 
 
 def test_the_rate_rises_stays_and_falls() -> None:
