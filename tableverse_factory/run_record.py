@@ -18,17 +18,8 @@ FORMAT = "tableverse-dataset-1"
 # Packages that decide bytes.
 PACKAGES = (
     *("coacd", "coal", "embreex", "manifold3d", "mujoco", "mujoco-menagerie", "networkx", "numpy", "onnxruntime"),
-    *(
-        "open3d-cpu",
-        "pillow",
-        "pyarrow",
-        "pydantic",
-        "scikit-image",
-        "scipy",
-        "tableverse-factory",
-        "toppra",
-        "trimesh",
-    ),
+    *("open3d-cpu", "pillow", "pyarrow", "pydantic", "scikit-image", "scipy", "tableverse-factory", "toppra"),
+    "trimesh",
 )
 CODE = "versions.code"  # key of the hash of this package's code: a checkout may change it under the same version
 AFTERWARDS = "afterwards"  # part with the versions that added trajectories to a dataset which others had made

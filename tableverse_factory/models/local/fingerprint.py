@@ -1,6 +1,5 @@
 """Identity of a model with weights for run.json: versions of its packages and a hash of its files."""
 
-import hashlib
 import json
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
@@ -10,6 +9,7 @@ from schemas.config import ModelsConfig
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import select_device
+from tableverse_factory.models.local.weight_files import hash_file
 
 PACKAGES = ("torch", "transformers")
 # Distributions that are installed from git, by depth model.
@@ -35,7 +35,7 @@ def identify_model(weights: str, config: ModelsConfig, package: str | None = Non
         except ModelAccessError:
             found["device"] = "none"
     if files := _list_files(weights):
-        found["sha256"] = content_hash(*(f"{path.name} {_hash_file(path)}".encode() for path in files))
+        found["sha256"] = content_hash(*(f"{path.name} {hash_file(path)}".encode() for path in files))
     return found
 
 
@@ -66,12 +66,7 @@ def identify_onnx_model(weights: str) -> dict[str, Any]:
     """Collect the version of onnxruntime, and the hash of an ONNX file if it exists."""
     path = Path(weights)
     found: dict[str, Any] = {"onnxruntime": _read_version("onnxruntime")}
-    return {**found, "sha256": _hash_file(path)} if path.is_file() else found
-
-
-def _hash_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return {**found, "sha256": hash_file(path)} if path.is_file() else found
 
 
 def _read_version(name: str) -> str:

@@ -113,8 +113,8 @@ def check_file(model: ModelEntry, commit: str, file: WeightFile, locked: WeightF
     if not commit or not path.is_file():
         return FileState(file.name, "missing")
     size, sizes = path.stat().st_size, [wanted.size for wanted in (file, locked) if wanted and wanted.size is not None]
-    if any(size != wanted for wanted in sizes):
-        return FileState(file.name, "damaged", f"{size} bytes, not {sizes[0]}")
+    if wrong := [wanted for wanted in sizes if wanted != size]:
+        return FileState(file.name, "damaged", f"{size} bytes, not {wrong[0]}")
     wanted = file.sha256 or (locked.sha256 if locked else "")
     named = "" if wanted else path.resolve().name
     if SHA256.fullmatch(wanted or named):

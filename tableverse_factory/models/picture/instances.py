@@ -145,7 +145,7 @@ def _renumber(ids: np.ndarray) -> IdImage:
 
 
 def upsample_ids(ids: IdImage, shape: tuple[int, int]) -> IdImage:
-    """Resize an image of ids: each pixel has the id with the greatest bilinear weight there."""
+    """Resize an image of ids: each pixel has the id with a bilinear weight of more than one half there, else 0."""
     if ids.shape == shape:
         return ids
     result, best = np.zeros(shape, dtype=np.int32), np.full(shape, 0.5, dtype=np.float32)

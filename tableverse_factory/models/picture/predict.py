@@ -11,7 +11,7 @@ from scipy.special import expit, softmax
 
 from schemas.geometry import Camera, DepthImage, Frozen, Picture
 from schemas.identity import content_hash
-from tableverse_factory.geometry.math.camera import rescale_camera
+from tableverse_factory.geometry.math.camera import backproject, rescale_camera
 from tableverse_factory.models.picture.net import MULTIPLE, load_picture_net
 
 LEAST_PIXELS, MOST_PIXELS = 76_800, 118_000  # of the net's input: it was trained at 320 x 240 and more
@@ -90,9 +90,8 @@ def _list_sizes() -> Iterator[tuple[int, int]]:
 
 def compute_rays(camera: Camera) -> Float32[np.ndarray, "3 h w"]:
     """Compute unit directions of the pixels, in the camera frame."""
-    v, u = np.indices((camera.height, camera.width), dtype=np.float64)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)])
-    return (rays / np.linalg.norm(rays, axis=0)).astype(np.float32)
+    rays = np.moveaxis(backproject(np.ones((camera.height, camera.width), np.float32), camera), -1, 0)
+    return np.ascontiguousarray(rays / np.linalg.norm(rays, axis=0), dtype=np.float32)
 
 
 def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"], weights: str) -> PicturePrediction:
