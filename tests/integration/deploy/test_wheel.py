@@ -21,7 +21,7 @@ from tests.helpers.paths import ROOT
 PACKAGES = ("schemas", "tableverse_factory", "workers")
 BUILD = "import sys, hatchling.build; hatchling.build.build_wheel(sys.argv[1])"
 """What `make build` has pip do, without pip's own environment, for which an index would be asked."""
-SUFFIXES = (".py", ".typed", ".html", ".css", ".js", ".svg", ".json", ".yaml", ".onnx", ".sha256")
+SUFFIXES = (".py", ".typed", ".html", ".css", ".js", ".svg", ".json", ".yaml", ".onnx", ".sha256", ".cu")
 ELSEWHERE = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
 
 
