@@ -46,31 +46,19 @@ def bench_picture(
         return
     _show_scores(scores, total)
     if others:
-        wrong = [name for name, reason in others.items() if not reason]
-        print(f"without a table: {len(others) - len(wrong)} of {len(others)} dropped; not {', '.join(wrong) or 'one'}")
+        kept = [name for name, reason in others.items() if not reason]
+        print(f"without a table: {len(others) - len(kept)} of {len(others)} dropped; kept: {', '.join(kept) or 'none'}")
 
 
 def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
-    columns = (
-        "picture",
-        "depth %",
-        "plane °",
-        "scale %",
-        "σ %",
-        "mean IoU",
-        "recall@0.5",
-        "overlap F",
-        "CPU s",
-        "dropped",
-    )
+    geometry, masks = ("depth %", "plane °", "scale %", "σ %"), ("mean IoU", "recall@0.5", "overlap F")
+    columns = ("picture", *geometry, *masks, "CPU s", "dropped")
     rows: list[tuple[object, ...]] = []
     for s in scores:
-        shares = (s.depth_error, s.plane_deg / 100, math.expm1(-s.log_scale), s.scale_sigma)
-        rows.append(
-            (s.name, *(_format(100 * share) for share in shares), *_format_masks(s.masks), f"{s.cpu_s:.2f}", s.reason)
-        )
-    figures = _format(100 * total.depth_error), _format(total.plane_deg), _format(100 * total.scale_error), ""
-    rows.append(("all", *figures, *_format_masks(total.masks), f"{total.cpu_s:.2f}", f"{total.dropped}"))
+        figures = (100 * s.depth_error, s.plane_deg, 100 * math.expm1(-s.log_scale), 100 * s.scale_sigma)
+        rows.append((s.name, *map(_format, figures), *_format_masks(s.masks), f"{s.cpu_s:.2f}", s.reason))
+    figures = (100 * total.depth_error, total.plane_deg, 100 * total.scale_error, math.nan)
+    rows.append(("all", *map(_format, figures), *_format_masks(total.masks), f"{total.cpu_s:.2f}", f"{total.dropped}"))
     print_figures(columns, rows, "depth error in the mean, one scale taken out; angle, scale and CPU s in the median")
     print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")
 

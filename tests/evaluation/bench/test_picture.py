@@ -81,7 +81,7 @@ def test_the_table_of_a_real_capture(tmp_path, run, shared_dir) -> None:
     assert code == 0, errors
     for word in ("osd_test14", "depth %", "scale %", "mean IoU", "CPU s", "within one stated standard deviation"):
         assert word in said
-    assert "without a table: 1 of 1 dropped; not one" in said
+    assert "without a table: 1 of 1 dropped; kept: none" in said
     code, said, errors = run("bench", "picture", captures, "--json")
     assert code == 0, errors
     (score,) = json.loads(said)["pictures"]
