@@ -25,7 +25,9 @@ def bench_perception(
     detector: Annotated[
         str, typer.Option(help="Detector to measure: geometric, picture, ensemble, learned or replay.")
     ] = "geometric",
-    weights: Annotated[str, typer.Option(metavar="FILE", help="The .onnx file of `learned`.")] = "",
+    weights: Annotated[
+        str, typer.Option(metavar="FILE", help="The .onnx file of `learned`, or another one of `picture`.")
+    ] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:

@@ -27,6 +27,7 @@ from tableverse_factory.evaluation.bench.perception import (
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import COLOR_NAMES, read_id_image
+from tableverse_factory.sources.image_file import read_image
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 
@@ -85,9 +86,8 @@ def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, st
     if not names:
         raise InputError(f"{str(folder)!r} holds no picture")
     for name in names:
-        seen = _observe(SceneKind.IMAGE, folder / name, config)
-        outcome = perceive(seen.value, config, _seed(config), Services(Path())) if isinstance(seen, Done) else seen
-        yield name, getattr(outcome, "reason", "")
+        read_image(str(folder / name), config.observe)  # a file that is no picture is none that was dropped rightly
+        yield name, getattr(_perceive_picture(folder / name, config), "reason", "")
 
 
 def score_picture(capture: Path, config: Config, with_focal: bool = False) -> PictureScore:
@@ -98,8 +98,7 @@ def score_picture(capture: Path, config: Config, with_focal: bool = False) -> Pi
         config = config.model_copy(update={"observe": focal})
     color = next(capture / name for name in COLOR_NAMES if (capture / name).is_file())
     start = time.process_time()
-    seen = _observe(SceneKind.IMAGE, color, config)
-    outcome = perceive(seen.value, config, _seed(config), Services(Path())) if isinstance(seen, Done) else seen
+    outcome = _perceive_picture(color, config)
     cpu_s = time.process_time() - start
     ids = _read_objects(capture, sensor, truth, config)
     found = outcome.value if isinstance(outcome, Done) else None
@@ -169,7 +168,7 @@ def _perceive_truth(capture: Path, config: Config) -> tuple[Observation, Perceiv
     seen = _observe(SceneKind.CAPTURE, capture, own)
     if not isinstance(seen, Done):
         raise InputError(f"{capture.name}: {seen}")
-    outcome = perceive(seen.value, own, _seed(config), Services(Path()))
+    outcome = perceive(seen.value, own, _seed(own), Services(Path()))
     return seen.value, outcome.value if isinstance(outcome, Done) else None
 
 
@@ -187,6 +186,11 @@ def _read_objects(capture: Path, sensor: Observation, truth: PerceivedObjects | 
 def _observe(kind: SceneKind, path: Path, config: Config) -> Outcome[Observation]:
     row = ImageRow(scene_id=check_id("picture"), kind=kind, uri=str(path))
     return observe(row, config, _seed(config), Services(Path()))
+
+
+def _perceive_picture(path: Path, config: Config) -> Outcome[PerceivedObjects]:
+    seen = _observe(SceneKind.IMAGE, path, config)
+    return perceive(seen.value, config, _seed(config), Services(Path())) if isinstance(seen, Done) else seen
 
 
 def _seed(config: Config) -> np.random.Generator:

@@ -105,3 +105,7 @@ def test_a_folder_without_other_pictures_is_refused(tmp_path, run) -> None:
     code, _, errors = run("bench", "picture", tmp_path / "captures", "--other", tmp_path / "others")
     assert code != 0
     assert "holds no picture" in errors
+    (tmp_path / "others" / "notes.txt").write_text("no picture, and no table either")
+    code, _, errors = run("bench", "picture", tmp_path / "captures", "--other", tmp_path / "others")
+    assert code != 0
+    assert "notes.txt" in errors
