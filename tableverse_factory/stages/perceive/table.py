@@ -275,7 +275,7 @@ def _thin(xy: Points2) -> Points2:
 
 def _remove_strips(flat: Mask, tolerance_px: float) -> Mask:
     """Remove strips as narrow as those where an upright face crosses the plane's height."""
-    size = 2 * int(np.ceil(1.2 * tolerance_px)) + 1
+    size = 2 * int(np.ceil(min(1.2 * tolerance_px, max(flat.shape)))) + 1  # a wider window sees no more
     core = ndimage.minimum_filter(flat.astype(np.uint8), size, mode="nearest")
     return flat & (ndimage.maximum_filter(core, size) > 0)
 

@@ -13,7 +13,7 @@ from tableverse_factory.geometry.math.transforms import rotation_angle, rotation
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
-from tableverse_factory.stages.perceive.table import find_table, refit_table_to_box
+from tableverse_factory.stages.perceive.table import _remove_strips, find_table, refit_table_to_box
 from tests.helpers.tabletop_views import Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
@@ -251,3 +251,12 @@ def test_the_table_of_real_captures_does_not_depend_on_the_seed(shared_dir):
         for seed in range(2):
             view = find_table(observation, np.random.default_rng(seed))
             assert -view.plane.offset == pytest.approx(height, abs=0.004), name
+
+
+def test_strips_wider_than_the_picture_cost_no_more_than_the_picture():
+    """The focal length of a file may be a million pixels, and the depth of a net a micrometre."""
+    flat = np.ones((40, 50), dtype=bool)
+    assert _remove_strips(flat, 1e15).all()
+    flat[20] = False
+    for wide in (10.0, 30.0, 60.0, 1e15):
+        assert _remove_strips(flat, wide).any() == (wide < 16.0), "nineteen rows are left on each side"
