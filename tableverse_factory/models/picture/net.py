@@ -24,7 +24,17 @@ _Arrays = Mapping[str, Float32[np.ndarray, "..."]]
 
 
 class PictureNet:
-    """A session with the inputs `INPUTS` and the outputs `MAPS` and `VECTORS`."""
+    """A session with the inputs `INPUTS` and the outputs `MAPS` and `VECTORS`, in the camera's frame.
+
+    Inputs: `image` RGB in 0-1; `rays` the pixels' unit directions; `depth` of a sensor [m], 0 where there is none.
+
+    Maps: `label` logits of neither, table and object; `log_depth` natural logarithm of the depth [m]; `height` over the
+    table as a share of the depth; `center` logit of the middle of an object; `votes` from each pixel to the middle of
+    its object, x and y [px]; `boundary` logit of an edge between objects.
+
+    Vectors: `plane` the table's unit normal towards the camera, and its distance [m]; `table` logit of a table-top
+    being shown; `log_scale_sigma` standard deviation of the logarithm of the scale.
+    """
 
     def __init__(self, path: Path, data: bytes) -> None:
         self._name = path.name

@@ -27,7 +27,6 @@ class PicturePrediction(Frozen):
         camera: At this size.
         depth: Distance along the optical axis [m].
         label: Probabilities of `OTHER`, `TABLE` and `OBJECT`.
-        center: Logits of being the middle of an object.
         votes: From each pixel to the middle of its object, x and y [px].
         boundary: Probability of an edge between objects.
         normal: Of the table, towards the camera, in the camera frame; a unit vector.
@@ -39,7 +38,6 @@ class PicturePrediction(Frozen):
     camera: Camera
     depth: Float32[np.ndarray, "h w"]
     label: Float32[np.ndarray, "3 h w"]
-    center: Float32[np.ndarray, "h w"]
     votes: Float32[np.ndarray, "2 h w"]
     boundary: Float32[np.ndarray, "h w"]
     normal: Float64[np.ndarray, "3"]
@@ -105,7 +103,6 @@ def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"],
         small,
         np.exp(np.minimum(out["log_depth"][0], _MAX_LOG_DEPTH)),
         softmax(out["label"], axis=0),
-        out["center"][0],
         out["votes"],
         expit(out["boundary"][0]),
         plane[:3] / max(float(np.linalg.norm(plane[:3])), 1e-9),

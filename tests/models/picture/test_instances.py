@@ -25,7 +25,6 @@ def make_prediction(*things: tuple[slice, slice]) -> PicturePrediction:
         Camera(120.0, 120.0, 63.5, 47.5, COLUMNS, ROWS),
         np.ones((ROWS, COLUMNS), np.float32),
         label,
-        np.zeros((ROWS, COLUMNS), np.float32),
         votes,
         np.zeros((ROWS, COLUMNS), np.float32),
         np.array([0.0, 0.0, -1.0]),

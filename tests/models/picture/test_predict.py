@@ -46,7 +46,7 @@ def digest(found: PicturePrediction) -> str:
 
 def check_sound(found: PicturePrediction, rows: int, columns: int) -> None:
     """Every field has its shape and its bounds."""
-    assert found.depth.shape == found.center.shape == found.boundary.shape == (rows, columns)
+    assert found.depth.shape == found.boundary.shape == (rows, columns)
     assert found.label.shape == (3, rows, columns)
     assert found.votes.shape == (2, rows, columns)
     for one in fields(found):

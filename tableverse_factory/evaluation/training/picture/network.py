@@ -74,7 +74,7 @@ class Attention(Module):  # type: ignore[misc]
 
 
 class PictureNetwork(Module):  # type: ignore[misc]
-    """Image, rays and depth in; the outputs of `models.picture` out."""
+    """Image, rays and depth in; the outputs that `models.picture.net` describes out."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -101,10 +101,7 @@ class PictureNetwork(Module):  # type: ignore[misc]
             self.dense.bias.copy_(torch.tensor([0.0, 0, 0, 0, 0, 0, -3, 0, 0, -2, 0, 0, 0, 0, 0, 0]))
 
     def forward(self, image: Tensor, rays: Tensor, depth: Tensor) -> tuple[Tensor, ...]:
-        """Compute label, log_depth, height, center, votes, boundary, plane, table, log_scale_sigma.
-
-        Image is RGB in 0-1, rays unit directions in the camera's frame, depth metres or 0. See docs/models.md.
-        """
+        """Compute the maps and the vectors of `PictureNet`, in the order of `MAPS` and `VECTORS`."""
         slopes = rays[:, :2] / rays[:, 2:].clamp(min=0.05)
         steps = (slopes[:, :1, :, 1:] - slopes[:, :1, :, :-1]).mean((1, 2, 3)).clamp(min=1e-6)
         zoom = -(steps * REFERENCE_PX).log()[:, None, None, None]  # of the focal length against the reference
