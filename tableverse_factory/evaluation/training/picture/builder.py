@@ -1,4 +1,4 @@
-"""A scene under construction, and its rows once built; `tracer.cu` names their columns."""
+"""A scene under construction, and its rows once built; `columns.py` names what they hold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,16 +7,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from schemas.geometry import Frozen
+from tableverse_factory.evaluation.training.picture.columns import Instance, Light, Material, Scene, View
 from tableverse_factory.evaluation.training.picture.materials import TextureBook, make_thing_material
-from tableverse_factory.evaluation.training.picture.tables import (
-    INSTANCE,
-    LIGHT,
-    MATERIAL,
-    SCENE,
-    VIEW,
-    MeshTables,
-    stack_rows,
-)
+from tableverse_factory.evaluation.training.picture.tables import MeshTables, stack_rows
 from tableverse_factory.evaluation.training.picture.things import Part, make_turn
 
 MAX_THINGS = 250
@@ -39,7 +32,7 @@ class SceneBuilder:
     def __init__(self, tables: MeshTables, book: TextureBook) -> None:
         self.tables = tables
         self.book = book
-        self.row = np.zeros(SCENE, dtype=np.float32)
+        self.row = np.zeros(Scene.WIDTH, dtype=np.float32)
         self.lights: list[np.ndarray] = []
         self.views: list[np.ndarray] = []
         self.boxes: list[np.ndarray] = []  # low and high corner of each thing that has an id [m]
@@ -53,15 +46,15 @@ class SceneBuilder:
 
     def add_mesh(self, mesh: int, map_: np.ndarray, offset: np.ndarray, material: int, id_: int = 0) -> np.ndarray:
         """Add a mesh under an affine map; return the corners of its box in the table's frame [m]. Shape (2, 3)."""
-        row = np.zeros(INSTANCE, dtype=np.float32)
+        row = np.zeros(Instance.WIDTH, dtype=np.float32)
         inverse = np.linalg.inv(map_)
-        row[:12] = np.column_stack([inverse, -inverse @ offset]).ravel()
+        row[Instance.TO_LOCAL] = np.column_stack([inverse, -inverse @ offset]).ravel()
         low, high = self.tables.low[mesh], self.tables.high[mesh]
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         moved = corners @ map_.T + offset
         box = np.stack([moved.min(axis=0) - 1e-4, moved.max(axis=0) + 1e-4])
-        row[12:18] = box.ravel()
-        row[18:21] = self.tables.roots[mesh], material, id_
+        row[Instance.BOX] = box.ravel()
+        row[Instance.ROOT], row[Instance.MATERIAL], row[Instance.ID] = self.tables.roots[mesh], material, id_
         self._instances.append(row)
         return box
 
@@ -103,14 +96,14 @@ class SceneBuilder:
 
     def build(self) -> SceneTables:
         """Return the rows."""
-        self.row[0], self.row[19] = len(self._instances), len(self.lights)
-        views = np.array(self.views, dtype=np.float32).reshape(-1, VIEW)
-        views[:, 18], views[:, 19] = self.row[7] > 0.5, len(self.boxes)
+        self.row[Scene.INSTANCES], self.row[Scene.LIGHTS] = len(self._instances), len(self.lights)
+        views = np.array(self.views, dtype=np.float32).reshape(-1, View.WIDTH)
+        views[:, View.HAS_TABLE], views[:, View.THINGS] = self.row[Scene.TABLE_KIND] > 0.5, len(self.boxes)
         return SceneTables(
             self.row[None].copy(),
-            stack_rows(self._instances, INSTANCE),
-            stack_rows(self._materials, MATERIAL),
-            stack_rows(self.lights, LIGHT),
+            stack_rows(self._instances, Instance.WIDTH),
+            stack_rows(self._materials, Material.WIDTH),
+            stack_rows(self.lights, Light.WIDTH),
             views,
         )
 
@@ -121,10 +114,10 @@ def join_scenes(scenes: Sequence[SceneTables]) -> SceneTables:
     instances = materials = lights = 0
     for index, each in enumerate(scenes):
         row, own, views = each.scenes.copy(), each.instances.copy(), each.views.copy()
-        row[0, 1], row[0, 20] = instances, lights
-        row[0, [8, 15, 16, 17, 18]] += materials
-        own[:, 19] += materials
-        views[:, 16] = index
+        row[0, Scene.FIRST_INSTANCE], row[0, Scene.FIRST_LIGHT] = instances, lights
+        row[0, [Scene.TABLE_MATERIAL, Scene.FLOOR, Scene.WALL, Scene.CEILING, Scene.OTHER_WALL]] += materials
+        own[:, Instance.MATERIAL] += materials
+        views[:, View.SCENE] = index
         for part, rows in zip(parts, (row, own, each.materials, each.lights, views), strict=True):
             part.append(rows)
         instances, materials, lights = instances + len(own), materials + len(each.materials), lights + len(each.lights)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from tableverse_factory.evaluation.training.picture.builder import SceneTables
+from tableverse_factory.evaluation.training.picture.columns import View
 from tableverse_factory.evaluation.training.picture.tables import TABLE_SIDE, TABLE_TOP
 from tableverse_factory.models.local.device import Tensor, import_torch
 
@@ -84,8 +85,9 @@ def _find_useful(views: Views) -> Tensor:
     things = ((views.ids > 0) & (views.ids < TABLE_SIDE)).flatten(1).float().mean(1)
     table = (views.ids == TABLE_TOP).flatten(1).float().mean(1)
     far = views.depth.flatten(1).amin(1) > NEAREST_M
-    shows = (table >= LEAST_TABLE) & ((things >= LEAST_THINGS) | (views.cameras[:, 19] == 0)) & (things <= MOST_THINGS)
-    without = (views.cameras[:, 18] == 0) & (table == 0)
+    is_empty = views.cameras[:, View.THINGS] == 0
+    shows = (table >= LEAST_TABLE) & ((things >= LEAST_THINGS) | is_empty) & (things <= MOST_THINGS)
+    without = (views.cameras[:, View.HAS_TABLE] == 0) & (table == 0)
     return far & (shows | without)
 
 

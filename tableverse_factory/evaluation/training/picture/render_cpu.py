@@ -4,6 +4,7 @@ import numpy as np
 
 from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.evaluation.training.picture.builder import SceneTables
+from tableverse_factory.evaluation.training.picture.columns import Instance, Material, Scene, View
 from tableverse_factory.evaluation.training.picture.exposure import Exposure
 from tableverse_factory.evaluation.training.picture.tables import TABLE_SIDE, TABLE_TOP, MeshTables
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
@@ -31,50 +32,54 @@ class CpuRenderer:
         for scene in range(len(pack.scenes)):
             meshes, own, materials = self._build_scene(pack, scene)
             caster = Raycaster(meshes)
-            for view in np.flatnonzero(pack.views[:, 16] == scene):
+            for view in np.flatnonzero(pack.views[:, View.SCENE] == scene):
                 row = pack.views[view].astype(np.float64)
-                rotation = row[3:12].reshape(3, 3)
-                camera = Camera(row[12], row[13], row[14], row[15], width, height)
-                hits = caster.cast(camera, Pose(row[:3], quaternion_from_matrix(rotation)))
+                rotation = row[View.AXES].reshape(3, 3)
+                fx, fy, cx, cy = row[View.INTRINSICS]
+                camera = Camera(fx, fy, cx, cy, width, height)
+                hits = caster.cast(camera, Pose(row[View.EYE], quaternion_from_matrix(rotation)))
                 at = np.unravel_index(hits.pixels, (height, width))
                 paint = pack.materials[materials[hits.part]]
                 side = (own[hits.part] == TABLE_TOP) & (hits.normals[:, 2] <= UP) & (hits.part == len(meshes) - 2)
                 depth[view][at] = hits.depth
                 ids[view][at] = np.where(side, TABLE_SIDE, own[hits.part])
                 normals[view][at] = np.rint(127 * hits.normals @ rotation)
-                shine[view][at] = 255 * np.clip(np.maximum(paint[:, 15], 2 * paint[:, 14] * (1 - paint[:, 13])), 0, 1)
+                gloss = 2 * paint[:, Material.SPECULAR] * (1 - paint[:, Material.ROUGHNESS])
+                shine[view][at] = 255 * np.clip(np.maximum(paint[:, Material.CLEAR], gloss), 0, 1)
                 light[view][(*at, slice(0, 3))] = 0.4 + np.clip(hits.normals @ LIGHT_DIRECTION, 0, 1)[:, None]
-                light[view][(*at, slice(3, 6))] = paint[:, 6:9] ** 2.2
+                light[view][(*at, slice(3, 6))] = paint[:, Material.COLOR] ** 2.2
         torch = import_torch()
         return Exposure(*(torch.from_numpy(each) for each in (light, depth, ids, normals, shine)))
 
     def _build_scene(self, pack: SceneTables, scene: int) -> tuple[list[TriangleMesh], np.ndarray, np.ndarray]:
         """Build the meshes of a scene, the last two its table and its room, with their ids and materials."""
         row = pack.scenes[scene].astype(np.float64)
-        first = int(row[1])
-        instances = pack.instances[first : first + int(row[0])].astype(np.float64)
+        first = int(row[Scene.FIRST_INSTANCE])
+        instances = pack.instances[first : first + int(row[Scene.INSTANCES])].astype(np.float64)
         meshes = [self._place_instance(each) for each in instances]
         meshes += [_make_table(row), _make_room(row)]
-        ids = np.concatenate([instances[:, 20], [TABLE_TOP, 0]]).astype(np.uint8)
-        return meshes, ids, np.concatenate([instances[:, 19], [row[8], row[15]]]).astype(int)
+        ids = np.concatenate([instances[:, Instance.ID], [TABLE_TOP, 0]]).astype(np.uint8)
+        materials = [*instances[:, Instance.MATERIAL], row[Scene.TABLE_MATERIAL], row[Scene.FLOOR]]
+        return meshes, ids, np.array(materials, dtype=int)
 
     def _place_instance(self, instance: np.ndarray) -> TriangleMesh:
-        to_local = instance[:12].reshape(3, 4)
-        corners = self._tables.get_triangles(int(instance[18])).reshape(-1, 3)
+        to_local = instance[Instance.TO_LOCAL].reshape(3, 4)
+        corners = self._tables.get_triangles(int(instance[Instance.ROOT])).reshape(-1, 3)
         placed = np.linalg.solve(to_local[:, :3], (corners - to_local[:, 3]).T).T
         return TriangleMesh(placed, np.arange(len(placed), dtype=np.int32).reshape(-1, 3))
 
 
 def _make_table(row: np.ndarray) -> TriangleMesh:
-    place, thick = (row[2], row[3], -row[4]), float(row[4])
-    if row[7] < 0.5:
+    (half_x, half_y), thick = row[Scene.HALF_SIZE], float(row[Scene.THICKNESS])
+    place = (*row[Scene.TABLE_XY], -thick)
+    if row[Scene.TABLE_KIND] < 0.5:
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
-    if row[7] > 1.5:
-        return revolve(np.array([[row[5], 0.0], [row[5], thick]])).translate(place).to_mesh()
-    return make_block((2 * row[5], 2 * row[6], thick)).translate(place).to_mesh()
+    if row[Scene.TABLE_KIND] > 1.5:
+        return revolve(np.array([[half_x, 0.0], [half_x, thick]])).translate(place).to_mesh()
+    return make_block((2 * half_x, 2 * half_y, thick)).translate(place).to_mesh()
 
 
 def _make_room(row: np.ndarray) -> TriangleMesh:
-    size = row[12:15] - row[9:12]
-    middle = (row[9:12] + row[12:15]) / 2
-    return make_prism([(size[0], size[1])], 0.0, size[2]).translate((middle[0], middle[1], row[11])).to_mesh()
+    low, high = row[Scene.ROOM_LOW], row[Scene.ROOM_HIGH]
+    (x, y, z), (width, depth, height) = low, high - low
+    return make_prism([(width, depth)], 0.0, height).translate((x + width / 2, y + depth / 2, z)).to_mesh()

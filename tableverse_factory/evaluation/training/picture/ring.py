@@ -7,9 +7,9 @@ from itertools import count
 
 from tableverse_factory.core.process_pool import parallel_stream
 from tableverse_factory.evaluation.training.picture.builder import SceneTables
+from tableverse_factory.evaluation.training.picture.columns import View
 from tableverse_factory.evaluation.training.picture.exposure import Renderer, Views, develop_views
 from tableverse_factory.evaluation.training.picture.scenes import SceneMaker
-from tableverse_factory.evaluation.training.picture.tables import VIEW
 from tableverse_factory.models.local.device import import_torch
 
 torch = import_torch()
@@ -28,8 +28,8 @@ class ViewRing:
     """The last `capacity` views of a stream of packs; `past` are the numbers of views of its packs so far."""
 
     def __init__(self, renderer: Renderer, capacity: int, size: tuple[int, int], seed: int, device: str) -> None:
-        width, height = size
-        shapes = ((3, height, width), (height, width), (height, width), (3, height, width), (height, width), (VIEW,))
+        plain = (size[1], size[0])
+        shapes = ((3, *plain), plain, plain, (3, *plain), plain, (View.WIDTH,))
         kinds = (torch.uint8, torch.float32, torch.uint8, torch.int8, torch.uint8, torch.float32)
         self._slots = Views(
             *(torch.zeros((capacity, *shape), dtype=k, device=device) for shape, k in zip(shapes, kinds, strict=True))

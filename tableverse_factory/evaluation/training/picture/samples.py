@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from tableverse_factory.evaluation.training.picture.columns import View
 from tableverse_factory.evaluation.training.picture.exposure import FARTHEST_M, GAMMA, Views
 from tableverse_factory.evaluation.training.picture.sensor import sense_depth
 from tableverse_factory.evaluation.training.picture.tables import TABLE_SIDE, TABLE_TOP
@@ -68,8 +69,8 @@ def make_sample(
 
     `size` is the width and height of augmented samples [px], else those of the views.
     """
-    image, labels, camera = views.images.float() / 255, _stack_labels(views), views.cameras[:, 12:16].clone()
-    plane = torch.cat([views.cameras[:, 9:12], views.cameras[:, 2:3]], dim=1)
+    image, labels, camera = views.images.float() / 255, _stack_labels(views), views.cameras[:, View.INTRINSICS].clone()
+    plane = torch.cat([views.cameras[:, View.UP], views.cameras[:, [View.HEIGHT]]], dim=1)
     if augment:
         image, labels, camera, mirrored = _crop(image, labels, camera, size)
         plane = plane * torch.cat([mirrored[:, None], torch.ones_like(plane[:, 1:])], dim=1)
@@ -86,7 +87,7 @@ def make_sample(
     else:
         has_depth = torch.arange(count, device=depth.device) < round(count * depth_share)
     sensed = sensed[:, None] * has_depth[:, None, None, None]
-    table, solid = views.cameras[:, 18].clone(), torch.ones_like(focal)
+    table, solid = views.cameras[:, View.HAS_TABLE].clone(), torch.ones_like(focal)
     if augment:
         image = _swap_surroundings(image, ids, has_depth)
         image, flat = _flatten_some(image, has_depth)

@@ -7,6 +7,7 @@ import numpy as np
 
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.training.picture.builder import MAX_THINGS, SceneBuilder, SceneTables, join_scenes
+from tableverse_factory.evaluation.training.picture.columns import Material, Scene, View
 from tableverse_factory.evaluation.training.picture.materials import (
     PLAIN,
     TextureBook,
@@ -22,7 +23,7 @@ from tableverse_factory.evaluation.training.picture.surroundings import (
     add_room,
     add_table,
 )
-from tableverse_factory.evaluation.training.picture.tables import VIEW, MeshTables
+from tableverse_factory.evaluation.training.picture.tables import MeshTables
 from tableverse_factory.evaluation.training.picture.things import Part, ThingMaker, arrange_things, make_turn
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 
@@ -111,26 +112,26 @@ class SceneMaker:
 def _furnish_without_table(rng: np.random.Generator, builder: SceneBuilder) -> None:
     """Make a room, a landscape, or a face-like blob before a wall, where no table is."""
     row = builder.row
-    row[2:7] = 0.0, 0.0, 0.0, 0.01, 0.01
-    row[8] = builder.add_material(make_surface_material(rng, builder.book))
-    row[11] = -rng.uniform(0.7, 1.6)
+    row[Scene.HALF_SIZE] = 0.01
+    row[Scene.TABLE_MATERIAL] = builder.add_material(make_surface_material(rng, builder.book))
+    row[Scene.FLOOR_Z] = -rng.uniform(0.7, 1.6)
     add_room(rng, builder)
     kind = rng.random()
     if kind < 0.35:  # outdoors
-        row[9:11], row[12:14] = -60.0, 60.0
-        row[14], row[24] = 30.0, 1.0
-        row[25:28] = np.clip(rng.uniform(0.02, 1.0) * rng.uniform(0.7, 1.2, 3), 0, 1.5)
-        dimmed = row[25:28] * rng.uniform(0.2, 1.0, 3)
-        row[28:31] = np.clip(dimmed + rng.uniform(0, 0.3) * np.array([0, 0.2, 0.6]), 0, 2)
-        for slot in (15, 16):
+        row[Scene.ROOM_LOW][:2], row[Scene.ROOM_HIGH][:2] = -60.0, 60.0
+        row[Scene.CEILING_Z], row[Scene.HAS_SKY] = 30.0, 1.0
+        row[Scene.HORIZON] = np.clip(rng.uniform(0.02, 1.0) * rng.uniform(0.7, 1.2, 3), 0, 1.5)
+        dimmed = row[Scene.HORIZON] * rng.uniform(0.2, 1.0, 3)
+        row[Scene.ZENITH] = np.clip(dimmed + rng.uniform(0, 0.3) * np.array([0, 0.2, 0.6]), 0, 2)
+        for slot in (Scene.FLOOR, Scene.WALL):
             material = make_surface_material(rng, builder.book)
-            material[2:4] *= rng.uniform(0.05, 0.5)
+            material[Material.SCALE] *= rng.uniform(0.05, 0.5)
             row[slot] = builder.add_material(material)
     if kind < 0.7:
         add_furniture(rng, builder, 14)
     else:
         _add_portrait(rng, builder)
-    add_light(rng, builder, np.array([0.0, 0.0, float(row[11]) / 2]))
+    add_light(rng, builder, np.array([0.0, 0.0, float(row[Scene.FLOOR_Z]) / 2]))
 
 
 def _add_portrait(rng: np.random.Generator, builder: SceneBuilder) -> None:
@@ -142,7 +143,7 @@ def _add_portrait(rng: np.random.Generator, builder: SceneBuilder) -> None:
         low, high = builder.tables.low[mesh], builder.tables.high[mesh]
         material = make_thing_material(rng, builder.book, low, high)
         if rng.random() < 0.5:
-            material[6:9], material[12], material[25] = skin, PLAIN, 2.0
+            material[Material.COLOR], material[Material.BLEND], material[Material.BAND_START] = skin, PLAIN, 2.0
         size = rng.uniform(0.1, 0.5, 3) if index < 3 else rng.uniform(0.02, 0.15, 3)
         place = rng.normal(0, 0.18, 3) + np.array([0, 0, 0.1])
         turn = make_turn(0, rng.uniform(0, 6.3)) @ make_turn(1, rng.uniform(0, 6.3))
@@ -170,7 +171,7 @@ def _aim_at_things(
         target[2] *= 0.6
         toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         eye = target + distance * np.array(toward)
-        inside = (eye > builder.row[9:12] + 0.06).all() and (eye < builder.row[12:15] - 0.06).all()
+        inside = (eye > builder.row[Scene.ROOM_LOW] + 0.06).all() and (eye < builder.row[Scene.ROOM_HIGH] - 0.06).all()
         if 0.08 < eye[2] < 1.6 and inside:
             return _make_view(rng, eye, target, focal, size)
     return None
@@ -181,7 +182,7 @@ def _aim_anywhere(
 ) -> list[np.ndarray]:
     """Aim cameras from about eye level to any side."""
     views = []
-    low, high = builder.row[9:12] + 0.3, builder.row[12:15] - 0.3
+    low, high = builder.row[Scene.ROOM_LOW] + 0.3, builder.row[Scene.ROOM_HIGH] - 0.3
     for _ in range(count):
         focal = size[0] * float(np.exp(rng.uniform(*np.log(FOCAL_RANGE))))
         angle, away = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2.5)
@@ -202,10 +203,10 @@ def _make_view(
     down = np.cross(forward, right)
     roll = rng.normal(0, 0.05)
     c, s = np.cos(roll), np.sin(roll)
-    view = np.zeros(VIEW, dtype=np.float32)
-    view[:3] = eye
-    view[3:12] = np.stack([c * right + s * down, c * down - s * right, forward], axis=1).ravel()
-    view[12:14] = focal
-    view[14:16] = (np.array(size) - 1) / 2 + rng.normal(0, 0.012 * size[0], 2)
-    view[17] = rng.integers(1 << 20)
+    view = np.zeros(View.WIDTH, dtype=np.float32)
+    view[View.EYE] = eye
+    view[View.AXES] = np.stack([c * right + s * down, c * down - s * right, forward], axis=1).ravel()
+    view[View.FOCAL] = focal
+    view[View.CENTER] = (np.array(size) - 1) / 2 + rng.normal(0, 0.012 * size[0], 2)
+    view[View.SEED] = rng.integers(1 << 20)
     return view

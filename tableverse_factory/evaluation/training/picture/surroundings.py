@@ -3,6 +3,7 @@
 import numpy as np
 
 from tableverse_factory.evaluation.training.picture.builder import SceneBuilder
+from tableverse_factory.evaluation.training.picture.columns import Light, Material, Scene
 from tableverse_factory.evaluation.training.picture.materials import (
     BOXED,
     TEXTURED,
@@ -11,7 +12,7 @@ from tableverse_factory.evaluation.training.picture.materials import (
     make_thing_material,
 )
 from tableverse_factory.evaluation.training.picture.patterns import pick_color, pick_skin_color
-from tableverse_factory.evaluation.training.picture.tables import LIGHT, TABLE_TOP
+from tableverse_factory.evaluation.training.picture.tables import TABLE_TOP
 from tableverse_factory.evaluation.training.picture.things import ThingMaker, make_turn
 
 SLAB, DISC = 1.0, 2.0
@@ -34,13 +35,13 @@ def add_table(rng: np.random.Generator, builder: SceneBuilder, azimuth: float, f
         center = center - 0.5 * far_m * np.array([np.cos(azimuth), np.sin(azimuth)])
         size = size + 0.5 * far_m * np.abs([np.cos(azimuth), np.sin(azimuth)])
     row = builder.row
-    row[7], row[4] = SLAB, rng.uniform(0.015, 0.07)
+    row[Scene.TABLE_KIND], row[Scene.THICKNESS] = SLAB, rng.uniform(0.015, 0.07)
     if kind < 0.14 and far_m == 0.0:
-        row[7], center = DISC, middle
+        row[Scene.TABLE_KIND], center = DISC, middle
         size = np.full(2, np.hypot(*half) + 0.02 + (rng.uniform(0, 0.12) if kind < 0.08 else rng.uniform(0, 0.5)))
     floor = rng.uniform(0.35, 0.95) if rng.random() < 0.9 else rng.uniform(0.04, 0.3)
-    row[2:4], row[5:7], row[11] = center, size, -floor
-    row[8] = builder.add_material(make_surface_material(rng, builder.book, table=True))
+    row[Scene.TABLE_XY], row[Scene.HALF_SIZE], row[Scene.FLOOR_Z] = center, size, -floor
+    row[Scene.TABLE_MATERIAL] = builder.add_material(make_surface_material(rng, builder.book, table=True))
     _add_legs(rng, builder, floor, is_desk=kind > 0.86)
     if rng.random() < 0.22:
         _add_sheets(rng, builder, middle, half)
@@ -48,10 +49,10 @@ def add_table(rng: np.random.Generator, builder: SceneBuilder, azimuth: float, f
 
 def _add_legs(rng: np.random.Generator, builder: SceneBuilder, floor: float, is_desk: bool) -> None:
     row = builder.row
-    (x, y), thick, (half_x, half_y) = row[2:4], float(row[4]), row[5:7]
+    (x, y), thick, (half_x, half_y) = row[Scene.TABLE_XY], float(row[Scene.THICKNESS]), row[Scene.HALF_SIZE]
     clear = max(floor - thick - 0.002, 0.01)
     material = builder.add_material(make_surface_material(rng, builder.book))
-    if row[7] == DISC:
+    if row[Scene.TABLE_KIND] == DISC:
         width = rng.uniform(0.03, 0.1)
         builder.add_box((width, width, clear), (x, y, -floor), material)
         return
@@ -73,12 +74,13 @@ def _add_sheets(rng: np.random.Generator, builder: SceneBuilder, middle: np.ndar
     box = builder.tables.find("box")[0]
     for _ in range(int(rng.integers(1, 4))):
         size = rng.uniform(0.1, 0.5, 2) if rng.random() < 0.6 else 2 * half * rng.uniform(0.6, 1.2, 2)
-        size = np.minimum(size, 1.7 * builder.row[5:7])
+        size = np.minimum(size, 1.7 * builder.row[Scene.HALF_SIZE])
         place = middle + rng.uniform(-1, 1, 2) * half
         row = make_surface_material(rng, builder.book)
         if rng.random() < 0.6:
-            row[0], row[1], row[12], row[31] = builder.book.pick_pattern(rng), BOXED, TEXTURED, 0.0
-            row[17:20], row[20:23] = 1.0, (-0.5, -0.5, 0.0)
+            row[Material.TEXTURE], row[Material.NEXT_FACE] = builder.book.pick_pattern(rng), 0.0
+            row[Material.MAPPING], row[Material.BLEND] = BOXED, TEXTURED
+            row[Material.SIZE], row[Material.LOW] = 1.0, (-0.5, -0.5, 0.0)
         map_ = make_turn(2, rng.uniform(0, 2 * np.pi)) @ np.diag([*size, rng.uniform(0.0003, SHEET_M)])
         builder.add_mesh(box, map_, np.array([*place, 0.0]), builder.add_material(row), TABLE_TOP)
 
@@ -86,29 +88,30 @@ def _add_sheets(rng: np.random.Generator, builder: SceneBuilder, middle: np.ndar
 def add_room(rng: np.random.Generator, builder: SceneBuilder) -> None:
     """Add floor, walls and ceiling about the table, sometimes with a wall close to it."""
     row = builder.row
-    (x, y), (half_x, half_y) = row[2:4], row[5:7]
+    (x, y), (half_x, half_y) = row[Scene.TABLE_XY], row[Scene.HALF_SIZE]
     reach = rng.uniform(0.9, 3.5, 4)
     if rng.random() < 0.4:
         reach[int(rng.integers(4))] = rng.uniform(0.001, 0.25)
-    row[9:11] = x - half_x - reach[0], y - half_y - reach[1]
-    row[12:15] = x + half_x + reach[2], y + half_y + reach[3], rng.uniform(1.4, 2.7)
-    for slot in (15, 16, 17, 18):
+    row[Scene.ROOM_LOW][:2] = x - half_x - reach[0], y - half_y - reach[1]
+    row[Scene.ROOM_HIGH] = x + half_x + reach[2], y + half_y + reach[3], rng.uniform(1.4, 2.7)
+    for slot in (Scene.FLOOR, Scene.WALL, Scene.CEILING, Scene.OTHER_WALL):
         row[slot] = builder.add_material(make_surface_material(rng, builder.book))
     if rng.random() < 0.6:
-        row[18] = row[16]
+        row[Scene.OTHER_WALL] = row[Scene.WALL]
     if rng.random() < 0.35:
         _add_carpet(rng, builder)
 
 
 def _add_carpet(rng: np.random.Generator, builder: SceneBuilder) -> None:
     row = make_plain(pick_color(rng))
-    row[16], row[0], row[1], row[12] = builder.book.count, builder.book.pick_pattern(rng), BOXED, TEXTURED
-    row[17:20], row[20:23] = 1.0, (-0.5, -0.5, 0.0)
+    row[Material.TEXTURES], row[Material.TEXTURE] = builder.book.count, builder.book.pick_pattern(rng)
+    row[Material.MAPPING], row[Material.BLEND] = BOXED, TEXTURED
+    row[Material.SIZE], row[Material.LOW] = 1.0, (-0.5, -0.5, 0.0)
     repeats = int(rng.integers(1, 4))
-    row[17:19] = 1.0 / repeats
+    row[Material.SIZE][:2] = 1.0 / repeats
     size = (*rng.uniform(1.0, 3.2, 2), 0.008)
-    place = builder.row[2:4] + rng.normal(0, 0.4, 2)
-    builder.add_box(size, (*place, float(builder.row[11])), builder.add_material(row), rng.uniform(0, 2 * np.pi))
+    place = (*(builder.row[Scene.TABLE_XY] + rng.normal(0, 0.4, 2)), float(builder.row[Scene.FLOOR_Z]))
+    builder.add_box(size, place, builder.add_material(row), rng.uniform(0, 2 * np.pi))
 
 
 def add_furniture(rng: np.random.Generator, builder: SceneBuilder, most: int = 9) -> None:
@@ -117,11 +120,11 @@ def add_furniture(rng: np.random.Generator, builder: SceneBuilder, most: int = 9
     shapes = builder.tables.find("cushion", "blob", "lathe", "prism", "limb")
     for _ in range(int(rng.integers(0, most))):
         size = np.exp(rng.uniform(np.log(0.1), np.log(0.9), 3)) * [1, 1, 1.3]
-        places = rng.uniform(row[9:11], row[12:14], (8, 2))
-        beside = (np.abs(places - row[2:4]) > row[5:7] + size[:2] / 2 + 0.05).any(axis=1)
+        places = rng.uniform(row[Scene.ROOM_LOW][:2], row[Scene.ROOM_HIGH][:2], (8, 2))
+        beside = (np.abs(places - row[Scene.TABLE_XY]) > row[Scene.HALF_SIZE] + size[:2] / 2 + 0.05).any(axis=1)
         if not beside.any():
             continue
-        place = np.array([*places[beside.argmax()], row[11]])
+        place = np.array([*places[beside.argmax()], row[Scene.FLOOR_Z]])
         kind, yaw = rng.random(), rng.uniform(0, 2 * np.pi)
         mesh = builder.tables.find("box")[0] if kind < 0.45 else shapes[int(rng.integers(len(shapes)))]
         low, high = builder.tables.low[mesh], builder.tables.high[mesh]
@@ -154,7 +157,7 @@ def add_far_clutter(
     reach = float(np.abs(toward) @ (high - low)[:2] / 2)
     across = np.array([-toward[1], toward[0]])
     for _ in range(int(rng.integers(1, 8))):
-        aside = rng.uniform(-0.9, 0.9) * float(np.abs(across) @ builder.row[5:7])
+        aside = rng.uniform(-0.9, 0.9) * float(np.abs(across) @ builder.row[Scene.HALF_SIZE])
         place = middle - toward * (reach + rng.uniform(0.28, max(0.3, far_m))) + across * aside
         thing, grow = maker.make(rng), rng.uniform(0.9, 2.4)
         turn = make_turn(2, rng.uniform(0, 2 * np.pi)) * grow
@@ -193,7 +196,7 @@ def add_light(rng: np.random.Generator, builder: SceneBuilder, middle: np.ndarra
     """Add one to four ceiling panels, windows and lamps, and an ambient term."""
     row = builder.row
     tone = 1 + rng.normal(0, 0.06, 3)
-    row[21:24] = rng.uniform(0.08, 0.55) * tone * (1 + rng.normal(0, 0.05, 3))
+    row[Scene.AMBIENT] = rng.uniform(0.08, 0.55) * tone * (1 + rng.normal(0, 0.05, 3))
     count = int(rng.choice([1, 2, 3, 4], p=[0.35, 0.3, 0.2, 0.15]))
     for share in rng.dirichlet(np.ones(count)):
         place, u, v = _place_light(rng, row, middle)
@@ -203,9 +206,9 @@ def add_light(rng: np.random.Generator, builder: SceneBuilder, middle: np.ndarra
         area = float(np.linalg.norm(facing))
         up, front = away[2] / np.sqrt(square), abs(facing @ away) / (area * np.sqrt(square))
         gain = max(up, 0.15) * max(front, 0.15) * 4 * area / np.pi / max(square, 0.05)
-        light = np.zeros(LIGHT, dtype=np.float32)
-        light[:3], light[3:6], light[6:9] = place, u, v
-        light[9:12] = np.clip(1 + rng.normal() * np.array([0.12, 0, -0.14]), 0.4, 1.6) * share / gain
+        light = np.zeros(Light.WIDTH, dtype=np.float32)
+        light[Light.CENTER], light[Light.HALF_U], light[Light.HALF_V] = place, u, v
+        light[Light.RADIANCE] = np.clip(1 + rng.normal() * np.array([0.12, 0, -0.14]), 0.4, 1.6) * share / gain
         builder.lights.append(light)
 
 
@@ -213,7 +216,7 @@ def _place_light(
     rng: np.random.Generator, row: np.ndarray, middle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place a panel: its centre and its half edges [m]."""
-    low, high = row[9:12].astype(float), row[12:15].astype(float)
+    low, high = row[Scene.ROOM_LOW].astype(float), row[Scene.ROOM_HIGH].astype(float)
     kind = rng.random()
     u, v = np.zeros(3), np.zeros(3)
     if kind < 0.5:  # ceiling

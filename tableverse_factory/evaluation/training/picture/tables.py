@@ -1,4 +1,4 @@
-"""Tables of floats that the tracer reads: lengths of their rows, and meshes with a bounding volume hierarchy each."""
+"""Tables of floats that the tracer reads: meshes with a bounding volume hierarchy each."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,6 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.training.picture.pool import MeshPool
 from tableverse_factory.evaluation.training.picture.shapes import Mesh, make_shapes
 
-INSTANCE, MATERIAL, SCENE, LIGHT, VIEW = 24, 36, 40, 12, 20  # floats a row, as in `tracer.cu`
 TABLE_TOP, TABLE_SIDE = 255, 254  # ids of the table's upper face and of its edge; things have 1-253, the rest has 0
 LEAF = 4  # most triangles of a leaf
 MAX_TRIANGLES = 1 << 24  # whose numbers a float holds

@@ -11,7 +11,7 @@ typedef unsigned int u32;
 typedef unsigned char u8;
 typedef signed char s8;
 
-// Rows of the tables that `tables.py` names.
+// Lengths of the rows of the tables whose columns `columns.py` names, and the ids of a table.
 enum { INSTANCE = 24, MATERIAL = 36, SCENE = 40, LIGHT = 12, VIEW = 20 };
 enum { TABLE_TOP = 255, TABLE_SIDE = 254 };
 enum { OF_ROOM = 1, OF_TABLE = 2, OF_MESH = 3 };
