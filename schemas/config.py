@@ -136,7 +136,7 @@ class PerceiveConfig(RemoteModelSection):
     `owner/name` or `owner/name@revision` on the Hub, empty for the published ones.
     """
     vocabulary: Vocabulary = VOCABULARY
-    """What `grounding_dino` looks for: English nouns in lower case. The table and people are found besides."""
+    """Things that `grounding_dino` looks for: English nouns in lower case. The table and people are found besides."""
     detector_score: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
     """Least score of a box of `grounding_dino`."""
     detector_overlap: Annotated[float, Field(gt=0.0, le=1.0)] = 0.7

@@ -43,7 +43,7 @@ class FetchedFile:
 
 @dataclass(frozen=True, slots=True)
 class _Offer:
-    """What the Hub says of a file, before any of it is downloaded."""
+    """A file as the Hub announces it, before any of it is downloaded."""
 
     url: str
     etag: str  # sha256 of large files, git's hash of small ones

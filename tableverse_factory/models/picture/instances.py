@@ -24,7 +24,14 @@ SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a s
 
 @dataclass(frozen=True, slots=True)
 class _Border:
-    """What separates two pieces that touch: in the median of their border, but for its length [px]."""
+    """The border of two pieces that touch.
+
+    Attributes:
+        length: [px].
+        bend: Median distance of one surface out of the other's tangent plane, as a share of that across the line of
+            sight.
+        boundary: Median probability of an edge.
+    """
 
     pieces: tuple[int, int]
     length: int

@@ -1,4 +1,4 @@
-"""What the net says about a picture: depth, table, objects, and how sure it is."""
+"""Predictions of the net of pictures: depth, table, objects, and how sure it is."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _MAX_LOG_DEPTH = 7.0  # a depth of a kilometre: what exceeds it is no room
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PicturePrediction(Frozen):
-    """What the net says, at its working size (h, w).
+    """A prediction, at the net's working size (h, w).
 
     Attributes:
         camera: At this size.

@@ -1,4 +1,4 @@
-"""What stands about the things: table, room, furniture, carpets, people's arms, clutter at the table's end, light."""
+"""Surroundings of the things: table, room, furniture, carpets, people's arms, clutter at the table's end, light."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What every process of a training reads: meshes, textures, and the makers of scenes."""
+"""Data of every process of a training: meshes, textures, and the makers of scenes."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
