@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -46,6 +45,9 @@ class PicturePrediction(Frozen):
     scale_sigma: float
 
 
+_LATEST: dict[str, PicturePrediction] = {}  # of this process, by the hash of the question
+
+
 def predict_picture(
     color: Picture, camera: Camera, depth: DepthImage | None = None, weights: str = ""
 ) -> PicturePrediction:
@@ -59,17 +61,11 @@ def predict_picture(
     """
     sensed = np.zeros(color.shape[:2], np.float32) if depth is None else np.asarray(depth, np.float32)
     key = content_hash(repr((color.shape, camera, weights)).encode(), color.tobytes(), sensed.tobytes())
-    latest = _get_latest()
-    if key not in latest:
+    if key not in _LATEST:
         made = _predict(color, camera, sensed, weights)
-        latest.clear()
-        latest[key] = made
-    return latest[key]
-
-
-@cache
-def _get_latest() -> dict[str, PicturePrediction]:
-    return {}
+        _LATEST.clear()
+        _LATEST[key] = made
+    return _LATEST[key]
 
 
 def choose_working_size(height: int, width: int) -> tuple[int, int]:
