@@ -61,12 +61,16 @@ class PictureSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrainPosition:
-    """How far a training has come: steps, packs, views, and the numbers of views of the packs in its ring."""
+    """How far a training has come: steps, packs, views, and the numbers of views of the packs in its ring.
+
+    `pool` is the sha256 of the file of meshes.
+    """
 
     step: int = 0
     packs: int = 0
     made: int = 0
     past: tuple[int, ...] = ()
+    pool: str = ""
 
 
 def save_checkpoint(

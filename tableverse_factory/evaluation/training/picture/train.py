@@ -26,6 +26,7 @@ from tableverse_factory.evaluation.training.picture.samples import make_sample
 from tableverse_factory.evaluation.training.picture.validate import validate_network
 from tableverse_factory.evaluation.training.picture.world import World, make_world
 from tableverse_factory.models.local.device import Tensor, import_torch
+from tableverse_factory.models.local.weight_files import hash_file
 
 torch = import_torch()
 
@@ -99,6 +100,9 @@ class _Trainer:
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
         position = load_checkpoint(run.folder, self._network, self._average, self._optimizer, settings, run.device)
+        self._pool = hash_file(run.pool)
+        if position.step and position.pool != self._pool:
+            raise InputError(f"{run.pool} holds other meshes than those that the checkpoint was trained on")
         world = make_world(run.pool, settings, run.jobs)
         renderer = world.make_renderer(settings, run.device)
         self._say(f"{len(world.tables.roots)} meshes, {len(world.textures)} textures")
@@ -171,7 +175,7 @@ class _Trainer:
         ring, folder = self._ring, self._run.folder
         if not all(torch.isfinite(each).all() for each in self._average.parameters()):
             raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
-        position = TrainPosition(self._step, ring.packs_done, ring.made, tuple(ring.past))
+        position = TrainPosition(self._step, ring.packs_done, ring.made, tuple(ring.past), self._pool)
         save_checkpoint(folder, self._network, self._average, self._optimizer, self._settings, position)
         write_weights(self._average, folder)
         for with_depth in (False, True) if self._held_out else ():

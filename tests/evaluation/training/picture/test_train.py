@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError, ModelError
+from tableverse_factory.evaluation.training.picture.pool import MeshPool
 from tests.evaluation.training.picture.conftest import SMALL
 
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
@@ -104,6 +105,17 @@ def test_checkpoints_of_other_settings_or_another_network_or_of_nothing_are_refu
             (tmp_path / name).write_bytes(damaged)
             with pytest.raises(InputError, match=match):
                 train(tmp_path, pool_file) if name == CHECKPOINT else read_weights(tmp_path / WEIGHTS, make_network(0))
+
+
+def test_a_checkpoint_is_continued_with_the_meshes_that_it_knows(
+    pool: MeshPool, pool_file: Path, tmp_path: Path
+) -> None:
+    train(tmp_path, pool_file, minutes=0.0)
+    others = tmp_path / "others.npz"
+    replace(pool, size=pool.size * np.float32(1.01)).write(others)
+    with pytest.raises(InputError, match=r"others\.npz holds other meshes than those that the checkpoint"):
+        train(tmp_path, others)
+    train(tmp_path, pool_file, minutes=0.0)
 
 
 def test_weights_are_the_averages_in_half_precision(pool_file: Path, tmp_path: Path) -> None:
