@@ -166,7 +166,8 @@ class Evidence(Frozen):
         masks_png: Instance ids as found in the picture, a 16-bit PNG file (0 background).
         object_pixels: Value in `masks_png` of each object, in the order of the objects.
         camera_to_table: Pose of the camera in the table frame.
-        scale_source: What metres come from, with `scale_sigma` and `intrinsics_source` as in `Observation`.
+        scale_source: What metres come from, with `scale_sigma`, `scale_deviation` and `intrinsics_source` as in
+            `Observation`.
     """
 
     color_jpg: bytes
@@ -177,6 +178,7 @@ class Evidence(Frozen):
     scale_source: ScaleSource = "sensor"
     scale_sigma: float = 0.0
     intrinsics_source: IntrinsicsSource = "capture"
+    scale_deviation: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,6 +26,8 @@ class Observation(Frozen):
         bend: Share of the distance by which the depth may be bent smoothly over the picture, as a model's is; 0 of a
             sensor, whose noise is known.
         scale_sigma: Standard deviation of the logarithm of the scale; 0 of a sensor, and where nothing tells it.
+        scale_deviation: Of a measured scale from the depth model's, in standard deviations, positive where the scene is
+            larger than estimated; None where nothing was measured or the model told no `scale_sigma`.
         known_length: From which the scale is to be measured, its pixels those of `color`; None if none is known.
     """
 
@@ -41,3 +43,4 @@ class Observation(Frozen):
     scale_source: ScaleSource = "sensor"
     intrinsics_source: IntrinsicsSource = "capture"
     known_length: KnownLength | None = None
+    scale_deviation: float | None = None

@@ -29,6 +29,7 @@ SCENES = pa.schema(
         ("known_length", pa.string()),  # of the manifest
         ("scale_source", pa.string()),  # sensor | estimated | measured | given
         ("scale_sigma", pa.float64()),  # relative standard deviation; null for layouts, and where nothing tells it
+        ("scale_deviation", pa.float64()),  # of a known length from the estimate, in standard deviations; or null
         ("intrinsics_source", pa.string()),  # capture | exif | model | assumed; null for layouts
         ("perception", pa.string()),
         ("judge", pa.string()),
@@ -38,7 +39,7 @@ SCENES = pa.schema(
         ("quality_score", pa.int32()),
         ("answered_usable", pa.bool_()),  # the judge's own word, before the checks
         ("answered_score", pa.int32()),
-        ("judge_remarks", pa.list_(pa.string())),  # codes of what was not taken as answered
+        ("judge_remarks", pa.list_(pa.string())),  # codes of what the checks of the verdict corrected
         ("judge_model", pa.string()),  # null where no model was asked, and so is the next
         ("judge_prompt_sha256", pa.string()),
         ("detector_model", pa.string()),  # null where no model was asked, and so are the next two

@@ -84,7 +84,7 @@ def describe_metric(evidence: Evidence | None) -> dict[str, Any]:
         return {"scale_source": "given"}
     is_known = evidence.scale_sigma > 0.0 or evidence.scale_source == "sensor"  # a model may tell no uncertainty
     sigma = evidence.scale_sigma if is_known else None
-    return {**_pick(evidence, "scale_source", "intrinsics_source"), "scale_sigma": sigma}
+    return {**_pick(evidence, "scale_source", "scale_deviation", "intrinsics_source"), "scale_sigma": sigma}
 
 
 def build_object_rows(

@@ -143,4 +143,5 @@ def _encode_evidence(scene: PerceivedObjects, objects: Sequence[PerceivedObject]
         scale_source=scene.observation.scale_source,
         scale_sigma=scene.observation.scale_sigma,
         intrinsics_source=scene.observation.intrinsics_source,
+        scale_deviation=scene.observation.scale_deviation,
     )

@@ -4,6 +4,8 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from tableverse_factory.dataset.doubtful_scales import is_scale_doubtful
+
 DASH = "–"
 
 _EXPLANATIONS = {
@@ -109,9 +111,15 @@ CAMERA_NAMES = {  # of `schemas.observation.IntrinsicsSource`
 
 def format_scale(row: Mapping[str, Any]) -> str:
     """Format where the metres of a scene come from, and how sure they are."""
-    source, sigma = row.get("scale_source"), row.get("scale_sigma")
-    name = SCALE_NAMES.get(str(source), DASH)
-    return f"{name}, ±{100 * sigma:.1f} %" if isinstance(sigma, float) and sigma > 0.0 else name
+    sigma, deviation = row.get("scale_sigma"), row.get("scale_deviation")
+    parts = [SCALE_NAMES.get(str(row.get("scale_source")), DASH)]
+    if isinstance(sigma, float) and sigma > 0.0:
+        parts.append(f"±{100 * sigma:.1f} %")
+    if isinstance(deviation, float):
+        side = "larger" if deviation > 0 else "smaller"
+        doubt = ": check the known length" if is_scale_doubtful(deviation) else ""
+        parts.append(f"{abs(deviation):.1f} standard deviations {side} than estimated{doubt}")
+    return ", ".join(parts)
 
 
 def format_camera(row: Mapping[str, Any]) -> str:

@@ -157,4 +157,6 @@ def _scale(item: Observation, factor: ScaleFactor | None) -> Observation:
     if factor is None:
         return item
     depth = item.depth * np.float32(factor.value)
-    return replace(item, depth=depth, scale_source="measured", scale_sigma=factor.sigma)
+    both = math.hypot(item.scale_sigma, factor.sigma)
+    deviation = math.log(factor.value) / both if item.scale_sigma > 0.0 else None  # a model may tell no uncertainty
+    return replace(item, depth=depth, scale_source="measured", scale_sigma=factor.sigma, scale_deviation=deviation)
