@@ -12,7 +12,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from schemas.outcome import ModelCost
     from tableverse_factory.core.storage.files import StoragePath
@@ -45,6 +45,7 @@ def status(
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
         _follow(place, every)
         return
+    from tableverse_factory.dataset.doubtful_scales import SCALE_COLUMNS, list_doubtful_scales
     from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
     from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
     from tableverse_factory.dataset.provisional import find_cut_scenes
@@ -52,13 +53,14 @@ def status(
     from workers.progress.build_state import OUTCOME_COLUMNS, read_build_state
     from workers.state.cost_log import sum_costs
 
-    columns = dict.fromkeys((*OUTCOME_COLUMNS, *JUDGEMENT_COLUMNS, *COST_COLUMNS))
+    columns = dict.fromkeys((*OUTCOME_COLUMNS, *JUDGEMENT_COLUMNS, *COST_COLUMNS, *SCALE_COLUMNS))
     state = read_build_state(place, [*columns], ["stage", "cpu_s"])
     verdicts, motions = summarize_judgements(state.stored), summarize_trajectories(place, state.published)
     asked, cut = (sum_model_costs(state.stored), sum_costs(place)), find_cut_scenes(place)
+    doubtful = list_doubtful_scales(state.stored)
     if as_json:
         costs = {"costs": {asker: asdict(cost) for asker, cost in asked[0].items()}, "spent": asdict(asked[1])}
-        print(_dump_json({**_to_dict(state, verdicts, motions), **costs, "damaged": cut}))
+        print(_dump_json({**_to_dict(state, verdicts, motions), **costs, "scale_doubtful": doubtful, "damaged": cut}))
     else:
         _print_state(state, place)
         if cut:
@@ -66,6 +68,7 @@ def status(
                 f"damaged, as by a loss of power: {pluralize(len(cut), 'scene')} of those done ({', '.join(cut[:3])})"
             )
         _print_judgements(verdicts)
+        _print_doubts(doubtful)
         _print_costs(*asked)
         _print_trajectories(motions)
 
@@ -182,8 +185,21 @@ def _print_judgements(verdicts: "JudgeSummary") -> None:
             f"same nouns {agreement.names_share:.0%}, masses × {agreement.mass_ratio:.2f}, "
             f"tasks shared {agreement.tasks_share:.0%}"
         )
+    if verdicts.judged:
+        print(f"usable: {verdicts.usable} of {pluralize(verdicts.judged, 'scene')}")
     for code, count in verdicts.remarks.items():
-        print(f"not taken as answered: {sanitize_line(code, 60)} × {count}")
+        print(f"verdicts corrected by checks: {sanitize_line(code, 60)} × {count}")
+
+
+def _print_doubts(doubtful: "Sequence[str]") -> None:
+    from tableverse_factory.dataset.doubtful_scales import DOUBTFUL_DEVIATION
+
+    if doubtful:
+        shown = f"{', '.join(doubtful[:3])}{', …' if len(doubtful) > 3 else ''}"
+        print(
+            f"known length over {DOUBTFUL_DEVIATION:g} standard deviations from what the depth model estimated, "
+            f"check it: {pluralize(len(doubtful), 'scene')} ({shown})"
+        )
 
 
 def _print_costs(answers: "Mapping[str, ModelCost]", spent: "ModelCost") -> None:

@@ -149,7 +149,7 @@ def _format_models(done: pa.Table, verdicts: JudgeSummary, spent: Mapping[str, M
         )
     if verdicts.remarks:
         parts += [
-            "Corrected or rejected answers:",
+            "Verdicts corrected by checks:",
             _format_table(("remark", "times"), _sort_by_count(verdicts.remarks)),
         ]
     return "\n\n".join(parts)

@@ -31,10 +31,12 @@ class RulesAgreement:
 
 @dataclass(frozen=True, slots=True)
 class JudgeSummary:
-    """Judgements by judge, and remarks on their answers."""
+    """Judgements by judge, and remarks on them."""
 
     judges: Mapping[str, int]  # scenes by judge, `openai: model` where a model was asked
-    remarks: Mapping[str, int]  # on what was not taken as answered, by code
+    judged: int  # scenes with a verdict
+    usable: int  # those of them that are
+    remarks: Mapping[str, int]  # on what the checks of the verdicts corrected, by code
     agreement: RulesAgreement | None  # None if only the rules judged
 
 
@@ -49,6 +51,8 @@ def summarize_judgements(scenes: pa.Table) -> JudgeSummary:
     compared = done.select(list(_COMPARED)).filter(pc.is_valid(done["rules_score"]))
     return JudgeSummary(
         judges=dict(sorted(judges.items())),
+        judged=pc.count(done["usable"]).as_py(),
+        usable=pc.sum(done["usable"]).as_py() or 0,
         remarks=dict(sorted(remarks.items(), key=lambda item: (-item[1], item[0]))),
         agreement=_agreement(compared) if compared.num_rows else None,
     )

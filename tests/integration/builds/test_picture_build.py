@@ -1,6 +1,7 @@
 """Bare pictures through `manifest` and `build`: a table is done, and every file that is none is a row with a reason."""
 
 import io
+import json
 import struct
 import zlib
 from pathlib import Path
@@ -38,9 +39,14 @@ def write_pictures(folder: Path) -> None:
     folder.mkdir()
     image = Image.fromarray(look(THINGS, floor_z=-0.7, wall_y=1.5)[0].color)
     frames = {"save_all": True, "append_images": [image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)]}
+    marked = image.copy()
+    marked.putpixel((0, 0), (1, 2, 3))
+    known = {"known_length": {"kind": "camera_height", "length_m": 2.2}}  # it is 0.6
     small = np.full((8, 8, 3), 90, np.uint8)
     files = {
         "table.png": encode(image, "PNG"),
+        "mistaken.png": encode(marked, "PNG"),
+        "mistaken.source.json": json.dumps(known).encode(),
         "truncated.png": encode(image, "PNG")[:2000],
         "truncated.jpg": encode(image, "JPEG")[:4000],
         "enormous.png": declare_png(60_000, 60_000),
@@ -69,6 +75,7 @@ def test_every_file_becomes_a_row(tmp_path, run) -> None:
     told = {name: row["reason"] or row["status"] for name, row in rows.items()}
     assert told == {
         "table.png": "done",
+        "mistaken.png": "done",
         "truncated.png": "unreadable_color",
         "truncated.jpg": "unreadable_color",
         "empty.png": "unreadable_color",
@@ -82,5 +89,12 @@ def test_every_file_becomes_a_row(tmp_path, run) -> None:
     table = rows["table.png"]
     assert (table["scale_source"], table["intrinsics_source"]) == ("estimated", "assumed")
     assert table["scale_sigma"] > 0
+    assert table["scale_deviation"] is None
+    mistaken = rows["mistaken.png"]
+    assert mistaken["scale_source"] == "measured"
+    assert mistaken["scale_deviation"] > 3
+    shown = run("status", out)[1]
+    assert f"check it: 1 scene ({mistaken['scene_id']})" in shown
+    assert f"usable: {table['usable'] + mistaken['usable']} of 2 scenes" in shown
     code, said, errors = run("verify", out)
     assert code == 0, said + errors

@@ -114,6 +114,8 @@ def test_judgements_are_summarized_scene_by_scene(rows):
     judges = Counter(": ".join(filter(None, (row["judge"] or "none", row["judge_model"]))) for row in done)
     remarks = Counter(remark.partition(":")[0] for row in done for remark in row["judge_remarks"] or ())
     assert list(found.judges.items()) == sorted(judges.items())
+    verdicts = [row["usable"] for row in done if row["usable"] is not None]
+    assert (found.judged, found.usable) == (len(verdicts), sum(verdicts))
     assert list(found.remarks.items()) == sorted(remarks.items(), key=lambda item: (-item[1], item[0]))
     compared = [row for row in done if row["rules_score"] is not None]
     if not compared:
