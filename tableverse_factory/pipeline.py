@@ -12,8 +12,10 @@ from tableverse_factory.stage import Pipelines, Stage
 from tableverse_factory.stages.curate.curate import curate
 from tableverse_factory.stages.curate.recorded import record_answers, record_prompts
 from tableverse_factory.stages.export.export import export
+from tableverse_factory.stages.observe.check import check_depth_model
 from tableverse_factory.stages.observe.observe import observe, read_layout
 from tableverse_factory.stages.observe.recorded import record_depth
+from tableverse_factory.stages.perceive.check import check_perception_models
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.recorded import record_detector, record_segmenter
 from tableverse_factory.stages.place.place import place
@@ -22,7 +24,12 @@ from tableverse_factory.stages.settle import settle
 from tableverse_factory.stages.trajectories.failed_rows import with_failed_trajectories
 
 _OBSERVE = Stage(
-    "observe", "perception", observe, reads=("observe", "place.mesh_model", "models"), recorded={"depth": record_depth}
+    "observe",
+    "perception",
+    observe,
+    reads=("observe", "place.mesh_model", "models"),
+    recorded={"depth": record_depth},
+    check=check_depth_model,
 )
 _PERCEIVE = Stage(
     "perceive",
@@ -30,6 +37,7 @@ _PERCEIVE = Stage(
     perceive,
     reads=("perceive", "models"),
     recorded={"detector": record_detector, "segmenter": record_segmenter},
+    check=check_perception_models,
 )
 _CURATE = Stage(
     "curate", "curation", curate, reads=("curate",), recorded={"answers": record_answers, "prompts": record_prompts}

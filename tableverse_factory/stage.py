@@ -1,6 +1,6 @@
 """Declaration of a stage: a pure function and its needs, which executors, checkpoints and commits obey."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -18,6 +18,10 @@ StageFunction = Callable[[Any, Config, np.random.Generator, Services], Outcome[A
 # `record(config, before) -> JSON value`, or None if the stage does not read that input; `before` is run.json.
 RecordFunction = Callable[[Config, Mapping[str, Any]], Any]
 
+# `check(config, kinds, here)` raises if what a stage loads for rows of these kinds is missing or damaged; `here` says
+# whether the stages run on this machine.
+CheckFunction = Callable[[Config, Collection[SceneKind], bool], None]
+
 
 @dataclass(frozen=True, slots=True)
 class Stage:
@@ -29,6 +33,7 @@ class Stage:
         reads: The sections or `section.key`s that it reads, its own first. Other changes leave its output valid.
         recorded: What it reads besides (prompts, weights, robot files), by part of run.json: a change of these makes
             another build.
+        check: Of a stage that loads models: before anything of a build is written or started, whether it can.
         record_failure: Of a stage that adds to exported scenes: `record_failure(item, config, failure)` returns its
             input with rows that say why the stage failed. The scene stays done then. None for every stage up to the
             export.
@@ -39,6 +44,7 @@ class Stage:
     run: StageFunction
     reads: tuple[str, ...]
     recorded: Mapping[str, RecordFunction] = field(default_factory=dict)
+    check: CheckFunction | None = None
     record_failure: Callable[[Any, Config, Dropped | Failed], Any] | None = None
 
     @property

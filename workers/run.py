@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -95,6 +96,7 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
     given = _read_rows(request)
     pipelines = load_pipelines(request.pipeline)
     check_output_dir(request.out)
+    _check_models(request, given or (), pipelines)
     with ExitStack() as stack:
         lock = stack.enter_context(create_writer_lock(request.out / WORK / LOCK, display.note))
         if signals is not None:
@@ -138,6 +140,19 @@ def _read_rows(request: BuildRequest) -> Sequence[ImageRow] | None:
     rows = read_manifest(request.manifest)
     check_shards(request.shards, len(rows), request.config.run.shard_size)
     return rows
+
+
+def _check_models(request: BuildRequest, rows: Sequence[ImageRow], pipelines: Pipelines) -> None:
+    """Check what the stages load, before anything is written; a build that goes on may have no more use for it."""
+    first = request.from_stage
+    if first is None and (request.out / "run.json").exists():
+        return
+    kinds = {row.kind for row in rows if not row.rejected}
+    here = request.executor == "local" or request.address is None
+    lines = (dropwhile(lambda stage: first not in (None, stage.section), pipelines[kind]) for kind in kinds)
+    for check in dict.fromkeys(stage.check for line in lines for stage in line):
+        if check is not None:
+            check(request.config, kinds, here)
 
 
 def _restore_from_dataset(

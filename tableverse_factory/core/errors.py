@@ -8,6 +8,7 @@ TableverseError
 ├── SolverError       a numerical problem without an answer within its bounds: the caller takes another way
 ├── ModelError        a model backend that is missing or answers nonsense
 │   ├── ModelAccessError    no key, a refused key, no credit: stops a build until a person acts
+│   │   └── WeightsError    weights, or what loads them, that are missing, damaged or out of reach
 │   ├── BudgetSpentError    the budget is spent: the scene waits, and the build ends
 │   └── AnswerInvalidError  an unusable answer: the scene is dropped for its `reason`
 └── BuildError        the build cannot go on or resume: the message says how to go on
@@ -79,6 +80,12 @@ class ModelAccessError(ModelError):
     """No model will answer before a person acts: no key, a refused key, no credit. Stops a build."""
 
     topic = "model-access"
+
+
+class WeightsError(ModelAccessError):
+    """Weights of a model, or what loads them, are missing, damaged or out of reach. Stops a build."""
+
+    topic = "weights"
 
 
 class BudgetSpentError(ModelError):

@@ -5,14 +5,22 @@ from typing import Any
 from schemas.manifest import ImageRow
 from schemas.outcome import Dropped, Failed
 from schemas.work import CommitCall, ScenePart, SceneResult, StageReport, Status
-from tableverse_factory.core.errors import BuildError, ConfigError, ModelAccessError, ModelError, StoreError
+from tableverse_factory.core.errors import (
+    BuildError,
+    ConfigError,
+    ModelAccessError,
+    ModelError,
+    StoreError,
+    WeightsError,
+)
 from tableverse_factory.rebuild import MANIFEST_STAGE
 from tableverse_factory.stage import Stage
 from workers.driver.in_flight import InFlightScene
 from workers.progress.tally import Display, Tally
 from workers.state.ledger import Ledger
 
-_FATAL_KINDS = frozenset({ModelAccessError.__name__, StoreError.__name__})  # they would recur for every scene
+_ACCESS_KINDS = frozenset({ModelAccessError.__name__, WeightsError.__name__})
+_FATAL_KINDS = frozenset({*_ACCESS_KINDS, StoreError.__name__})  # they would recur for every scene
 _CONFIG_ERROR = ConfigError.__name__  # fatal where a stage adds to finished scenes: a misspelt key must not fail them
 _MODEL_SILENT = ModelError.__name__  # postpones a scene there: with failed rows it would count as done for ever
 _MAX_SILENT_IN_A_ROW = 5  # postponed scenes in a row that stop the build: the model server is down
@@ -41,7 +49,8 @@ class OutcomeRecorder:
         if isinstance(outcome, Failed):
             if outcome.error_kind in _FATAL_KINDS or (adds and outcome.error_kind == _CONFIG_ERROR):
                 advice = _advise_correction(scene.stage, outcome.error_kind)
-                raise BuildError(f"{outcome.message}. Finished scenes are kept: run the same command to go on{advice}")
+                why = outcome.message.rstrip(".")
+                raise BuildError(f"{why}. Finished scenes are kept: run the same command to go on{advice}")
             if adds and outcome.error_kind == _MODEL_SILENT:
                 self._postpone(scene, outcome.message)
                 return True
@@ -94,6 +103,6 @@ class OutcomeRecorder:
 
 def _advise_correction(stage: Stage, kind: str) -> str:
     """Advise how to resume with another configuration, which is refused without `--from`."""
-    if stage.is_post_export or kind != ModelAccessError.__name__:
+    if stage.is_post_export or kind not in _ACCESS_KINDS:
         return ""
     return f"; where the configuration is wrong, correct it and add --from {stage.section}"

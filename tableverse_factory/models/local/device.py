@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from schemas.config import ModelsConfig
-from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.core.errors import InputError, WeightsError
 from tableverse_factory.core.optional_imports import import_extra
 
 Tensor = Any  # A `torch.Tensor`; torch is an extra, and type checks must pass without it
@@ -33,11 +33,11 @@ def select_device(config: ModelsConfig, key: str = "models.device") -> Device:
     """Resolve `models.device` and `models.precision` on this machine; `key` is what sets the device, for the error.
 
     Raises:
-        ModelAccessError: without torch, or if a GPU is required and torch sees none.
+        WeightsError: without torch, or if a GPU is required and torch sees none.
     """
     sees_gpu = import_torch().cuda.is_available() if config.device != "cpu" else False
     if config.device == "cuda" and not sees_gpu:
-        raise ModelAccessError(
+        raise WeightsError(
             f"{key} is 'cuda', but torch sees no GPU here: install a CUDA build of torch and a driver, on a "
             "cluster give the pool a GPU (docs/cluster.md), or set 'auto' or 'cpu'"
         )
@@ -48,7 +48,7 @@ def select_device(config: ModelsConfig, key: str = "models.device") -> Device:
 
 
 def import_torch() -> Any:
-    """Import torch, set up for reproducible bytes; ModelAccessError without it.
+    """Import torch, set up for reproducible bytes; WeightsError without it.
 
     One thread on a CPU; on a GPU cuDNN's deterministic kernels, no kernel benchmarks, and no TF32.
     """
@@ -56,7 +56,7 @@ def import_torch() -> Any:
     try:
         torch: Any = import_extra("torch", "a model with weights", "models")
     except InputError as error:
-        raise ModelAccessError(str(error)) from None
+        raise WeightsError(str(error)) from None
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     torch.backends.cudnn.benchmark = False

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.core.errors import InputError, WeightsError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.storage.files import sync_folder
 from tableverse_factory.models.local.catalogue import ModelEntry, WeightFile
@@ -58,7 +58,7 @@ def fetch_model(model: ModelEntry, announce: Callable[[str], None]) -> tuple[str
 
     Raises:
         InputError: if its weights are fetched by another program.
-        ModelAccessError: if the Hub refuses, cannot be reached, or sends something else.
+        WeightsError: if the Hub refuses, cannot be reached, or sends something else.
     """
     if not model.files:
         raise InputError(f"{model.name} is not fetched here: see {model.loaded_by}", "no_such_model")
@@ -66,7 +66,7 @@ def fetch_model(model: ModelEntry, announce: Callable[[str], None]) -> tuple[str
     if not GIT_HASH.fullmatch(commit):
         commit = pin_commit(model.weights, model.name).rpartition("@")[2]
     if not GIT_HASH.fullmatch(commit):
-        raise ModelAccessError(f"{model.weights}: the hub names no commit of 40 digits, but {commit!r:.80}")
+        raise WeightsError(f"{model.weights}: the hub names no commit of 40 digits, but {commit!r:.80}")
     lock = read_lock(model).get(commit, {})
     fetched = tuple(_fetch_file(model, commit, file, lock.get(file.name), announce) for file in model.files)
     record_in_lock(model, commit, {file.name: WeightFile(file.name, file.size, file.sha256) for file in fetched})
@@ -95,7 +95,7 @@ def _fetch_file(
 
 
 def _read_offer(model: ModelEntry, commit: str, wanted: WeightFile) -> _Offer:
-    """Ask the Hub for size and hash of a file; ModelAccessError if they are not those that are wanted."""
+    """Ask the Hub for size and hash of a file; WeightsError if they are not those that are wanted."""
     hub = _import_hub()
     url = hub.hf_hub_url(model.repository, wanted.name, revision=commit)
     try:
@@ -104,14 +104,14 @@ def _read_offer(model: ModelEntry, commit: str, wanted: WeightFile) -> _Offer:
         raise _make_error(model, commit, wanted.name, error) from error
     etag, size, name = str(found.etag or ""), found.size, f"{model.name}: {wanted.name}"
     if found.commit_hash != commit or size is None or not (SHA256.fullmatch(etag) or GIT_HASH.fullmatch(etag)):
-        raise ModelAccessError(f"{name}: what HF_ENDPOINT names tells no commit, size and hash of it: it is no hub")
+        raise WeightsError(f"{name}: what HF_ENDPOINT names tells no commit, size and hash of it: it is no hub")
     if wanted.size is not None and size != wanted.size:
-        raise ModelAccessError(f"{name}: the hub offers {size} bytes, and {wanted.size} are known: not fetched")
+        raise WeightsError(f"{name}: the hub offers {size} bytes, and {wanted.size} are known: not fetched")
     if wanted.sha256 and SHA256.fullmatch(etag) and etag != wanted.sha256:
-        raise ModelAccessError(f"{name}: the hub offers sha256 {etag}, and {wanted.sha256} is known: not fetched")
+        raise WeightsError(f"{name}: the hub offers sha256 {etag}, and {wanted.sha256} is known: not fetched")
     most = MAX_FILE_BYTES if wanted.name.endswith(".safetensors") else MAX_SMALL_BYTES
     if size > most:
-        raise ModelAccessError(f"{name}: {size} bytes are more than the {most} that are allowed: not fetched")
+        raise WeightsError(f"{name}: {size} bytes are more than the {most} that are allowed: not fetched")
     return _Offer(url, etag, size)
 
 
@@ -119,7 +119,7 @@ def _require_space(blob: Path, size: int) -> None:
     there = next(parent for parent in blob.parents if parent.exists())
     free = shutil.disk_usage(there).free
     if free < size + SPARE_BYTES:
-        raise ModelAccessError(
+        raise WeightsError(
             f"{there}: {free / 1e9:.1f} GB are free, and {(size + SPARE_BYTES) / 1e9:.1f} are needed: make room, or "
             "set HF_HOME to a folder on another disk"
         )
@@ -134,7 +134,7 @@ def _download_blob(model: ModelEntry, commit: str, offer: _Offer, wanted: Weight
     with _PartialFile(partial, offer.size, f"{model.name}: {wanted.name}") as file:
         try:
             file.download(offer)
-        except ModelAccessError:
+        except WeightsError:
             partial.unlink()
             raise
         except Exception as error:
@@ -145,7 +145,7 @@ def _download_blob(model: ModelEntry, commit: str, offer: _Offer, wanted: Weight
         if not right or by_name != offer.etag:
             partial.unlink()
             known = wanted.sha256 if not right else offer.etag
-            raise ModelAccessError(
+            raise WeightsError(
                 f"{model.name}: {wanted.name} arrived with sha256 {found}, and not as {known}: it was deleted; fetch "
                 "it again, and if that does not help, something between the hub and here changes it"
             )
@@ -167,11 +167,11 @@ class _PartialFile(io.BufferedRandom):
             is_there = False
         if not is_there:  # another process has it, or has just moved it to its place
             self.close()
-            raise ModelAccessError(f"{name} is being fetched by another process: wait for it, then run this again")
+            raise WeightsError(f"{name} is being fetched by another process: wait for it, then run this again")
 
     def write(self, data: Any) -> int:
         if self.tell() + len(data) > self._limit:
-            raise ModelAccessError(f"{self._name}: the hub sends more than the {self._limit} bytes that it announced")
+            raise WeightsError(f"{self._name}: the hub sends more than the {self._limit} bytes that it announced")
         return super().write(data)
 
     def download(self, offer: _Offer) -> None:
@@ -195,13 +195,13 @@ def _link_blob(model: ModelEntry, commit: str, name: str) -> None:
         raise _make_error(model, commit, name, error) from error
 
 
-def _make_error(model: ModelEntry, commit: str, name: str, error: Exception) -> ModelAccessError:
+def _make_error(model: ModelEntry, commit: str, name: str, error: Exception) -> WeightsError:
     weights = f"{model.repository}@{commit}"
     if "EntryNotFound" in type(error).__name__:
-        return ModelAccessError(f"{model.name} = {weights!r} holds no {name}: is the revision right?")
+        return WeightsError(f"{model.name} = {weights!r} holds no {name}: is the revision right?")
     if refusal := describe_refusal(error, weights, model.name):
-        return ModelAccessError(refusal)
-    return ModelAccessError(
+        return WeightsError(refusal)
+    return WeightsError(
         f"{model.name}: {name} cannot be fetched ({shorten_error(error)}): run the same command again, which goes on "
         "with what arrived"
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 from schemas.config import ModelsConfig
 from schemas.identity import content_hash
-from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.core.errors import WeightsError
 from tableverse_factory.models.local.device import select_device
 from tableverse_factory.models.local.weight_files import hash_file
 
@@ -32,7 +32,7 @@ def identify_model(weights: str, config: ModelsConfig, package: str | None = Non
     if config.device == "auto":
         try:
             found["device"] = select_device(ModelsConfig()).kind
-        except ModelAccessError:
+        except WeightsError:
             found["device"] = "none"
     if files := _list_files(weights):
         found["sha256"] = content_hash(*(f"{path.name} {hash_file(path)}".encode() for path in files))

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.core.errors import InputError, WeightsError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.text import redact_secrets
 from tableverse_factory.core.timeouts import call_with_timeout
@@ -37,7 +37,7 @@ def parse_hub_name(weights: str) -> HubWeights | None:
 
 
 def resolve_hub_name(weights: str, key: str) -> HubWeights | None:
-    """Parse the repository that weights name, see `parse_hub_name`; ModelAccessError if a path has the same name.
+    """Parse the repository that weights name, see `parse_hub_name`; WeightsError if a path has the same name.
 
     The meaning of a configuration must not depend on the working directory.
     """
@@ -46,7 +46,7 @@ def resolve_hub_name(weights: str, key: str) -> HubWeights | None:
         return None
     here = next((name for name in (weights, found.name) if Path(name).exists()), "")
     if here:
-        raise ModelAccessError(
+        raise WeightsError(
             f"{key} = {weights!r} may be a name on the hub or what lies here: write './{here}' for what lies here, or "
             f"run the command where nothing is called {here!r} for the hub"
         )
@@ -57,13 +57,13 @@ def resolve_source(weights: str, key: str) -> tuple[str, dict[str, str]]:
     """Return the arguments of `from_pretrained`: a path, or a name on the hub and its revision.
 
     Raises:
-        ModelAccessError: if there is no such path, or as `resolve_hub_name`.
+        WeightsError: if there is no such path, or as `resolve_hub_name`.
     """
     hub = resolve_hub_name(weights, key)
     if hub is not None:
         return hub.name, {"revision": hub.revision} if hub.revision else {}
     if not Path(weights).exists():
-        raise ModelAccessError(
+        raise WeightsError(
             f"{key} = {weights!r}: no such folder here, and no `owner/name` or `owner/name@revision` of the hub"
         )
     return weights, {}
@@ -73,7 +73,7 @@ def pin_commit(weights: str, key: str) -> str:
     """Return `owner/name@COMMIT` of weights on the hub, from the local cache if it knows the revision.
 
     Raises:
-        ModelAccessError: if the hub has no such weights or cannot be reached, or its client is too old.
+        WeightsError: if the hub has no such weights or cannot be reached, or its client is too old.
     """
     hub = resolve_hub_name(weights, key)
     if hub is None or GIT_HASH.fullmatch(hub.revision):
@@ -81,9 +81,9 @@ def pin_commit(weights: str, key: str) -> str:
     try:
         module: Any = import_extra("huggingface_hub", f"{key} = {weights!r}", "models")
     except InputError as error:
-        raise ModelAccessError(str(error)) from None
+        raise WeightsError(str(error)) from None
     if not hasattr(module.HfApi, "resolve_revision"):
-        raise ModelAccessError(
+        raise WeightsError(
             f"{key} = {weights!r}: huggingface_hub {module.__version__} is too old to say which commit is meant; "
             f"pip install 'huggingface_hub>=1.26', or name a whole commit: {hub.name}@COMMIT"
         )
@@ -95,7 +95,7 @@ def pin_commit(weights: str, key: str) -> str:
         except module.errors.RevisionResolutionError:
             commit = call_with_timeout(HUB_TIMEOUT_S, resolve, TimeoutError())
     except Exception as error:
-        raise ModelAccessError(describe_load_error(error, weights, key)) from error
+        raise WeightsError(describe_load_error(error, weights, key)) from error
     return f"{hub.name}@{commit.resolved}"
 
 

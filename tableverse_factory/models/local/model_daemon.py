@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.errors import ModelAccessError, ModelError, WeightsError
 from tableverse_factory.core.source_hash import compute_source_hash
 from tableverse_factory.models.local.batch_server import BatchModel, Heartbeat, serve_batches
 from tableverse_factory.models.local.fingerprint import stat_weights
@@ -31,6 +31,7 @@ _POLL_S = 0.02
 _MAX_FOLDER = 85  # maximum length of the folder's path; that of a socket may have 107 [bytes]
 # Place of the log in messages, which go into datasets and must not hold paths of this machine.
 _LOG = "a .log in the folder tableverse-UID of $XDG_RUNTIME_DIR, or of the temporary files where that is not set"
+_ERRORS = {kind.__name__: kind for kind in (ModelAccessError, WeightsError)}
 _CONNECTIONS: dict[Path, socket.socket] = {}
 
 
@@ -58,7 +59,7 @@ def ask_daemon(module: str, spec: Spec, question: Sequence[np.ndarray]) -> list[
         if fine.tolist() == [1]:
             return answer
         kind, message = decode_error(answer[0])
-        raise ModelAccessError(message) if kind == ModelAccessError.__name__ else ModelError(message)
+        raise _ERRORS.get(kind, ModelError)(message)
     raise ModelError(f"the process of the model died {TRIES} times; its last words are in {_LOG}")
 
 

@@ -1,16 +1,19 @@
 """Sessions of onnxruntime: one CPU thread, and nothing read but the bytes that were checked."""
 
 import os
+import re
 from typing import Any
 
-from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.core.errors import WeightsError
+
+_CODE = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ")
 
 
 def open_onnx_session(data: bytes, described: str) -> Any:
     """Open a session on the bytes of an ONNX file; `described` names the file in messages.
 
     Raises:
-        ModelAccessError: if the bytes are no ONNX file that holds all of its weights.
+        WeightsError: if the bytes are no ONNX file that holds all of its weights.
     """
     import onnxruntime  # not at the head: builds without a net need neither its memory nor its time
 
@@ -23,9 +26,9 @@ def open_onnx_session(data: bytes, described: str) -> Any:
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common base
-        raise ModelAccessError(f"{described} is no ONNX file: {shorten_onnx_error(error)}") from error
+        raise WeightsError(f"{described} is no ONNX file: {shorten_onnx_error(error)}") from error
 
 
 def shorten_onnx_error(error: Exception) -> str:
-    """Return the start of a message of onnxruntime, in one line."""
-    return " ".join(str(error).split())[:200]
+    """Return the start of a message of onnxruntime, in one line without its code and full stop."""
+    return _CODE.sub("", " ".join(str(error).split()))[:200].rstrip(".")

@@ -25,7 +25,7 @@ def record_weights(part: str, backend: str, config: Config, before: Mapping[str,
 
     Raises:
         ConfigError: if weights on the disk are missing.
-        ModelAccessError: if the commit of weights of the Hub cannot be looked up.
+        WeightsError: if the commit of weights of the Hub cannot be looked up.
     """
     section, name = _KEYS[part]
     named = getattr(getattr(config, section), name)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from schemas.config import Config
-from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.core.errors import WeightsError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.text import describe_error
@@ -147,7 +147,7 @@ def read_lock(model: ModelEntry) -> dict[str, dict[str, WeightFile]]:
     """Read the sizes and hashes that were recorded when files were fetched, by commit and name; empty without a lock.
 
     Raises:
-        ModelAccessError: if the lock cannot be read.
+        WeightsError: if the lock cannot be read.
     """
     path = locate_repository(model) / LOCK_NAME
     if not path.exists():
@@ -163,7 +163,7 @@ def read_lock(model: ModelEntry) -> dict[str, dict[str, WeightFile]]:
             for commit, files in tree["commits"].items()
         }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ModelAccessError(
+        raise WeightsError(
             f"{path} cannot be read ({describe_error(error)}): delete it, and fetch {model.name} again"
         ) from error
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.core.errors import InputError, WeightsError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.models.local.batches import get_first_line, is_out_of_memory
 from tableverse_factory.models.local.device import Device, import_torch
@@ -48,7 +48,7 @@ def load_pretrained(
         exact: Names of child modules that stay in float32 whatever the precision.
 
     Raises:
-        ModelAccessError: without transformers or weights, or with weights of another model.
+        WeightsError: without transformers or weights, or with weights of another model.
     """
     import_torch()
     transformers = _import_transformers(weights, key)
@@ -58,16 +58,16 @@ def load_pretrained(
         model, found = _load_model(kind, name, at, local_only=True)
     except _UNREADABLE as error:
         if Path(name).exists():
-            raise ModelAccessError(_describe_folder_error(architecture, error, weights, key)) from error
+            raise WeightsError(_describe_folder_error(architecture, error, weights, key)) from error
         try:
             model, found = _load_model(kind, name, at, local_only=False)
         except _UNREADABLE as again:
-            raise ModelAccessError(describe_load_error(again, weights, key)) from again
+            raise WeightsError(describe_load_error(again, weights, key)) from again
     described = getattr(model.config, "model_type", "")
     missing = [*found["missing_keys"], *found["mismatched_keys"]]
     if missing or described not in kinds:
         what = f"{len(missing)} of its weights are not there" if missing else f"it describes a {described!r}"
-        raise ModelAccessError(f"{key} = {weights!r} holds no {architecture}: {what}; name weights of that model")
+        raise WeightsError(f"{key} = {weights!r} holds no {architecture}: {what}; name weights of that model")
     return move_to_device(model, device, exact)
 
 
@@ -77,7 +77,7 @@ def load_tokenizer(weights: str, key: str, numbers: Mapping[str, int]) -> Any:
     `numbers` holds tokens with their numbers: without its files transformers makes a tokenizer that knows no words.
 
     Raises:
-        ModelAccessError: without transformers, or a tokenizer with these numbers.
+        WeightsError: without transformers, or a tokenizer with these numbers.
     """
     transformers = _import_transformers(weights, key)
     name, at = resolve_source(weights, key)
@@ -94,7 +94,7 @@ def load_tokenizer(weights: str, key: str, numbers: Mapping[str, int]) -> Any:
         return load(local_only=True)
     except _UNREADABLE as error:
         if Path(name).exists():
-            raise ModelAccessError(f"{key} = {weights!r} holds no tokenizer: {shorten_error(error)}") from error
+            raise WeightsError(f"{key} = {weights!r} holds no tokenizer: {shorten_error(error)}") from error
     return load_foreign(lambda: load(local_only=False), weights, key)
 
 
@@ -102,7 +102,7 @@ def _import_transformers(weights: str, key: str) -> Any:
     try:
         transformers: Any = import_extra("transformers", f"{key} = {weights!r}", "models")
     except InputError as error:
-        raise ModelAccessError(str(error)) from None
+        raise WeightsError(str(error)) from None
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     return transformers
@@ -125,22 +125,22 @@ def move_to_device(model: Any, device: Device, exact: Collection[str] = ()) -> A
     return model
 
 
-def create_memory_error(error: BaseException) -> ModelAccessError:
+def create_memory_error(error: BaseException) -> WeightsError:
     """Create the error for a model that does not fit into the memory."""
-    return ModelAccessError(
+    return WeightsError(
         "a model does not fit into the memory here: give it a GPU with more of it free, smaller weights, or set "
         f"models.device to 'cpu' ({get_first_line(error)})"
     )
 
 
 def load_foreign(make: Callable[[], _Model], weights: str, key: str) -> _Model:
-    """Load a model with a foreign package; whatever that raises for bad weights becomes a ModelAccessError."""
+    """Load a model with a foreign package; whatever that raises for bad weights becomes a WeightsError."""
     try:
         return make()
     except Exception as error:
         if is_out_of_memory(error):
             raise create_memory_error(error) from error
-        raise ModelAccessError(describe_load_error(error, weights, key)) from error
+        raise WeightsError(describe_load_error(error, weights, key)) from error
 
 
 def make_absolute(weights: str) -> str:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32
 
-from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.errors import ModelError, WeightsError
 from tableverse_factory.models.local.onnx_session import open_onnx_session, shorten_onnx_error
 
 SHIPPED = Path(__file__).with_name("picture.onnx")
@@ -43,7 +43,7 @@ class PictureNet:
             {one.name for one in ends} for ends in (self._session.get_inputs(), self._session.get_outputs())
         )
         if inputs != {*INPUTS} or not outputs >= {*MAPS, *VECTORS}:
-            raise ModelAccessError(
+            raise WeightsError(
                 f"{str(path)!r} is another net: it takes {', '.join(sorted(inputs))} and gives "
                 f"{', '.join(sorted(outputs))}; one of {', '.join(INPUTS)} to {', '.join([*MAPS, *VECTORS])} is wanted"
             )
@@ -72,13 +72,31 @@ def load_picture_net(weights: str = "") -> PictureNet:
     """Load the net in a file, or the one of this package, once per process.
 
     Raises:
-        ModelAccessError: if the file is missing or damaged, or holds another net.
+        WeightsError: if the file is missing or damaged, or holds another net.
     """
+    return _load(weights)
+
+
+def check_picture_net(weights: str, key: str) -> None:
+    """Check that a build can load the net that `key` of the configuration names; it is not kept.
+
+    Raises:
+        WeightsError: as `load_picture_net`.
+    """
+    try:
+        _load(weights)
+    except WeightsError as error:
+        raise WeightsError(f"{key}: {error}") from error
+
+
+def _load(weights: str) -> PictureNet:
     if not weights:
         return PictureNet(SHIPPED, _read_shipped(SHIPPED, DIGEST))
     path = Path(weights)
-    if not path.is_file() or path.stat().st_size > MAX_BYTES:
-        raise ModelAccessError(f"{weights!r} is no file of at most {MAX_BYTES} bytes: give the .onnx file of a net")
+    if not path.is_file():
+        raise WeightsError(f"{weights!r} is no file here: give the .onnx file of a net")
+    if path.stat().st_size > MAX_BYTES:
+        raise WeightsError(f"{weights!r} has {path.stat().st_size} bytes, and a net at most {MAX_BYTES}")
     return PictureNet(path, path.read_bytes())
 
 
@@ -87,10 +105,10 @@ def _read_shipped(path: Path, digest: Path) -> bytes:
     try:
         data, wanted = path.read_bytes(), digest.read_text().strip()
     except OSError as error:
-        raise ModelAccessError(f"the net of bare pictures is missing: {error}; install the package again") from error
+        raise WeightsError(f"the net of bare pictures is missing: {error}; install the package again") from error
     found = hashlib.sha256(data).hexdigest()
     if found != wanted:
-        raise ModelAccessError(
+        raise WeightsError(
             f"{path} is damaged: its SHA-256 begins with {found[:12]}, not {wanted[:12]}; install the package again"
         )
     return data

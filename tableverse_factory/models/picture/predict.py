@@ -56,7 +56,7 @@ def predict_picture(
     The latest prediction is remembered: two stages ask the same of one picture.
 
     Raises:
-        ModelAccessError: if the net of `weights`, empty for the one of this package, cannot be loaded.
+        WeightsError: if the net of `weights`, empty for the one of this package, cannot be loaded.
         ModelError: if it cannot be run.
     """
     sensed = np.zeros(color.shape[:2], np.float32) if depth is None else np.asarray(depth, np.float32)

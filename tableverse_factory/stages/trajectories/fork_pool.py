@@ -21,7 +21,14 @@ from typing import Literal
 
 import psutil
 
-from tableverse_factory.core.errors import ConfigError, ModelAccessError, ModelError, StoreError, TableverseError
+from tableverse_factory.core.errors import (
+    ConfigError,
+    ModelAccessError,
+    ModelError,
+    StoreError,
+    TableverseError,
+    WeightsError,
+)
 
 _DONE, _RAISED, _FATAL = b"d", b"r", b"f"
 _PR_SET_PDEATHSIG = 1
@@ -29,7 +36,7 @@ _POLL_S, _EXIT_S = 0.2, 10.0
 _MAX_ANSWER, _MAX_MESSAGE = 1 << 30, 500
 # Errors that every item would raise again, by exact class name: `AnswerInvalidError` concerns one item only
 _FATAL_ERRORS: dict[str, type[TableverseError]] = {
-    kind.__name__: kind for kind in (ConfigError, ModelAccessError, ModelError, StoreError)
+    kind.__name__: kind for kind in (ConfigError, ModelAccessError, ModelError, StoreError, WeightsError)
 }
 
 

@@ -93,6 +93,8 @@ ELSEWHERE = {
     "object_fell": "tests/stages/test_settle.py",
     "colliding": "tests/evaluation/test_scene_audit.py",
     "error: … refuses … (HTTP …)": "tests/models/remote/test_client.py",
+    "… is no ONNX file: …": "tests/integration/builds/test_missing_models.py",
+    "… is not on this machine and the hub cannot be reached: …": "tests/models/local/test_hf_weights.py",
     "… is not set where the stages run": "tests/models/remote/test_client.py",
     "… is left for a later run: …": "tests/integration/builds/test_trajectories_build.py",
     "… scenes in a row were left. Run the same command to go on": "tests/integration/builds/test_trajectories_build.py",

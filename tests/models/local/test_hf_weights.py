@@ -118,7 +118,7 @@ def test_what_the_hub_does_not_know_is_said_before_the_build_begins(hub, monkeyp
 def test_a_hub_that_says_nothing_is_not_waited_for_without_end(hub, monkeypatch):
     monkeypatch.setattr("tableverse_factory.models.local.hf_weights.HUB_TIMEOUT_S", 0.2)
     hub.silent_s = 1.0
-    assert "the hub cannot be reached" in refused(NAME)
+    assert "is not on this machine and the hub cannot be reached:" in refused(NAME)
 
 
 def test_a_client_that_is_too_old_to_ask_is_named(hub, monkeypatch):

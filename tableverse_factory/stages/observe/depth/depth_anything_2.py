@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from schemas.config import Config
 from schemas.geometry import Picture
 from schemas.manifest import ImageRow
-from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.core.errors import WeightsError
 from tableverse_factory.models.local.batches import run_in_batches
 from tableverse_factory.models.local.catalogue import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.device import Device, import_torch, select_device
@@ -63,7 +63,7 @@ def _load_metric_model(weights: str, device: Device) -> Any:
         "DepthAnythingForDepthEstimation", weights, device, "observe.depth_weights", ("depth_anything",)
     )
     if model.config.depth_estimation_type != "metric":
-        raise ModelAccessError(
+        raise WeightsError(
             f"observe.depth_weights = {weights!r} is a relative model, which gives no metres; use a metric one, like "
             f"{DEFAULT_WEIGHTS[NAME]}"
         )

@@ -1,9 +1,10 @@
 """Packages of depth models that are installed from git, because no package index has them."""
 
 import importlib
+import importlib.util
 from types import ModuleType
 
-from tableverse_factory.core.errors import ModelAccessError
+from tableverse_factory.core.errors import WeightsError
 
 # Name and pip source by module; similar names on PyPI are not the authors'
 PACKAGES = {
@@ -12,12 +13,23 @@ PACKAGES = {
 }
 
 
+def check_git_package(package: str) -> None:
+    """Check that one of `PACKAGES` is installed, without importing it; WeightsError if it is not."""
+    if importlib.util.find_spec(package) is None:
+        raise WeightsError(_describe_missing(package))
+
+
 def import_git_package(module: str) -> ModuleType:
     """Import a module of one of `PACKAGES`; the error says what to install."""
-    name, source = PACKAGES[module.partition(".")[0]]
+    package = module.partition(".")[0]
     try:
         return importlib.import_module(module)
     except ImportError as error:
         missing = (error.name or module).partition(".")[0]
-        lack = "" if missing == module.partition(".")[0] else f" whole: {missing} is missing"
-        raise ModelAccessError(f"{name} is not installed{lack}; pip install '{source}'") from None
+        raise WeightsError(_describe_missing(package, missing)) from None
+
+
+def _describe_missing(package: str, missing: str = "") -> str:
+    name, source = PACKAGES[package]
+    lack = f" whole: {missing} is missing" if missing not in ("", package) else ""
+    return f"{name} is not installed{lack}; pip install '{source}'"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from tableverse_factory.core.errors import ModelAccessError, ModelError
+from tableverse_factory.core.errors import ModelError, WeightsError
 from tableverse_factory.models.local.onnx_session import open_onnx_session, shorten_onnx_error
 from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS, THINNING
 
@@ -24,7 +24,7 @@ class SegmentationNet:
         file_format = self._session.get_modelmeta().custom_metadata_map.get("format", "")
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if file_format != FORMAT or len(inputs) != 1 or len(outputs) != 1 or inputs[0].shape[1:2] != [CHANNELS]:
-            raise ModelAccessError(f"{_KEY} = {str(path)!r} is another net: give one of `tableverse train segmenter`")
+            raise WeightsError(f"{_KEY} = {str(path)!r} is another net: give one of `tableverse train segmenter`")
         self._input = inputs[0].name
 
     def __call__(self, inputs: Float32[np.ndarray, "7 h w"]) -> Float32[np.ndarray, "4 h2 w2"]:
@@ -45,9 +45,14 @@ def load_net(weights: str) -> SegmentationNet:
     return SegmentationNet(Path(weights))
 
 
+def check_net(weights: str) -> None:
+    """Check that a build can load the network in this file, else raise WeightsError; it is not kept."""
+    SegmentationNet(Path(weights))
+
+
 def _open_session(path: Path) -> Any:
     if not path.is_file():
-        raise ModelAccessError(f"{_KEY} = {str(path)!r} is no file: give the .onnx of `tableverse train segmenter`")
+        raise WeightsError(f"{_KEY} = {str(path)!r} is no file: give the .onnx of `tableverse train segmenter`")
     if path.stat().st_size > MAX_BYTES:
-        raise ModelAccessError(f"{_KEY} = {str(path)!r} is larger than {MAX_BYTES} bytes: no net of ours")
+        raise WeightsError(f"{_KEY} = {str(path)!r} is larger than {MAX_BYTES} bytes: no net of ours")
     return open_onnx_session(path.read_bytes(), f"{_KEY} = {str(path)!r}")
