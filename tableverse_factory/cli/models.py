@@ -54,7 +54,10 @@ def list_models(config: ForConfig = None, as_json: AsJson = False) -> None:
             if file.sha256:
                 print(f"    {file.name}: sha256 {file.sha256}")
         print(f"    {model.licence}{f', forbids {model.forbids}' if model.forbids else ''}")
-        print(f"    {'needs' if model.files else 'loaded by'} {model.loaded_by}")
+        if model.loaded_by:
+            print(f"    loaded by {model.loaded_by}")
+    if any(model.files for model in chosen):
+        print("to fetch weights and to load them: pip install 'tableverse-factory[models]'", file=sys.stderr)
 
 
 @models.command("fetch")

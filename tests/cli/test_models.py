@@ -1,6 +1,7 @@
 """`tableverse models` as a user meets it, and the recipes, which are configurations of models of its table."""
 
 import json
+import sys
 
 import pytest
 
@@ -116,6 +117,17 @@ def test_weights_that_are_not_those_of_the_table_are_not_fetched(tableverse, hub
     refused = tableverse("models", "fetch", "sam2.1-tiny")
     assert refused.code == 1
     assert "and 155908064 are known: not fetched" in refused.err
+
+
+def test_a_plain_installation_is_told_what_to_install(tableverse, monkeypatch):
+    for module in ("huggingface_hub", "huggingface_hub.constants"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for command in ("fetch", "check"):
+        told = tableverse("models", command, "sam2.1-tiny")
+        assert told.code == 1
+        assert "error: looking for weights needs huggingface_hub: pip install 'tableverse-factory[models]'" in told.err
+    listed = tableverse("models", "list")
+    assert listed.err.count("pip install 'tableverse-factory[models]'") == 1
 
 
 def test_mistakes_are_answered_with_what_to_type(tableverse, hub, tmp_path):

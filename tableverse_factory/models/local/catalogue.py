@@ -26,8 +26,8 @@ class WeightFile:
 class ModelEntry:
     """A model by its name in this table.
 
-    `backend` is its value of the key of its role; `files` is empty where its own program fetches the weights, which
-    `loaded_by` names.
+    `backend` is its value of the key of its role; `files` is empty where its own program fetches the weights.
+    `loaded_by` names what loads it, empty for this project's extra `models`.
     """
 
     name: str
@@ -40,7 +40,7 @@ class ModelEntry:
     forbids: str
     files: tuple[WeightFile, ...] = ()
     is_gated: bool = False
-    loaded_by: str = "pip install 'tableverse-factory[models]'"
+    loaded_by: str = ""
 
     @property
     def weights(self) -> str:
@@ -55,7 +55,7 @@ class ModelEntry:
 
 _SAM_LICENCE = "military and weapons uses, among others: read it before you publish results"
 _CONFIG = WeightFile("config.json")
-_FROM_DA3 = "pip install 'git+https://github.com/ByteDance-Seed/Depth-Anything-3'"
+_FROM_DA3 = "its authors' package: pip install 'git+https://github.com/ByteDance-Seed/Depth-Anything-3'"
 
 
 def _weights(size: int, sha256: str) -> WeightFile:

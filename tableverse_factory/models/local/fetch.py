@@ -13,7 +13,13 @@ from tableverse_factory.core.errors import InputError, WeightsError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.storage.files import sync_folder
 from tableverse_factory.models.local.catalogue import ModelEntry, WeightFile
-from tableverse_factory.models.local.hf_weights import GIT_HASH, describe_refusal, pin_commit, shorten_error
+from tableverse_factory.models.local.hf_weights import (
+    GIT_HASH,
+    describe_refusal,
+    is_unreachable,
+    pin_commit,
+    shorten_error,
+)
 from tableverse_factory.models.local.weight_files import (
     SHA256,
     check_file,
@@ -138,7 +144,7 @@ def _download_blob(model: ModelEntry, commit: str, offer: _Offer, wanted: Weight
             partial.unlink()
             raise
         except Exception as error:
-            raise _make_error(model, commit, wanted.name, error) from error
+            raise _make_error(model, commit, wanted.name, error, has_begun=partial.stat().st_size > 0) from error
         found = hash_file(partial)
         right = found == (wanted.sha256 or found)
         by_name = found if SHA256.fullmatch(offer.etag) else hash_git_blob(partial)
@@ -195,15 +201,20 @@ def _link_blob(model: ModelEntry, commit: str, name: str) -> None:
         raise _make_error(model, commit, name, error) from error
 
 
-def _make_error(model: ModelEntry, commit: str, name: str, error: Exception) -> WeightsError:
+def _make_error(model: ModelEntry, commit: str, name: str, error: Exception, has_begun: bool = False) -> WeightsError:
     weights = f"{model.repository}@{commit}"
     if "EntryNotFound" in type(error).__name__:
         return WeightsError(f"{model.name} = {weights!r} holds no {name}: is the revision right?")
     if refusal := describe_refusal(error, weights, model.name):
         return WeightsError(refusal)
+    if is_unreachable(error) and not has_begun:
+        return WeightsError(
+            f"{model.name}: the hub cannot be reached to fetch {name} ({shorten_error(error)}): look at the network, "
+            "its proxy and HF_ENDPOINT, then run the same command again"
+        )
+    goes_on = ", which goes on with what arrived" if has_begun else ""
     return WeightsError(
-        f"{model.name}: {name} cannot be fetched ({shorten_error(error)}): run the same command again, which goes on "
-        "with what arrived"
+        f"{model.name}: {name} cannot be fetched ({shorten_error(error)}): run the same command again{goes_on}"
     )
 
 

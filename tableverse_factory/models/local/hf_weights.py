@@ -104,12 +104,17 @@ def describe_load_error(error: BaseException, weights: str, key: str) -> str:
     name, _, revision = weights.partition("@")
     if refusal := describe_refusal(error, weights, key):
         return refusal
-    if {type(cause).__name__ for cause in _list_causes(error)} & _UNREACHABLE:
+    if is_unreachable(error):
         return (
             f"{key} = {weights!r} is not on this machine and the hub cannot be reached: fetch it once with a network "
             f"(`{_suggest_fetch(name, revision)}`), or name a folder that holds it"
         )
     return f"{key} = {weights!r} cannot be loaded: {shorten_error(error)}"
+
+
+def is_unreachable(error: BaseException) -> bool:
+    """Whether an error says that the hub cannot be reached."""
+    return bool({type(cause).__name__ for cause in _list_causes(error)} & _UNREACHABLE)
 
 
 def describe_refusal(error: BaseException, weights: str, key: str) -> str:

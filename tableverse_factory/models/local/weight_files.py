@@ -76,7 +76,7 @@ def find_models(config: Config) -> tuple[tuple[ModelEntry, ...], tuple[str, ...]
 
 def locate_repository(model: ModelEntry) -> Path:
     """Locate the folder of a repository in the cache, which need not exist."""
-    constants: Any = import_extra("huggingface_hub.constants", "the weights of models", "models")
+    constants: Any = import_extra("huggingface_hub.constants", "looking for weights", "models")
     return Path(constants.HF_HUB_CACHE) / f"models--{model.repository.replace('/', '--')}"
 
 

@@ -47,7 +47,7 @@ def test_a_net_that_is_missing_or_damaged(refuse, section, key, more):
     Path("cut.onnx").write_bytes(SHIPPED.read_bytes()[:100_000])
     told = refuse(**{section: {key: "cut.onnx", **more}})
     assert f"{section}.{key}" in told
-    assert "is no ONNX file" in told
+    assert "is no ONNX file: Failed to load model" in told
     assert not told.endswith(".")
 
 

@@ -135,6 +135,17 @@ def test_a_body_that_breaks_off_is_continued_and_not_begun_again(hub, model, fol
     assert sent == [(WEIGHTS, ""), (WEIGHTS, f"bytes={size // 2 // 1000 * 1000}-")]
 
 
+def test_what_arrived_before_a_hub_gave_up_is_said_to_be_kept(hub, model, folder, monkeypatch):
+    monkeypatch.setattr("time.sleep", lambda _: None)  # between the client's own attempts
+    hub.cuts = 50
+    assert refused(known(model, folder), f"{WEIGHTS} cannot be fetched").endswith("run the same command again")
+    (name,) = left_over(model)
+    partial = locate_repository(model) / "blobs" / name
+    partial.write_bytes((folder / WEIGHTS).read_bytes()[:2000])
+    refused(known(model, folder), "run the same command again, which goes on with what arrived")
+    assert partial.stat().st_size == 2000
+
+
 def test_a_killed_fetch_is_continued_where_it_was(hub, model, folder, tmp_path):
     hub.pause_s = 0.02
     script = f"""if True:
@@ -245,10 +256,12 @@ def test_what_the_hub_refuses_is_told_with_the_remedy(hub, model, monkeypatch):
     missing = replace(model, files=(WeightFile("tokenizer.json"),))
     refused(missing, "holds no tokenizer.json: is the revision right?")
     hub.status = 503
-    assert "127.0.0.1" not in refused(model, "run the same command again, which goes on with what arrived")
+    told = refused(model, f"{CONFIG} cannot be fetched")
+    assert told.endswith("run the same command again")
+    assert "127.0.0.1" not in told
     hub.status = 200
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    assert "127.0.0.1" not in refused(model, f"{CONFIG} cannot be fetched (OfflineModeIsEnabled")
+    assert "127.0.0.1" not in refused(model, f"the hub cannot be reached to fetch {CONFIG} (OfflineModeIsEnabled")
 
 
 def test_a_slow_hub_is_not_waited_for_without_end(hub, model, monkeypatch):
