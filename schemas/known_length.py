@@ -6,6 +6,8 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
+from schemas.error_text import describe_validation_error
+
 MAX_CHARS = 1000
 MIN_DISTANCE_PX = 4.0
 
@@ -96,11 +98,7 @@ def parse_known_length(text: str) -> KnownLength:
     try:
         return _ADAPTER.validate_json(text, strict=True)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"][1:])
-        message, value = first["msg"].removeprefix("Value error, "), first["input"]
-        given = f", not {value!r:.80}" if isinstance(value, str | int | float | bool | None) else ""
-        raise ValueError(f"{where}: {message}{given}" if where else f"{message}{given}") from None
+        raise ValueError(describe_validation_error(error, skipped=1)) from None  # the kind
 
 
 def encode_known_length(known: KnownLength | None) -> str:

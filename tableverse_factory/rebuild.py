@@ -6,11 +6,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from schemas.config import Config
+from schemas.error_text import describe_validation_error
 from schemas.manifest import ImageRow
 from tableverse_factory.core.config import build_config
 from tableverse_factory.core.errors import BuildError, ConfigError
 from tableverse_factory.core.storage.files import StoragePath
-from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.dataset.committed_rows import read_shard
 from tableverse_factory.dataset.image_rows import ImageRows
 from tableverse_factory.dataset.shard_plan import Plan, digest_manifest

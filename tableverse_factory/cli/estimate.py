@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from schemas.error_text import describe_validation_error
 from tableverse_factory.cli.options import AsJson, BuiltOut, Pools
 from tableverse_factory.cli.tables import make_table, print_json
 from tableverse_factory.core.errors import ConfigError
-from tableverse_factory.core.text import describe_validation_error, sanitize_line
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     from schemas.config import Config

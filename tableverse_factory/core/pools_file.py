@@ -6,10 +6,10 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from schemas.config import Config
+from schemas.error_text import describe_validation_error
 from schemas.pools import Pools, PoolSpec
 from tableverse_factory.core.config import load_yaml
 from tableverse_factory.core.errors import ConfigError
-from tableverse_factory.core.text import describe_validation_error
 
 IDLE_ACTOR_CPUS = 0.25  # CPUs of an actor that mostly waits for a model's answer
 

@@ -2,10 +2,6 @@
 
 import json
 import re
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
 
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
 _QUERY = re.compile(r"\?[^\s\"'<>)]*")
@@ -41,24 +37,3 @@ def describe_error(error: BaseException) -> str:
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     return " ".join(str(error).split()) or type(error).__name__
-
-
-_PYDANTIC_MESSAGES = {
-    "missing": "is missing",
-    "tuple_type": "give a list",
-    "list_type": "give a list",
-    "model_type": "give keys and values",
-    "dict_type": "give keys and values",
-    "too_short": "give at least one",
-}
-"""Messages in the terms of JSON and YAML by pydantic's error code."""
-
-
-def describe_validation_error(error: "ValidationError") -> str:
-    """Describe the first problem of a validation as `where: what, not value`; long values are cut."""
-    first = error.errors(include_url=False)[0]
-    location = ".".join(str(part) for part in first["loc"])
-    message = _PYDANTIC_MESSAGES.get(first["type"], first["msg"].removeprefix("Value error, "))
-    value = first["input"]
-    given = f", not {sanitize_line(repr(value), 80)}" if isinstance(value, str | int | float | bool | None) else ""
-    return f"{location}: {message}{given}" if location else f"{message}{given}"

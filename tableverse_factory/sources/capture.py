@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from schemas.config import ObserveConfig
 from schemas.detection import Detections
+from schemas.error_text import describe_validation_error
 from schemas.geometry import Camera, DepthImage, IdImage, Picture, TriangleMesh
 from schemas.observation import IntrinsicsSource, ScaleSource
 from tableverse_factory.core.errors import GeometryError, InputError
@@ -21,7 +22,6 @@ from tableverse_factory.core.storage.untrusted import (
     parse_json,
     read_bytes,
 )
-from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")

@@ -8,12 +8,12 @@ from fsspec.implementations.local import LocalFileSystem
 from pydantic import ValidationError
 
 from schemas.config import ObserveConfig
+from schemas.error_text import describe_validation_error
 from schemas.geometry import TriangleMesh
 from schemas.layout import Layout
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.files import resolve_filesystem
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_json, read_bytes
-from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.sources.mesh_file import read_mesh_with_colors
 
 

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from schemas.detection import MAX_DETECTIONS, Detections
+from schemas.error_text import describe_validation_error
 from schemas.layout import MAX_OBJECTS, Layout
 from schemas.manifest import ImageRow
 from schemas.tables import MANIFEST
-from tableverse_factory.core.text import describe_validation_error
 
 
 def entry(**changes):
@@ -131,7 +131,7 @@ def test_a_chain_that_leads_into_a_circle_names_the_circle_alone():
     [
         ([], "give keys and values"),
         ({"objects": {}}, "objects: give a list"),
-        ({"objects": []}, "objects: give at least one"),
+        ({"objects": []}, "objects: give at least 1"),
         (layout({"id": "a"}), "objects.0.mesh: is missing"),
         (layout(entry(pose=[0, 0, 0])), "objects.0.pose: give keys and values"),
     ],

@@ -61,12 +61,12 @@ def test_the_option_is_for_bare_pictures_that_have_none(tmp_path):
 @pytest.mark.parametrize(
     ("value", "told"),
     [
-        ({**EDGE, "length_m": 1e9}, "source.json: known_length: length_m: Input should be less than or equal to 10"),
-        ({**EDGE, "length_m": float("nan")}, "finite number, not nan"),
+        ({**EDGE, "length_m": 1e9}, "source.json: known_length: length_m: give at most 10, not"),
+        ({**EDGE, "length_m": float("nan")}, "length_m: give a finite number, not nan"),
         ({**EDGE, "pixels": [[3, 4], [32, 20]]}, "the pixel (32, 20) lies outside: the upright picture has 32 x 24"),
-        ({"kind": "a4\n\x1b[31m", "pixels": []}, "expected tags"),
-        ([], "object"),
-        (0.3, "object"),
+        ({"kind": "a4\n\x1b[31m", "pixels": []}, "give one of 'distance', 'a4'"),
+        ([], "give keys and values"),
+        (0.3, "give keys and values, not 0.3"),
         ("0.3 m", "JSON"),
         ({"kind": "a4", "pixels": [[0, 0]] * 4000}, "at most 1000"),
     ],
@@ -112,7 +112,7 @@ def test_the_command_takes_one_and_names_what_is_wrong(tmp_path, run):
     assert run(*line, json.dumps(CAMERA))[0] == 0
     code, _, told = run(*line, json.dumps({**CAMERA, "length_m": -1}))
     assert code == 1
-    assert "--known-length: length_m: Input should be greater than or equal to 0.05, not -1" in " ".join(told.split())
+    assert "--known-length: length_m: give at least 0.05, not -1" in " ".join(told.split())
 
 
 @pytest.mark.parametrize("pixel", [(31.6, 0.0), (0.0, 23.6), (1000.0, 1000.0)])

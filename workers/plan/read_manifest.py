@@ -12,12 +12,12 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from schemas.error_text import describe_validation_error
 from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage.files import StoragePath
 from tableverse_factory.core.storage.parquet import open_parquet
-from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.dataset.columns import HashIndex, TextColumn
 from tableverse_factory.dataset.image_rows import BATCH_ROWS, ImageRows, find_valid
 

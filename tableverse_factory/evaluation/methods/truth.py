@@ -8,11 +8,11 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from schemas.error_text import describe_validation_error
 from schemas.geometry import Pose
 from schemas.layout import MAX_OBJECTS, LayoutPose
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, parse_finite, parse_json, read_bytes
-from tableverse_factory.core.text import describe_validation_error
 from tableverse_factory.delivery.formats.model_contents import VisualMesh
 from tableverse_factory.evaluation.methods.comparison import index_by_shared_name
 from tableverse_factory.evaluation.methods.glb import GREY

@@ -1,0 +1,55 @@
+"""Words for what a pydantic model refuses, in the terms of JSON and YAML."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+_SHOWN_CHARS: Final = 80
+_MESSAGES: Final[Mapping[str, str]] = {
+    "missing": "is missing",
+    "extra_forbidden": "is no key here: leave it out",
+    "tuple_type": "give a list",
+    "list_type": "give a list",
+    "model_type": "give keys and values",
+    "model_attributes_type": "give keys and values",
+    "dict_type": "give keys and values",
+    "too_short": "give at least {min_length}",
+    "too_long": "give at most {max_length}",
+    "float_type": "give a number",
+    "int_type": "give a whole number",
+    "string_type": "give a text",
+    "bool_type": "give true or false",
+    "finite_number": "give a finite number",
+    "greater_than": "give more than {gt:g}",
+    "greater_than_equal": "give at least {ge:g}",
+    "less_than": "give less than {lt:g}",
+    "less_than_equal": "give at most {le:g}",
+    "string_too_long": "give at most {max_length} characters",
+    "literal_error": "give {expected}",
+    "json_invalid": "it is no JSON: {error}",
+    "union_tag_not_found": "{discriminator} is missing",
+    "union_tag_invalid": "{discriminator}: give one of {expected_tags}, not {tag!r}",
+}
+_WITHOUT_VALUE: Final = {"json_invalid", "missing", "extra_forbidden", "union_tag_not_found", "union_tag_invalid"}
+
+
+def describe_validation_error(error: "ValidationError", skipped: int = 0) -> str:
+    """Describe the first problem of a validation in one line, `where: what, not value`; long values are cut.
+
+    The first `skipped` parts of the place are left out.
+    """
+    first: Mapping[str, Any] = error.errors(include_url=False)[0]
+    kind, value = first["type"], first["input"]
+    where = ".".join(str(part) for part in first["loc"][skipped:])
+    wording = _MESSAGES.get(kind)
+    message = first["msg"].removeprefix("Value error, ") if wording is None else wording.format(**first.get("ctx", {}))
+    is_shown = kind not in _WITHOUT_VALUE and isinstance(value, str | int | float | bool | None)
+    given = f", not {_shorten(repr(value))}" if is_shown else ""
+    return f"{where}: {message}{given}" if where else f"{message}{given}"
+
+
+def _shorten(text: str) -> str:
+    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: _SHOWN_CHARS + 1])
+    return plain if len(plain) <= _SHOWN_CHARS else f"{plain[: _SHOWN_CHARS - 1]}…"
