@@ -87,7 +87,7 @@ class ModelsConfig(Section):
 class ObserveConfig(StageSection):
     """Limits on decoded inputs, and the source of depth."""
 
-    max_pixels: Annotated[int, Field(ge=1, le=200_000_000)] = 40_000_000
+    max_pixels: Annotated[int, Field(ge=1, le=178_000_000)] = 40_000_000
     """Largest picture, by its header; a larger one is refused before it is decoded."""
     max_file_bytes: Annotated[int, Field(ge=1)] = 256 * 1024 * 1024
     """Largest input file [bytes]."""

@@ -1,6 +1,7 @@
 """`tableverse manifest`: image manifest of folders, files and lists of addresses."""
 
 import math
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from functools import partial
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tableverse_factory.cli.exit_codes import FAILED
 from tableverse_factory.cli.options import AsJson, ConfigFile, Overrides, require_local_path
 from tableverse_factory.cli.tables import make_table, print_json
 from tableverse_factory.core.errors import InputError
@@ -79,7 +81,8 @@ def manifest(
 ) -> None:
     """List captures, layouts and pictures, and check each.
 
-    Each is decoded once. An unusable one is a row too, with the reason in its column `rejected`. The bounds come from
+    Each is decoded once. An unusable one is a row too, with the reason in its column `rejected`; where all are, the
+    command fails. The bounds come from
     the section `observe` of the configuration. Files that end in .csv, .jsonl or .parquet are lists of addresses, with
     the columns url, source and licence: their pictures are fetched, and the same command resumes after a kill.
 
@@ -104,13 +107,17 @@ def manifest(
     with count_progress("entries checked") as count:
         folders = [path for path in paths if not is_list(path)]
         made = create_manifest(folders, out, bounds, gathered, image_filter, count.update, known)
+    is_empty = all(row.rejected for row in made.rows)
     if as_json:
         fetched = {"fetched": {"now": gathered.fetched, "earlier": gathered.earlier}} if lists else {}
         print_json({"counts": _count_rows(made), "ignored": made.ignored, **fetched}, indent=None)
-        return
-    _print_manifest(made, out)
-    if lists:
-        print(f"fetched {pluralize(gathered.fetched, 'picture')}; {gathered.earlier} were there already")
+    else:
+        _print_manifest(made, out)
+        if lists:
+            print(f"fetched {pluralize(gathered.fetched, 'picture')}; {gathered.earlier} were there already")
+    if is_empty:
+        print("error: every row is rejected, so there is nothing to build", file=sys.stderr)
+        raise typer.Exit(FAILED)
 
 
 def _drop_none(options: dict[str, Any]) -> dict[str, Any]:

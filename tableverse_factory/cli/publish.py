@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
     from tableverse_factory.delivery.hub.upload_set import UploadSet
@@ -57,11 +57,12 @@ def publish(
 def _print_contents(contents: "UploadSet") -> None:
     from tableverse_factory.dataset.licences import LicenceVerdict
 
-    files, shards = len(contents.sizes) + 1, f"{len(contents.shards)} of {contents.n_shards} shards"
-    print(f"  {files} files, {contents.n_bytes / 1e6:,.1f} MB: {shards}")
-    print(f"  {contents.scenes} scenes, {contents.with_files} of them with files")
+    files = pluralize(len(contents.sizes) + 1, "file")
+    shards = f"{len(contents.shards)} of {pluralize(contents.n_shards, 'shard')}"
+    print(f"  {files}, {contents.n_bytes / 1e6:,.1f} MB: {shards}")
+    print(f"  {pluralize(contents.scenes, 'scene')}, {contents.with_files} of them with files")
     shown = list(contents.licences.items())[:_SHOWN_LICENCES]
     print("  licences: " + ", ".join(f"{sanitize_line(name, 60) or 'not stated'} ({count})" for name, count in shown))
     strict = [(each, count) for each, count in contents.verdicts.items() if each is not LicenceVerdict.PERMISSIVE]
     kinds = f" ({', '.join(f'{count} {verdict.value}' for verdict, count in strict)})" if strict else ""
-    print(f"  not permissive: {sum(count for _, count in strict)} scenes{kinds}")
+    print(f"  not permissive: {pluralize(sum(count for _, count in strict), 'scene')}{kinds}")

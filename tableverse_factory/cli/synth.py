@@ -31,10 +31,11 @@ def synth(
     Example: `tableverse synth captures --scenes 24 --seed 7 && tableverse manifest captures --out images.parquet`
     """
     from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.text import pluralize
     from tableverse_factory.sources.synthetic.layout import synthesize_layouts
     from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
     with count_progress("scenes", scenes) as done:
         make = synthesize_captures if kind == "captures" else synthesize_layouts
         made = make(out, scenes, seed, lambda *_: done())
-    print(f"{len(made)} {kind} in {out}")
+    print(f"{pluralize(len(made), kind.removesuffix('s'))} in {out}")

@@ -23,6 +23,7 @@ from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES, DEPTH_N
 from tableverse_factory.sources.content_hash import CAMERA_SUFFIX
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+UNREAD_SUFFIXES = (".avif", ".bmp", ".dng", ".gif", ".heic", ".heif", ".jfif", ".jp2", ".jxl", ".tif", ".tiff")
 ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
 MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
@@ -150,7 +151,7 @@ def _walk_remote_folders(filesystem: fsspec.AbstractFileSystem, root: str) -> It
 
 def _make_file_entry(uri: str) -> ManifestEntry:
     suffix = posixpath.splitext(uri)[1].lower()
-    if suffix not in (".json", *IMAGE_SUFFIXES):
+    if suffix not in (".json", *IMAGE_SUFFIXES, *UNREAD_SUFFIXES):
         known = ", ".join((".json", *IMAGE_SUFFIXES))
         raise InputError(
             f"{sanitize_line(uri)}: neither a picture nor a layout by its ending; give a folder or one of {known}"
@@ -193,7 +194,7 @@ def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
         return "hidden file"
     if is_source_file(name):
         return "source.json"
-    if suffix in IMAGE_SUFFIXES:
+    if suffix in (*IMAGE_SUFFIXES, *UNREAD_SUFFIXES):
         return "picture among meshes" if in_assets else SceneKind.IMAGE
     if suffix == ".json":
         sidecar = name in (CAMERA_NAME, DETECTIONS_NAME, GROUND_TRUTH_NAME)
@@ -239,13 +240,15 @@ def _make_entry(kind: SceneKind, uri: str, problem: tuple[str, str] | None = Non
 
 
 def _check_name(entry: ManifestEntry) -> ManifestEntry:
-    """Add a problem to an entry whose name would not survive a manifest, or would open something else."""
+    """Add a problem to an entry of a format that is not read, or whose name would not survive, or open another."""
     if any("\ud800" <= c <= "\udfff" for c in entry.uri):
         problem = ("name_not_utf8", "the file name is not UTF-8: rename it")
     elif len(entry.uri) > MAX_URI_CHARS:
         problem = ("name_too_long", f"{len(entry.uri)} characters; at most {MAX_URI_CHARS}: shorten the path")
     elif entry.uri.startswith("/") and "::" in entry.uri:
         problem = ("unsafe_name", "'::' in a path means another place to fsspec: rename it")
+    elif entry.kind is SceneKind.IMAGE and entry.uri.lower().endswith(UNREAD_SUFFIXES):
+        problem = ("unsupported_format", f"{entry.name}: pictures of this format are not read: give PNG, JPEG or WebP")
     else:
         return entry
     return replace(entry, uri=sanitize_line(entry.uri, MAX_URI_CHARS), problem=entry.problem or problem)

@@ -13,6 +13,8 @@ from tableverse_factory.core.storage.untrusted import decode_image, open_image, 
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
 """Pillow's modes that convert to 8-bit sRGB. CMYK needs its printer's profile; 16-bit grey would clip."""
 
+MIN_SIDE_PX = 16  # nothing is seen in less
+MAX_ASPECT = 8.0  # maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures
 _ORIENTATION = 0x0112  # EXIF tag
 _TRANSPOSE_BY_ORIENTATION = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -34,10 +36,11 @@ def decode_upright(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
     """Decode the bytes of a bare picture, as `read_image` does.
 
     Raises:
-        InputError: reasons `unreadable_color`, `picture_too_large`, `animated_picture`, `unsupported_pixels`,
-            `transparent_picture`.
+        InputError: reasons `unreadable_color`, `picture_too_large`, `picture_too_small`, `picture_too_narrow`,
+            `animated_picture`, `unsupported_pixels`, `transparent_picture`.
     """
     image = open_image(data, name, bounds, "unreadable_color")
+    _check_shape(name, *image.size)
     frames = getattr(image, "n_frames", 1)
     if frames > 1 and image.format != "MPO":  # phones put a preview or a depth behind the photo: its first frame counts
         raise InputError(f"{name} has {frames} frames: give one picture", "animated_picture")
@@ -52,6 +55,16 @@ def decode_upright(data: bytes, name: str, bounds: ObserveConfig) -> Picture:
     decode_image(image, name, None, "unreadable_color")  # before its EXIF, which may stand behind the pixels
     turned = _TRANSPOSE_BY_ORIENTATION.get(_read_orientation(image))
     return decode_image(image if turned is None else image.transpose(turned), name, "RGB", "unreadable_color")
+
+
+def _check_shape(name: str, width: int, height: int) -> None:
+    shorter, longer = sorted((width, height))
+    if shorter < MIN_SIDE_PX:
+        problem = f"{name} is {width} x {height} pixels: give at least {MIN_SIDE_PX} on each side"
+        raise InputError(problem, "picture_too_small")
+    if longer > MAX_ASPECT * shorter:
+        problem = f"{name} is {width} x {height} pixels: crop it, one side may be {MAX_ASPECT:g} times the other"
+        raise InputError(problem, "picture_too_narrow")
 
 
 def _read_orientation(image: Image.Image) -> int:

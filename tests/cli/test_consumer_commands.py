@@ -112,8 +112,11 @@ def test_manifest_counts_what_it_found(tableverse, tmp_path):
 def test_manifest_keeps_to_the_bounds_of_the_configuration(tableverse, tmp_path):
     write_picture(tmp_path / "in" / "photo.png", 2)
     options = ("--out", tmp_path / "m.parquet", "--set", "observe.max_pixels=10", "--json")
-    counted = json.loads(tableverse("manifest", tmp_path / "in", *options).out)
-    assert counted["counts"] == {"image": {"picture_too_large": 1}}
+    answer = tableverse("manifest", tmp_path / "in", *options)
+    assert json.loads(answer.out)["counts"] == {"image": {"picture_too_large": 1}}
+    assert answer.code == 1, "a script must not go on to build nothing"
+    assert "every row is rejected" in answer.err
+    assert pq.read_metadata(tmp_path / "m.parquet").num_rows == 1
 
 
 def test_config_prints_a_file_that_reads_back(tableverse, tmp_path):

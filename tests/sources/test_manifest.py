@@ -59,6 +59,42 @@ def test_what_lies_in_a_capture_or_beside_meshes_belongs_to_it(tmp_path):
     assert made.ignored["picture among meshes"] == 2
 
 
+def test_pictures_of_other_formats_are_rows_that_say_what_to_give(tmp_path):
+    for name in ("a.gif", "b.HEIC", "c.tiff", "d.avif"):
+        (tmp_path / name).write_bytes(b"?")
+    write_capture(tmp_path / "capture.gif", 1)
+    write_picture(tmp_path / "capture.gif" / "film.gif", 1)
+    rows = rows_of(tmp_path)
+    assert {row.name: row.rejected for row in rows} == {
+        **dict.fromkeys(("a.gif", "b.HEIC", "c.tiff", "d.avif"), "unsupported_format"),
+        "capture.gif": "",
+    }
+    (named,) = rows_of(tmp_path / "a.gif")
+    assert named in rows
+    assert "give PNG, JPEG or WebP" in named.rejected_detail
+
+
+@pytest.mark.parametrize(
+    ("size", "reason"),
+    [((1, 1), "picture_too_small"), ((15, 400), "picture_too_small"), ((100, 3000), "picture_too_narrow"),
+     ((801, 100), "picture_too_narrow"), ((16, 16), ""), ((16, 128), "")],
+)  # fmt: skip
+def test_what_no_model_can_see_is_rejected_before_a_build(tmp_path, size, reason):
+    write_picture(tmp_path / "a.png", 1, size)
+    (row,) = rows_of(tmp_path)
+    assert row.rejected == reason
+    assert not reason or f"a.png is {size[1]} x {size[0]} pixels" in row.rejected_detail
+
+
+@pytest.mark.parametrize("bound", [10_000, 178_000_000])
+def test_an_enormous_picture_is_told_the_key_that_bounds_it(tmp_path, bound):
+    (tmp_path / "a.png").write_bytes(huge_png(60_000, 60_000))
+    (row,) = rows_of(tmp_path, bounds=ObserveConfig(max_pixels=bound))
+    assert row.rejected == "picture_too_large"
+    assert f"a.png has 3600000000 pixels; at most {bound} (observe.max_pixels)" in row.rejected_detail
+    assert "bomb" not in row.rejected_detail
+
+
 def test_ids_come_from_the_content_and_not_from_the_place(tmp_path, monkeypatch):
     write_capture(tmp_path / "a" / "mug", 1)
     shutil.copytree(tmp_path / "a", tmp_path / "b")

@@ -4,6 +4,7 @@ import errno
 import io
 import json
 import math
+import re
 import struct
 import warnings
 import zlib
@@ -29,6 +30,7 @@ _ABSENT_STATUSES = (403, 410)  # Besides 404: public buckets that may not be lis
 _BAD_NAME_ERRNOS = (errno.ENAMETOOLONG, errno.ELOOP)  # Errors of names that cannot exist on a disk
 IMAGE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  # Formats that are decoded; the last two serve textures alone
 LARGE_IMAGE_BOUNDS = ObserveConfig(max_pixels=100_000_000)  # Bounds on texture maps: 8K by 8K and a little more
+_PIXELS = re.compile(r"\((\d+) pixels\)")  # in Pillow's words
 _DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, MemoryError, OverflowError, struct.error, zlib.error)
 
 
@@ -161,8 +163,10 @@ def open_image(data: bytes, name: str, bounds: ObserveConfig, reason: str) -> Im
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides, below
             warnings.simplefilter("ignore", UserWarning)  # about notes beside the pixels that are cut off
             image = Image.open(io.BytesIO(data), formats=IMAGE_FORMATS)
-    except Image.DecompressionBombError as error:
-        raise InputError(f"{name} is too large: {error}", "picture_too_large") from error
+    except Image.DecompressionBombError as error:  # of more pixels than `observe.max_pixels` may allow
+        found = "".join(_PIXELS.findall(str(error))) or "too many"
+        limit = f"at most {bounds.max_pixels} (observe.max_pixels) are decoded"
+        raise InputError(f"{name} has {found} pixels; {limit}", "picture_too_large") from error
     except UnidentifiedImageError as error:  # its own text holds a memory address: another one in every run
         raise InputError(f"{name} is no picture: give PNG, JPEG or WebP", reason) from error
     except _DECODE_ERRORS as error:

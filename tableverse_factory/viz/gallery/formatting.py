@@ -29,6 +29,8 @@ _EXPLANATIONS = {
     "depth_all_zero": "the depth image has no valid depth",
     "picture_too_large": "more pixels than the limit",
     "picture_too_narrow": "too narrow for depth models",
+    "picture_too_small": "too few pixels to see anything",
+    "unsupported_format": "pictures of this format are not read: give PNG, JPEG or WebP",
     "no_table_plane": "no table plane was found",
     "no_table_detected": "the detector found no table-top",
     "no_objects": "nothing stands on the table",

@@ -55,6 +55,8 @@ def write_pictures(folder: Path) -> None:
         "gif.jpg": encode(image, "GIF", **frames),
         "other.gif": encode(image, "GIF", **frames),
         "rocket.jpg": (DATA / "rocket.jpg").read_bytes(),
+        "strip.png": encode(image.resize((3000, 100)), "PNG"),
+        "photo.HEIC": b"\0\0\0\x18ftypheic",
         "tiny.png": encode(Image.fromarray(small), "PNG"),
         "empty.png": b"",
     }
@@ -67,7 +69,7 @@ def test_every_file_becomes_a_row(tmp_path, run) -> None:
     write_pictures(tmp_path / "in")
     code, said, errors = run("manifest", tmp_path / "in", "--out", tmp_path / "m.parquet")
     assert code == 0, said + errors
-    assert "left alone: 1 × other file" in said
+    assert "left alone: 1 × source.json" in said
     out = tmp_path / "out"
     code, said, errors = run("build", tmp_path / "m.parquet", out, "--executor", "local", "--workers", 1)
     assert code == 0, said + errors
@@ -84,7 +86,10 @@ def test_every_file_becomes_a_row(tmp_path, run) -> None:
         "animated.webp": "animated_picture",
         "gif.jpg": "unreadable_color",
         "rocket.jpg": "no_table",
-        "tiny.png": "no_table",
+        "tiny.png": "picture_too_small",
+        "strip.png": "picture_too_narrow",
+        "other.gif": "unsupported_format",
+        "photo.HEIC": "unsupported_format",
     }
     table = rows["table.png"]
     assert (table["scale_source"], table["intrinsics_source"]) == ("estimated", "assumed")

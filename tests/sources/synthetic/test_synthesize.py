@@ -36,7 +36,7 @@ def test_same_bytes_in_another_process_fewer_scenes_and_after_an_interruption(
     out = tmp_path / "again"
     done = run_command(str(out), "--scenes", "1", "--seed", "3", hash_seed="77")
     assert done.returncode == 0, done.stderr
-    assert done.stdout == f"1 captures in {out}\n"
+    assert done.stdout == f"1 capture in {out}\n"
     assert contents(out / "synth_000000") == contents(synthetic_folders[0])
     # A second call that was killed half-way leaves a partial folder; the next goes on and replaces it.
     (out / ".synth_000001.partial" / "truth").mkdir(parents=True)

@@ -9,14 +9,12 @@ from PIL import Image
 from schemas.config import ObserveConfig
 from schemas.geometry import Frozen, Picture
 from schemas.observation import IntrinsicsSource
-from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.untrusted import open_image, read_bytes
 from tableverse_factory.sources.focal import read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
 
 MAX_SIDE_PX = 2048  # larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest
 USUAL_FIELD_DEG = 58.0  # angle over the longer side where nothing tells it: between phones and web cameras
-MAX_ASPECT = 8.0  # maximum ratio of the longer side to the shorter: no depth model was trained on narrower pictures
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,12 +46,6 @@ def read_rgb_image(uri: str, bounds: ObserveConfig) -> RgbImage:
     color = decode_upright(data, name, bounds)
     focal = read_exif_focal(open_image(data, name, bounds, "unreadable_color")).px
     height, width = color.shape[:2]
-    if max(width, height) > MAX_ASPECT * min(width, height):
-        raise InputError(
-            f"{name} has {width} x {height} pixels: one side is more than {MAX_ASPECT:g} times the other, and no depth "
-            "model knows such pictures",
-            "picture_too_narrow",
-        )
     scale = min(1.0, MAX_SIDE_PX / max(width, height))
     if scale < 1.0:
         size = max(1, round(width * scale)), max(1, round(height * scale))
