@@ -23,6 +23,7 @@ PACKAGES = (
 )
 CODE = "versions.code"  # key of the hash of this package's code: a checkout may change it under the same version
 AFTERWARDS = "afterwards"  # part with the versions that added trajectories to a dataset which others had made
+_OF_MANIFEST = ("manifest.scenes", "manifest.sha256")
 _MAX_SHOWN = 6
 
 
@@ -148,24 +149,35 @@ def diff_run_records(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[
 
 
 def resume_refused_error(
-    out: str, differing: Mapping[str, tuple[Any, Any]], section: str, option: str = ""
+    out: str, differing: Mapping[str, tuple[Any, Any]], section: str, option: str = "", manifest: str = ""
 ) -> BuildError:
     """Make the error of a build that would not give the bytes of the one that was begun in `out`.
 
-    `section` is the stage from which everything could be recomputed, if any, with `option` or `--from`.
+    `section` is the stage from which everything could be recomputed, if any, with `option` or `--from`. `manifest` says
+    how the manifest differs, if it does.
     """
     code = (
         f". {CODE} is tableverse-factory's own code, which a `git pull` changes too: --from computes the stage that it "
         "names and what follows with the code that is here now, and keeps what came before"
     )
-    shown = ", ".join(f"{key} was {old!r} and is now {new!r}" for key, (old, new) in [*differing.items()][:_MAX_SHOWN])
-    more = f" and {len(differing) - _MAX_SHOWN} more" if len(differing) > _MAX_SHOWN else ""
+    changes = [_describe_change(*item) for item in differing.items() if not (manifest and item[0] in _OF_MANIFEST)]
+    changes = [manifest, *changes] if manifest else changes
+    shown = ", ".join(changes[:_MAX_SHOWN])
+    more = f" and {len(changes) - _MAX_SHOWN} more" if len(changes) > _MAX_SHOWN else ""
     again = f"add {option or f'--from {section}'} to compute that stage again and what follows it, " if section else ""
+    begun = "the manifest that it was begun with" if manifest else "what it was begun with (see run.json)"
     return BuildError(
-        f"{out} was begun as another build: {shown}{more}. "
-        f"Go on with what it was begun with (see run.json), {again}or give another OUT"
+        f"{out} was begun as another build: {shown}{more}. Go on with {begun}, {again}or give another OUT"
         f"{code if section and CODE in differing else ''}"
     )
+
+
+def _describe_change(key: str, values: tuple[Any, Any]) -> str:
+    """Describe a change by its values, but for hashes, which say nothing."""
+    old, new = values
+    if key.endswith("sha256") and None not in values:
+        return f"the content of {key.removesuffix('sha256').rstrip('._')} differs"
+    return f"{key} was {old!r} and is now {new!r}"
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

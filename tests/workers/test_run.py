@@ -147,8 +147,15 @@ def test_another_configuration_or_manifest_refuses_and_says_what_differs(mixed, 
     with pytest.raises(BuildError, match=r"config\.run\.seed was 0 and is now 5.*another OUT"):
         build(manifest, out, seed=5)
     other = write_manifest(tmp_path / "m.parquet", [*MIXED, "fine"])
-    with pytest.raises(BuildError, match=r"manifest\.scenes was 12 and is now 13"):
+    words = (
+        "its manifest has 12 scenes and this one 13, with 12 in both. Go on with the manifest .* or give another OUT$"
+    )
+    with pytest.raises(BuildError, match=words) as told:
         build(other, out)
+    assert "sha256" not in str(told.value)
+    moved = write_manifest(tmp_path / "m.parquet", MIXED, root="/elsewhere")
+    with pytest.raises(BuildError, match=r"same scenes .* where they lie"):
+        build(moved, out)
     assert digests(out) == before
 
 

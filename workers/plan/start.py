@@ -9,6 +9,7 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
+from tableverse_factory.core.text import pluralize
 from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.shard_plan import Plan, digest_manifest, make_plan, read_plan, write_plan
 from tableverse_factory.run_record import (
@@ -138,11 +139,22 @@ def _check_same_build(
     """Refuse another build than the started one, except for the stages to recompute."""
     earliest = suggest_restart_stage(pipelines, plan.kinds, differing)
     if section is None and differing:
-        raise resume_refused_error(str(out), differing, earliest, option)
+        is_other = any(key.startswith("manifest.") for key in differing)
+        manifest = _describe_manifest_change(read_plan(out / "plan.parquet"), plan) if is_other else ""
+        raise resume_refused_error(str(out), differing, earliest, option, manifest)
     if read_plan(out / "plan.parquet") != plan:
         raise BuildError(f"{out / 'plan.parquet'} was changed after the build began: give another OUT")
     if section is not None:
         check_upstream_unchanged(pipelines, points, differing, section, earliest)
+
+
+def _describe_manifest_change(began: Plan, now: Plan) -> str:
+    """Describe in words how the scenes of the manifest differ from those that the build began with."""
+    old, new = set(began.scene_ids), set(now.scene_ids)
+    if old == new:
+        return "its manifest has the same scenes in another order, or says other things of them, such as where they lie"
+    both = len(old & new)
+    return f"its manifest has {pluralize(len(old), 'scene')} and this one {len(new)}, with {both} in both"
 
 
 def _invalidate_from(
