@@ -8,6 +8,7 @@ from tableverse_factory.core.version import __version__
 if TYPE_CHECKING:
     from tableverse_factory.dataset.dataset import Dataset, open_dataset
     from tableverse_factory.dataset.scene import Scene
+    from tableverse_factory.delivery.learning.dataset_environment import DatasetEnv
     from tableverse_factory.delivery.learning.environment import TableEnv
     from tableverse_factory.delivery.learning.grid import SceneGrid, build_scene_grid
     from tableverse_factory.delivery.learning.loader import SceneDataset
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Dataset",
+    "DatasetEnv",
     "Scene",
     "SceneDataset",
     "SceneGrid",
@@ -31,6 +33,7 @@ __all__ = [
 
 _MODULES = {
     "Dataset": "dataset.dataset",
+    "DatasetEnv": "delivery.learning.dataset_environment",
     "Scene": "dataset.scene",
     "SceneDataset": "delivery.learning.loader",
     "SceneGrid": "delivery.learning.grid",

@@ -32,9 +32,9 @@ LICENCES = ("CC0-1.0", "CC-BY-4.0", "CC-BY-NC-4.0")
 TASKED = (("task_000", "next to", True), ("task_001", "to the right of", True), ("task_002", "on", False))
 
 
-def write_learnable_dataset(out: Path, scenes: int = 6, shard_size: int = 2) -> Path:
-    """Scenes `s-0`, `s-1`, … that differ in where a bystander stands; the first has a motion for each of two tasks."""
-    exported = [_exported(k, with_motions=k == 0) for k in range(scenes)]
+def write_learnable_dataset(out: Path, scenes: int = 6, shard_size: int = 2, moved: int = 1) -> Path:
+    """Scenes `s-0`, `s-1`, … that differ in where a bystander stands; `moved` have a motion for each of two tasks."""
+    exported = [_exported(k, with_motions=k < moved) for k in range(scenes)]
     for number in range(0, scenes, shard_size):
         _write_shard(out, number // shard_size, exported[number : number + shard_size])
     (out / "run.json").write_text("{}")

@@ -1,4 +1,4 @@
-"""Gymnasium environment of a scene and a task, registered as `TableVerse/PickPlace-v0` on import."""
+"""Gymnasium environment of a scene and a task; `TableVerse/PickPlace-v0` is registered on import."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from gymnasium import spaces
 from schemas.geometry import Picture, Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.dataset.dataset import Scene, open_dataset
+from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.camera import RobotCamera
 from tableverse_factory.delivery.learning.pick_place_sim import PickPlaceSim, SimState
 from tableverse_factory.delivery.learning.variation import Variation, draw_lighting, draw_table_seed
@@ -71,9 +71,12 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             render_mode: `rgb_array` or None.
             render_size: Height and width of the pictures of `render` [px].
         """
-        if reward not in ("sparse", "dense") or render_mode not in (None, "rgb_array"):
-            given = f"reward {reward!r}, render_mode {render_mode!r}"
-            raise ConfigError(f"{given}: 'sparse' or 'dense', None or 'rgb_array'")
+        if reward not in ("sparse", "dense"):
+            raise ConfigError(f"reward {reward!r}: give 'sparse' or 'dense'")
+        if render_mode not in (None, "rgb_array"):
+            raise ConfigError(
+                f"render_mode {render_mode!r}: None or 'rgb_array'; 'human' needs gymnasium.make, which opens a window"
+            )
         self.render_mode = render_mode
         self.sim = PickPlaceSim(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
         self._scene, self._reward = scene, reward
@@ -119,7 +122,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         if (table, lighting) != self._look:
             self._look, self._cameras = (table, lighting), {}
         self._steps = 0
-        return self._observation(state), self._info(state)
+        return self._observation(state), {**self._info(state), "instruction": self.sim.instruction}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Execute one action for 1/50 s; `ResetNeeded` before the first reset, and once the episode has ended."""
@@ -190,16 +193,6 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return {**told, "fingers": int(state.sample.pads).bit_count()}
 
 
-def make_environment(dataset: str, scene: str, task: str, **options: Any) -> TableEnv:
-    """Make the environment from names alone, for `gymnasium.make` and worker processes.
-
-    `scene` and `task` are ids; `options` are those of `TableEnv`, except `max_steps`: Gymnasium itself truncates.
-    """
-    if "max_steps" in options:
-        raise ConfigError(f"max_steps {options['max_steps']!r}: gymnasium.make has max_episode_steps, -1 for no limit")
-    return TableEnv(open_dataset(dataset).scene(scene), task, max_steps=None, **options)
-
-
 def _check_count(name: str, value: object, least: int) -> int:
     if not isinstance(value, int | np.integer) or value < least:
         raise ConfigError(f"{name} {value!r}: give a whole number from {least} on")
@@ -219,4 +212,8 @@ def _check_variation(value: object) -> Variation:
     return value
 
 
-gymnasium.register(ENVIRONMENT_ID, entry_point=f"{__name__}:make_environment", max_episode_steps=MAX_STEPS)
+gymnasium.register(
+    ENVIRONMENT_ID,
+    entry_point="tableverse_factory.delivery.learning.dataset_environment:make_environment",
+    max_episode_steps=MAX_STEPS,
+)

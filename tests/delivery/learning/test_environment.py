@@ -328,6 +328,6 @@ def test_names_alone_are_enough_for_a_process_that_knows_nothing(out):
         "again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))\n"
         "print((env.reset(seed=1)[0]['state'] == again.reset(seed=1)[0]['state']).all())\n"
     )
-    name = f"tableverse_factory.delivery.learning.environment:{ID}"
+    name = f"tableverse_factory.gym:{ID}"
     done = subprocess.run([sys.executable, "-c", code, name, str(out)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "True"), done.stderr[-2000:]
