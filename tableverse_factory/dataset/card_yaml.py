@@ -30,8 +30,8 @@ def make_front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[s
     """
     head = {
         "pretty_name": "Table-top scenes for MuJoCo",
-        **_make_license_keys(licences),
-        "size_categories": [next((name for limit, name in SIZES if n_scenes < limit), "1M<n<10M")],
+        **make_license_keys(licences),
+        "size_categories": [name_size(n_scenes)],
         "task_categories": ["robotics"],
         "tags": _TAGS,
         "configs": [
@@ -46,7 +46,12 @@ def make_front_matter(n_scenes: int, licences: Iterable[str], tables: Sequence[s
     return f"---\n{yaml.safe_dump(head, sort_keys=False)}---"
 
 
-def _make_license_keys(licences: Iterable[str]) -> dict[str, object]:
+def name_size(rows: int) -> str:
+    """Name the size as the Hub does."""
+    return next((name for limit, name in SIZES if rows < limit), "1M<n<10M")
+
+
+def make_license_keys(licences: Iterable[str]) -> dict[str, object]:
     """Name the licences as the Hub does; `other` if it does not know them all."""
     plain = ("-".join(licence.lower().split()) for licence in licences)
     names = sorted({_HUB_NAMES.get(name, name) for name in plain})

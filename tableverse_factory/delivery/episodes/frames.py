@@ -7,12 +7,21 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from schemas.trajectories import Phase
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.delivery.episodes.observation import (
+    build_state,
+    name_objects,
+    name_state,
+    pad_objects,
+    read_object_poses,
+)
+from tableverse_factory.delivery.episodes.selection import Episode
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.arm import Arm
 
-STATE, ACTION = "observation.state", "action"
-_POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+STATE, OBJECTS, ACTION = "observation.state", "observation.environment_state", "action"
+SUBTASKS = tuple(phase.value.replace("_", "-") for phase in Phase)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +37,15 @@ class Feature:
         return {"dtype": self.dtype, "shape": [self.size], "names": list(self.names) if self.names else None}
 
 
-def list_features(arm: Arm) -> dict[str, Feature]:
+def list_features(arm: Arm, object_rows: int) -> dict[str, Feature]:
     """List every column of data/; policies read `observation.…` and `action` by default."""
-    joints = arm.joint_names
+    state, objects, commands = name_state(arm), name_objects(object_rows), (*arm.joint_names, "gripper_opening_m")
     return {
-        STATE: Feature("float32", len(joints) + len(arm.finger_joints), (*joints, *arm.finger_joints)),
-        ACTION: Feature("float32", len(joints) + 1, (*joints, "gripper_opening_m")),
-        "tcp_pose": Feature("float32", 7, _POSE),
-        "object_pose": Feature("float32", 7, _POSE),
+        STATE: Feature("float32", len(state), state),
+        OBJECTS: Feature("float32", len(objects), objects),
+        ACTION: Feature("float32", len(commands), commands),
         "phase": Feature("int64", 1),
+        "subtask": Feature("string", 1),
         "next.done": Feature("bool", 1),
         "next.success": Feature("bool", 1),
         "timestamp": Feature("float32", 1),
@@ -60,23 +69,27 @@ def compute_stride(recording: Recording, fps: int | None) -> tuple[int, int]:
     return rate // fps, fps
 
 
-def build_columns(recording: Recording, samples: Sequence[int], fps: int, success: bool) -> dict[str, np.ndarray]:
+def build_columns(
+    episode: Episode, arm: Arm, samples: Sequence[int], fps: int, object_rows: int
+) -> dict[str, np.ndarray]:
     """Build an episode's own columns; `number_columns` adds the others.
 
     A frame's action is the command that leads to the next frame, as a state is measured when its own command has just
     been reached. The last frame's action is the last command.
     """
-    count = len(samples)
+    recording, count = episode.recording, len(samples)
     following = [*samples[1:], len(recording) - 1]
     last = np.arange(count) == count - 1
+    objects = pad_objects(read_object_poses(episode.scene.model(), episode)[samples], object_rows)
+    phase = recording.phase[samples].astype(np.int64)
     return {
-        STATE: recording.qpos[samples],
+        STATE: build_state(arm, recording.qpos[samples], recording.qvel[samples], recording.tcp[samples]),
+        OBJECTS: objects.reshape(count, -1),
         ACTION: recording.command[following].astype(np.float32),
-        "tcp_pose": recording.tcp[samples],
-        "object_pose": recording.object_pose[samples],
-        "phase": recording.phase[samples].astype(np.int64),
+        "phase": phase,
+        "subtask": np.array(SUBTASKS)[phase],
         "next.done": last,
-        "next.success": last & success,
+        "next.success": last & bool(episode.row["success"]),
         "timestamp": (np.arange(count) / fps).astype(np.float32),
         "frame_index": np.arange(count, dtype=np.int64),
     }

@@ -1,5 +1,6 @@
 """LeRobot datasets, version 3.0, by pyarrow and PyAV, without the package `lerobot`.
 
+    DEST/README.md                                    the dataset card
     DEST/meta/info.json, stats.json, tasks.parquet
     DEST/meta/episodes/chunk-000/file-000.parquet     a row per episode: where its frames lie, and its statistics
     DEST/data/chunk-000/file-000.parquet              a row per frame, many episodes in a file
@@ -9,7 +10,7 @@ The layout is that of the public documentation.
 """
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +18,11 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.dataset.splits import SPLITS, find_split
 from tableverse_factory.delivery.episodes.frames import compute_stride, list_features
+from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction, read_instruction
 from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
+from tableverse_factory.delivery.episodes.observation import count_object_rows
 from tableverse_factory.delivery.episodes.render_workers import (
     ROBOT_CAMERA,
     SCENE_CAMERA,
@@ -31,11 +35,11 @@ from tableverse_factory.delivery.episodes.selection import (
     check_new_path,
     get_kind,
     open_episode,
-    read_instruction,
     select_rows,
 )
 from tableverse_factory.delivery.episodes.video import import_av
 
+_SCENE_COLUMNS = ("scene_id", "content_sha256", "licence")
 _CAMERAS = {"robot": ROBOT_CAMERA, "scene": SCENE_CAMERA}
 
 
@@ -71,45 +75,48 @@ def export_lerobot(
     """
     import_av()
     check_new_path(dest)
-    rows = select_rows(dataset, options.failed)
+    scenes = {row["scene_id"]: row for row in dataset.scenes.to_table(columns=list(_SCENE_COLUMNS)).to_pylist()}
+    rows = _sort_by_split(select_rows(dataset, options.failed), scenes)
     first = open_episode(dataset, rows[0])
-    setting, arm = _build_setting(first, options), load_recorded_arm(first.recording, options.robot)
-    licences = _read_licences(dataset)
+    setting, arm = _build_setting(dataset, first, options), load_recorded_arm(first.recording, options.robot)
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        files = LeRobotFiles(Path(scratch) / "dataset", setting, list_features(arm))
+        files = LeRobotFiles(Path(scratch) / "dataset", setting, list_features(arm, setting.object_rows))
         with closing(files):
             for row, shot in zip(rows, render_episodes(dataset.path, setting, rows, options.jobs), strict=True):
-                files.add(read_instruction(row), shot, _build_origin(row, licences))
+                files.add(read_instruction(row), shot, _build_origin(row, scenes[row["scene_id"]]))
                 if progress is not None:
                     progress(files.n_episodes, len(rows))
             files.finish().rename(dest)
     return LeRobotResult(files.n_episodes, files.n_frames, setting.cameras)
 
 
-def _build_setting(first: Episode, options: LeRobotOptions) -> RenderSetting:
+def _build_setting(dataset: Dataset, first: Episode, options: LeRobotOptions) -> RenderSetting:
     """Build the setting shared by all episodes."""
     if options.width % 2 or options.height % 2:
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
     every, fps = compute_stride(first.recording, options.fps)
     cameras = tuple(_CAMERAS[name] for name in options.cameras)
-    return RenderSetting(get_kind(first), cameras, options.width, options.height, every, fps, options.robot)
+    size, rows = (options.width, options.height), count_object_rows(dataset)
+    return RenderSetting(get_kind(first), cameras, *size, every, fps, rows, options.robot)
 
 
-def _read_licences(dataset: Dataset) -> dict[str, str]:
-    table = dataset.scenes.to_table(columns=["scene_id", "licence"])
-    return {row["scene_id"]: row["licence"] or "" for row in table.to_pylist()}
+def _sort_by_split(rows: Sequence[dict[str, Any]], scenes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Sort rows by split, as LeRobot's splits are ranges of episodes; within a split the order stays."""
+    return sorted(rows, key=lambda row: list(SPLITS).index(find_split(scenes[row["scene_id"]])))
 
 
-def _build_origin(row: Mapping[str, Any], licences: Mapping[str, str]) -> dict[str, Any]:
-    """Build columns of meta/episodes beyond LeRobot's: origin and outcome of an episode."""
+def _build_origin(row: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
+    """Build columns of meta/episodes beyond LeRobot's: split, words, origin and outcome of an episode."""
     return {
+        "split": find_split(scene),
+        "paraphrases": list(paraphrase_instruction(read_instruction(row))),
         "scene_id": row["scene_id"],
         "task_id": row["task_id"],
         "relation": row["relation"] or "",
         "success": bool(row["success"]),
         "failed_phase": row["failed_phase"] or "",
         "reason": row["reason"] or "",
-        "licence": licences.get(row["scene_id"], ""),
+        "licence": scene["licence"] or "",
     }

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tableverse_factory.delivery.episodes.frames import Feature, build_frame_table, number_columns
+from tableverse_factory.delivery.episodes.lerobot_card import make_lerobot_card
 from tableverse_factory.delivery.episodes.render_workers import RenderedEpisode, RenderSetting
 from tableverse_factory.delivery.episodes.statistics import FeatureStats, compute_vector_stats, merge_stats
 from tableverse_factory.delivery.episodes.video import PIXELS, VideoFile
@@ -20,7 +21,7 @@ _CHUNK_PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA_PATH = f"data/{_CHUNK_PATH}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{_CHUNK_PATH}.mp4"
 EPISODES_PATH = f"meta/episodes/{_CHUNK_PATH}.parquet"
-_NO_STATS = frozenset({"next.done", "next.success"})
+_NO_STATS = frozenset({"next.done", "next.success", "subtask"})
 _MB = 1024**2
 
 
@@ -114,12 +115,17 @@ class LeRobotFiles:
         self.close()
         self._write_data()
         rows = [{**row, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} for row in self._rows]
-        _write_parquet(self._folder / _format_path(EPISODES_PATH, 0), [pa.Table.from_pylist(rows)])
+        table = pa.Table.from_pylist(rows)
+        texts = table.schema.get_field_index("paraphrases")  # without any, Arrow does not know what they are lists of
+        table = table.set_column(texts, "paraphrases", table["paraphrases"].cast(pa.list_(pa.string())))
+        _write_parquet(self._folder / _format_path(EPISODES_PATH, 0), [table])
         _write_parquet(self._folder / "meta/tasks.parquet", [build_tasks_table(self._tasks)])
         merged = {name: merge_stats(figures) for name, figures in self._figures.items()}
         stats = {name: {key: value.tolist() for key, value in figure.items()} for name, figure in merged.items()}
         self._write_json("meta/stats.json", stats)
         self._write_json("meta/info.json", self._info())
+        card = make_lerobot_card(self._setting.kind.robot, self.n_frames, self._rows)
+        (self._folder / "README.md").write_text(card, encoding="utf-8")
         return self._folder
 
     def _info(self) -> dict[str, Any]:
@@ -133,7 +139,7 @@ class LeRobotFiles:
             "data_files_size_in_mb": self._data_mb,
             "video_files_size_in_mb": self._video_mb,
             "fps": self._setting.fps,
-            "splits": {"train": f"0:{self.n_episodes}"},
+            "splits": self._find_split_ranges(),
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH,
             "features": {
@@ -141,6 +147,12 @@ class LeRobotFiles:
                 **{name: feature.as_json() for name, feature in self._features.items()},
             },
         }
+
+    def _find_split_ranges(self) -> dict[str, str]:
+        """Find the episodes of each split, which follow one another."""
+        splits = [str(row["split"]) for row in self._rows]
+        starts = {name: splits.index(name) for name in dict.fromkeys(splits)}
+        return {name: f"{start}:{start + splits.count(name)}" for name, start in starts.items()}
 
     def _video_feature(self) -> dict[str, Any]:
         height, width = self._setting.height, self._setting.width

@@ -33,6 +33,7 @@ class RenderSetting:
     height: int  # [px]
     every: int  # samples per frame
     fps: int
+    object_rows: int  # of `observation.environment_state`, zeros behind those of the scene
     robot: str | None = None  # the user's, for recordings from elsewhere (`load_recorded_arm`)
 
 
@@ -57,14 +58,15 @@ def render_episode(path: str, setting: RenderSetting, row: Mapping[str, Any]) ->
     episode = open_episode(open_dataset(path), row)
     check_kind(setting.kind, episode)
     samples = list(range(0, len(episode.recording), setting.every))
-    figure = ArmMeshes(load_recorded_arm(episode.recording, setting.robot))
+    arm = load_recorded_arm(episode.recording, setting.robot)
+    figure = ArmMeshes(arm)
     videos, figures = {}, {}
     for key in setting.cameras:
         eye = choose_camera(key, episode, setting.width, setting.height)
         pictures = list(render_frames(episode.scene, row["x_id"], episode.recording, figure, eye, samples))
         videos[key] = encode_mp4(pictures, setting.fps)
         figures[key] = compute_picture_stats(pictures)
-    values = build_columns(episode.recording, samples, setting.fps, bool(row["success"]))
+    values = build_columns(episode, arm, samples, setting.fps, setting.object_rows)
     return RenderedEpisode(values, videos, figures)
 
 

@@ -21,13 +21,13 @@ import numpy as np
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.delivery.episodes.demonstration import Demonstration, build_demonstration, build_env_args
+from tableverse_factory.delivery.episodes.instructions import read_instruction
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
     check_kind,
     check_new_path,
     get_kind,
     open_episodes,
-    read_instruction,
     select_rows,
 )
 

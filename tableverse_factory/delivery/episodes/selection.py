@@ -12,8 +12,6 @@ from tableverse_factory.dataset.dataset import Dataset, Scene
 from tableverse_factory.dataset.trajectory_files import check_digest
 from tableverse_factory.robotics.execution.arrays import Recording, decode_recording
 
-_MAX_INSTRUCTION = 500
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Episode(Frozen):
@@ -37,11 +35,6 @@ def select_rows(dataset: Dataset, failed: bool) -> list[dict[str, Any]]:
         lost = f"{len(rows)} of its trajectories failed; --failed takes those" if rows else "it has no trajectories"
         raise InputError(f"{dataset.path}: nothing to export: {lost}", "no_trajectories")
     return sorted(kept, key=lambda row: (row["scene_id"], row["task_id"]))
-
-
-def read_instruction(row: Mapping[str, Any]) -> str:
-    """Read the task's instruction: foreign text, cut and without control characters."""
-    return sanitize_line(str(row["instruction"] or ""), _MAX_INSTRUCTION)
 
 
 def open_episode(dataset: Dataset, row: Mapping[str, Any]) -> Episode:

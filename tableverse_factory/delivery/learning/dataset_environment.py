@@ -11,6 +11,7 @@ from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.splits import SPLITS, find_split
+from tableverse_factory.delivery.episodes.observation import count_object_rows
 from tableverse_factory.delivery.learning.environment import TableEnv
 from tableverse_factory.robotics.robots.registry import load_arm
 
@@ -46,8 +47,8 @@ class DatasetEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ign
         """
         self._dataset = open_dataset(dataset) if isinstance(dataset, str) else dataset
         self.tasks = list_solved_tasks(self._dataset, split, load_arm(robot).name)
-        largest = pc.max(self._dataset.scenes.to_table(columns=["n_objects"])["n_objects"]).as_py()
-        self._options = {**options, "robot": robot, "max_objects": max_objects or largest}
+        rows = count_object_rows(self._dataset) if max_objects is None else max_objects
+        self._options = {**options, "robot": robot, "max_objects": rows}
         self._task, self._env = self.tasks[0], self._open(self.tasks[0])
         self.render_mode = self._env.render_mode
         self.action_space, self.observation_space = self._env.action_space, self._env.observation_space

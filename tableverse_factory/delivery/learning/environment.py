@@ -11,6 +11,8 @@ from schemas.geometry import Picture, Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction
+from tableverse_factory.delivery.episodes.observation import build_state, pad_objects
 from tableverse_factory.delivery.learning.camera import RobotCamera
 from tableverse_factory.delivery.learning.pick_place_sim import PickPlaceSim, SimState
 from tableverse_factory.delivery.learning.variation import Variation, draw_lighting, draw_table_seed
@@ -122,7 +124,8 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         if (table, lighting) != self._look:
             self._look, self._cameras = (table, lighting), {}
         self._steps = 0
-        return self._observation(state), {**self._info(state), "instruction": self.sim.instruction}
+        words = {"instruction": self.sim.instruction, "paraphrases": paraphrase_instruction(self.sim.instruction)}
+        return self._observation(state), {**self._info(state), **words}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Execute one action for 1/50 s; `ResetNeeded` before the first reset, and once the episode has ended."""
@@ -165,11 +168,9 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return spaces.Dict(seen)
 
     def _observation(self, state: SimState) -> dict[str, np.ndarray]:
-        sample, joints = state.sample, len(self._low) - 1
-        robot = np.concatenate([sample.qpos[:joints], sample.qvel[:joints], [self.sim.opening()], sample.tcp])
-        objects = np.zeros((self._rows, 7), dtype=np.float32)
-        objects[: len(self.sim.object_ids)] = self.sim.poses()
-        seen = {"state": robot.astype(np.float32), "objects": objects}
+        sample, arm = state.sample, self.sim.station.arm
+        robot = build_state(arm, sample.qpos[None], sample.qvel[None], sample.tcp[None])[0]
+        seen = {"state": robot, "objects": pad_objects(self.sim.poses(), self._rows)}
         for name, values in seen.items():
             space = self.observation_space[name]
             np.clip(values, space.low, space.high, out=values)

@@ -16,6 +16,8 @@ from schemas.trajectories import Numbers
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.episodes.instructions import read_instruction
+from tableverse_factory.delivery.episodes.observation import order_objects
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
 from tableverse_factory.delivery.learning.variation import Variation, displace_objects
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
@@ -76,7 +78,7 @@ class PickPlaceSim:
             raise ConfigError(f"max_disturbed_m {max_disturbed_m}: give a length from 0 m on")
         files, row = scene.files(), _find_task(scene, task)
         self.goal = load_goal(files, row, max_disturbed_m)
-        self.instruction = sanitize_line(str(row.get("instruction") or ""), 500)
+        self.instruction = read_instruction(row)
         self.step_s = step_s
         self.station = Station(files, load_arm(robot))
         check_simulation_settings(self.station.model)
@@ -89,17 +91,12 @@ class PickPlaceSim:
     @property
     def object_ids(self) -> tuple[str, ...]:
         """X, Y, then all others in the order of the model."""
-        first = (self.goal.x_id, self.goal.y_id)
-        return (*first, *(name for name in self.station.object_ids if name not in first))
+        return order_objects(self.station.object_ids, self.goal.x_id, self.goal.y_id)
 
     def poses(self) -> np.ndarray:
         """Return position [m] and quaternion wxyz of each of `object_ids` in the table frame. Shape (n, 7)."""
         starts = np.array([self.station.object_qpos[name] for name in self.object_ids])
         return np.array(self._data.qpos[starts[:, None] + np.arange(7)])
-
-    def opening(self) -> float:
-        """Return the present distance between the fingertips [m]."""
-        return self.station.opening(self._data)
 
     def reset(self, rng: np.random.Generator, variation: Variation) -> SimState:
         """Restore the exported scene, varied by `variation`, with the arm at home and open fingers."""

@@ -76,6 +76,11 @@ class Arm(Frozen):
         share = opening_m / self.max_opening_m
         return self.finger_closed + share * (self.finger_open - self.finger_closed)
 
+    def compute_openings(self, fingers: Float64[np.ndarray, "*t k"]) -> Float64[np.ndarray, "*t"]:
+        """Compute the distance between the fingertips from positions of `finger_joints` [m]."""
+        span = self.finger_open - self.finger_closed
+        return (fingers - self.finger_closed) @ span / (span @ span) * self.max_opening_m
+
     def gripper_command(self, opening_m: float) -> float:
         """Return the gripper actuator's control for an opening."""
         closed, opened = self.gripper_control

@@ -108,10 +108,7 @@ class Station:
 
     def opening(self, data: mujoco.MjData) -> float:
         """Compute the distance between the fingertips from the finger joints [m]."""
-        arm = self.arm
-        span = arm.finger_open - arm.finger_closed
-        share = (data.qpos[self.finger_qpos] - arm.finger_closed) @ span / (span @ span)
-        return float(share) * arm.max_opening_m
+        return float(self.arm.compute_openings(data.qpos[self.finger_qpos]))
 
 
 def _collect_vertices(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Points:

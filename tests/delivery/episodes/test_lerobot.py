@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -9,20 +10,33 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
+from schemas.trajectories import Phase
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.dataset import Scene, open_dataset
+from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction
 from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions, export_lerobot
+from tableverse_factory.delivery.episodes.observation import pad_objects, read_object_poses
+from tableverse_factory.delivery.episodes.selection import Episode
 from tableverse_factory.robotics.execution.arrays import encode_recording
 from tableverse_factory.robotics.robots.registry import load_arm
-from tests.helpers.recorded_dataset import STEP_S, recording, trajectory_row, two_scenes, write_recorded_dataset
+from tests.helpers.recorded_dataset import (
+    STEP_S,
+    recording,
+    scene_members,
+    trajectory_row,
+    two_scenes,
+    write_recorded_dataset,
+)
 
 pytestmark = pytest.mark.heavy
 
 SMALL = {"width": 64, "height": 48}
 CAMERAS = ["observation.images.robot", "observation.images.scene"]
 LENGTHS = [41, 31, 31]
-DTYPES = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
+DTYPES = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string()}
+ORIGIN = {"split": "train", "paraphrases": [], "scene_id": "a-1", "success": True, "licence": ""}
 FIGURES = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99")
 
 
@@ -52,6 +66,7 @@ def episodes(made) -> list[dict]:
 def test_the_files_are_those_of_the_layout_and_nothing_else(made):
     names = sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if path.is_file())
     assert names == [
+        "README.md",
         "data/chunk-000/file-000.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/info.json",
@@ -112,12 +127,58 @@ def test_state_and_action_are_the_recorded_ones(data):
     """An action is the command that leads to the next frame, in radians and metres."""
     taken, rows = recording(), data.slice(0, 41)
     state, action = (np.array(rows[name].to_pylist()) for name in ("observation.state", "action"))
-    assert (state == taken.qpos).all()
+    assert state.shape == (41, 22)
+    assert (state[:, :7] == taken.qpos[:, :7]).all()
+    assert (state[:, 7:14] == taken.qvel[:, :7]).all()
+    assert state[:, 14] == pytest.approx(2 * taken.qpos[:, 7], abs=1e-6)
+    assert (state[:, 15:] == taken.tcp).all()
     assert (action[:-1] == taken.command[1:].astype(np.float32)).all()
     assert (action[-1] == taken.command[-1].astype(np.float32)).all()
-    assert (np.array(rows["tcp_pose"].to_pylist()) == taken.tcp).all()
-    assert (np.array(rows["object_pose"].to_pylist()) == taken.object_pose).all()
     assert rows["phase"].to_pylist() == taken.phase.tolist()
+    assert rows["subtask"].to_pylist() == [list(Phase)[k].value.replace("_", "-") for k in taken.phase]
+
+
+def test_objects_are_the_carried_one_then_the_reference_then_zeros(info, data):
+    objects = np.array(data.slice(0, 41)["observation.environment_state"].to_pylist())
+    names = info["features"]["observation.environment_state"]["names"]
+    assert (names[0], names[7], len(names)) == ("carried.x", "reference.x", 14)
+    assert (objects[:, :7] == recording().object_pose).all()
+    assert objects[:, 7:] == pytest.approx(np.tile([0, 0, 0.03, 1, 0, 0, 0], (41, 1)), abs=1e-7)
+    pushed = open_episode_of(recording(pushed=True))
+    assert read_object_poses(pushed.scene.model(), pushed)[:, 1] == pytest.approx(
+        pushed.recording.moved_poses[:, 0], abs=1e-7
+    )
+    assert (pad_objects(np.ones((4, 2, 7)), 3)[:, 2] == 0).all()
+    strange = replace(recording(), moved_ids=("table",), moved_poses=recording(pushed=True).moved_poses)
+    with pytest.raises(InputError, match="'table' is no object that can move"):
+        read_object_poses(pushed.scene.model(), open_episode_of(strange))
+
+
+def open_episode_of(taken):
+    return Episode(trajectory_row("a-1", "task_000", True), Scene("a-1", {}, scene_members("a-1")), taken)
+
+
+def test_the_card_leads_datasets_to_the_frames(made, episodes):
+    text = (made / "README.md").read_text()
+    head = yaml.safe_load(text.split("---")[1])
+    assert head["license"] == "cc0-1.0"
+    for config, rows in (("default", sum(LENGTHS)), ("episodes", 3)):
+        (pattern,) = [each["data_files"] for each in head["configs"] if each["config_name"] == config]
+        assert sum(pq.read_metadata(path).num_rows for path in made.glob(pattern)) == rows
+    assert "3 episodes of the robot panda on 2 scenes, 103 frames; successes: 2." in text
+    assert [e["split"] for e in episodes] == ["train"] * 3
+    assert [e["paraphrases"] for e in episodes] == [[]] * 3, "these instructions are of no template"
+
+
+def test_an_instruction_is_said_in_three_other_ways():
+    said = paraphrase_instruction("Pick up the red mug on the left and place it to the right of the bowl.")
+    assert said == (
+        "Put the red mug on the left to the right of the bowl",
+        "Move the red mug on the left so that it is to the right of the bowl",
+        "Grasp the red mug on the left, carry it over and set it down to the right of the bowl",
+    )
+    assert paraphrase_instruction("Pick up {x.__class__} and place it on {y}")[0] == "Put {x.__class__} on {y}"
+    assert paraphrase_instruction("Stack them all") == ()
 
 
 def test_tasks_are_indexed_by_their_sentence(made, data, episodes):
@@ -150,8 +211,8 @@ def test_episodes_say_where_their_frames_lie(episodes):
 
 def test_figures_of_episodes_and_of_all_are_those_of_the_numbers(made, info, data, episodes):
     stats = json.loads((made / "meta/stats.json").read_text())
-    assert set(stats) == set(info["features"]) - {"next.done", "next.success"}
-    names = ("observation.state", "action", "timestamp", "index")
+    assert set(stats) == set(info["features"]) - {"next.done", "next.success", "subtask"}
+    names = ("observation.state", "observation.environment_state", "action", "timestamp", "index")
     for name in names:
         values = np.array(data[name].to_pylist(), dtype=np.float64).reshape(sum(LENGTHS), -1)
         for key, value in (("min", values.min(0)), ("max", values.max(0)), ("mean", values.mean(0))):
@@ -223,12 +284,12 @@ def test_files_are_closed_at_their_bounds(out, tmp_path):
     from tableverse_factory.delivery.episodes.selection import get_kind, open_episode, select_rows
 
     row = select_rows(open_dataset(out), failed=False)[0]
-    setting = RenderSetting(get_kind(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4)
+    setting = RenderSetting(get_kind(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4, 2)
     shot = render_episode(str(out), setting, row)
     megabytes = 2.5 * len(shot.videos[ROBOT_CAMERA]) / 1024**2
-    files = LeRobotFiles(tmp_path / "made", setting, list_features(load_arm("panda")), 0.002, megabytes)
+    files = LeRobotFiles(tmp_path / "made", setting, list_features(load_arm("panda"), 2), 0.002, megabytes)
     for _ in range(5):
-        files.add("Do it.", shot, {})
+        files.add("Do it.", shot, ORIGIN)
     files.finish()
     rows = pq.read_table(tmp_path / "made/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert [row[f"videos/{ROBOT_CAMERA}/file_index"] for row in rows] == [0, 0, 1, 1, 2]
@@ -271,8 +332,6 @@ def test_nothing_is_overwritten_and_nothing_half_made_stays(out, tmp_path):
 
 
 def test_robots_and_rhythms_are_not_mixed(tmp_path):
-    from dataclasses import replace
-
     slow = replace(recording(6), step_s=0.1, time_s=(np.arange(6) * 0.1).astype(np.float32))
     rows = [
         (trajectory_row("a-1", "task_000", True), encode_recording(recording(6))),

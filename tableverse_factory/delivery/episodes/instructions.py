@@ -1,0 +1,28 @@
+"""Instructions of tasks in words: foreign text made printable, and paraphrases of it."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from schemas.curation import Relation
+from tableverse_factory.core.text import sanitize_line
+
+_MAX_INSTRUCTION = 500
+_RELATIONS = "|".join(sorted((re.escape(relation.value) for relation in Relation), key=len, reverse=True))
+_TEMPLATE = re.compile(rf"Pick up (?P<x>.+) and place it (?P<relation>{_RELATIONS}) (?P<y>.+?)\.?")
+_PARAPHRASES = (
+    "Put {x} {relation} {y}",
+    "Move {x} so that it is {relation} {y}",
+    "Grasp {x}, carry it over and set it down {relation} {y}",
+)
+
+
+def read_instruction(row: Mapping[str, Any]) -> str:
+    """Read the task's instruction: foreign text, cut and without control characters."""
+    return sanitize_line(str(row.get("instruction") or ""), _MAX_INSTRUCTION)
+
+
+def paraphrase_instruction(instruction: str) -> tuple[str, ...]:
+    """Say an instruction of the usual template in three other ways; none of another template."""
+    found = _TEMPLATE.fullmatch(instruction)
+    return tuple(text.format_map(found.groupdict()) for text in _PARAPHRASES) if found else ()

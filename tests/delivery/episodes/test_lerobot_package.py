@@ -1,0 +1,123 @@
+"""The export in the hands of those it is made for: the packages `lerobot` and `datasets`."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tableverse_factory import TableEnv, open_dataset
+from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions, export_lerobot
+from tests.helpers.learnable_dataset import write_learnable_dataset
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    return write_learnable_dataset(tmp_path_factory.mktemp("real") / "out", scenes=2, moved=2)
+
+
+@pytest.fixture(scope="module")
+def made(out, tmp_path_factory):
+    dest = tmp_path_factory.mktemp("exported") / "made"
+    export_lerobot(open_dataset(out), dest, LeRobotOptions(failed=True, fps=25, width=64, height=48))
+    return dest
+
+
+def test_the_numbers_are_those_that_the_environment_shows(out, made):
+    """Replayed command by command, the environment observes what stands in the frames."""
+    import pyarrow.parquet as pq
+
+    scene = open_dataset(out).scene("s-1")
+    env = TableEnv(scene, "task_000")
+    env.reset(seed=0)
+    seen = []
+    for command in scene.trajectory("task_000").recording().command[1:]:
+        observation, _, terminated, *_ = env.step(env.command_to_action(command))
+        seen.append(np.concatenate([observation["state"], observation["objects"].ravel()]))
+        if terminated:
+            break
+    table = pq.read_table(made / "data")
+    frames = table.filter(table["episode_index"].to_numpy() == 0).to_pydict()
+    told = np.concatenate([frames["observation.state"], frames["observation.environment_state"]], axis=1)
+    count = min(len(told) - 1, len(seen) // 2)
+    away = np.abs(told[1 : count + 1] - np.array(seen)[1 : 2 * count : 2])
+    assert count > 50
+    assert np.delete(away, 14, axis=1).max() < 1e-5
+    assert away[:, 14].max() < 3e-3, "the gripper opened elsewhere before the recording"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_lerobot_reads_frames_statistics_and_delta_timestamps(made):
+    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    deltas = {"observation.state": [-0.04, 0.0], "action": [0.0, 0.04, 0.08], "observation.images.robot": [-0.04, 0.0]}
+    dataset = lerobot.LeRobotDataset("tableverse", root=made, delta_timestamps=deltas, video_backend="pyav")
+    info = json.loads((made / "meta/info.json").read_text())
+    assert (
+        (dataset.num_frames, dataset.num_episodes)
+        == (info["total_frames"], info["total_episodes"])
+        == (len(dataset), 4)
+    )
+    first, last = dataset[0], dataset[len(dataset) - 1]
+    assert first["observation.images.robot"].shape == (2, 3, 48, 64)
+    assert first["observation.environment_state"].shape == (21,)
+    assert first["observation.state_is_pad"].tolist() == [True, False]
+    assert last["action_is_pad"].tolist() == [False, True, True]
+    assert first["task"] == "Pick up the wooden block and place it next to the bowl"
+    assert first["subtask"] == "pre-grasp"
+    actions = np.stack([dataset[k]["action"][0].numpy() for k in range(len(dataset))])
+    assert np.allclose(actions.mean(axis=0), dataset.meta.stats["action"]["mean"], atol=1e-5)
+    assert np.allclose(actions.std(axis=0), dataset.meta.stats["action"]["std"], atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("pictures", [True, False])
+def test_act_takes_a_step_on_it(made, pictures):
+    """With pictures, and on states alone, which ACT takes because objects are `observation.environment_state`."""
+    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    import torch
+    from lerobot.configs.types import FeatureType
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+
+    try:
+        from lerobot.utils.feature_utils import dataset_to_policy_features
+    except ImportError:
+        from lerobot.datasets.utils import dataset_to_policy_features
+
+    meta = lerobot.LeRobotDatasetMetadata("tableverse", root=made)
+    features = dataset_to_policy_features(meta.features)
+    seen = {name: each for name, each in features.items() if each.type is not FeatureType.ACTION}
+    assert seen["observation.environment_state"].type is FeatureType.ENV
+    seen = {name: each for name, each in seen.items() if pictures or each.type is not FeatureType.VISUAL}
+    config = ACTConfig(
+        input_features=seen, output_features={"action": features["action"]}, chunk_size=8, n_action_steps=8,
+        dim_model=64, n_heads=2, dim_feedforward=64, n_encoder_layers=1, n_vae_encoder_layers=1, latent_dim=4,
+        pretrained_backbone_weights=None, device="cpu", push_to_hub=False,
+    )  # fmt: skip
+    dataset = lerobot.LeRobotDataset(
+        "tableverse", root=made, delta_timestamps={"action": [k / 25 for k in range(8)]}, video_backend="pyav"
+    )
+    policy = ACTPolicy(config)
+    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True)))
+    optimizer = torch.optim.Adam(policy.parameters(), 1e-3)
+    losses = []
+    for _ in range(8):
+        loss, _ = policy.forward(dict(batch))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss))
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_datasets_finds_frames_and_episodes_by_the_card(made, tmp_path):
+    datasets = pytest.importorskip("datasets", reason="the package datasets is not installed")
+    frames = datasets.load_dataset(str(made), split="train", cache_dir=str(tmp_path))
+    episodes = datasets.load_dataset(str(made), "episodes", split="train", cache_dir=str(tmp_path))
+    assert frames.num_rows == json.loads((made / "meta/info.json").read_text())["total_frames"]
+    assert frames[0]["subtask"] == "pre-grasp"
+    assert len(frames[0]["observation.environment_state"]) == 21
+    assert sorted(episodes["split"]) == ["train"] * 2 + ["validation"] * 2
+    assert episodes[0]["paraphrases"][0] == "Put the wooden block next to the bowl"
