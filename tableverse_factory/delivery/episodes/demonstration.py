@@ -10,12 +10,15 @@ from jaxtyping import Float32, Float64, Int64
 
 from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.version import __version__
+from tableverse_factory.delivery.episodes.observation import pad_objects, read_object_poses
 from tableverse_factory.delivery.episodes.selection import Episode
+from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import PREFIX, build_station_spec
 
-ENVIRONMENT = "TableVerse"
-_GYM_TYPE = 2  # robomimic's environment type with the fewest requirements
+ENVIRONMENT = "tableverse_factory.gym:TableVerse/PickPlace-v0"
+_GYM_TYPE = 2
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
 
 
@@ -27,13 +30,14 @@ class Demonstration(Frozen):
     rewards: Float32[np.ndarray, " n"]  # 1 at the end of a success
     dones: Int64[np.ndarray, " n"]  # 1 at the end
     states: Float64[np.ndarray, "n s"]  # time, qpos and qvel of the model
+    phases: Int64[np.ndarray, " n"]  # index into `Phase`
     observations: Mapping[str, np.ndarray]  # by name, each of shape (n, …)
     model: str  # MJCF of the scene with the arm in place
     assets: Mapping[str, bytes]  # files that the model references
 
 
-def build_demonstration(episode: Episode, arm: Arm) -> Demonstration:
-    """Build the episode's samples."""
+def build_demonstration(episode: Episode, arm: Arm, object_rows: int) -> Demonstration:
+    """Build the episode's samples; states of objects have `object_rows` rows, zeros behind those of the scene."""
     recording, count = episode.recording, len(episode.recording)
     files = episode.scene.files()
     spec = build_station_spec(files, arm)
@@ -51,7 +55,8 @@ def build_demonstration(episode: Episode, arm: Arm) -> Demonstration:
         rewards=(last & bool(episode.row["success"])).astype(np.float32),
         dones=last.astype(np.int64),
         states=_build_states(model, episode, arm),
-        observations=_build_observations(model, episode, len(arm.joint_names)),
+        phases=recording.phase.astype(np.int64),
+        observations=_build_observations(model, episode, len(arm.joint_names), object_rows),
         model=spec.to_xml(),
         assets={name: known[name] for name in sorted(used) if name in known},
     )
@@ -62,20 +67,18 @@ def compute_action_limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     return np.array([*arm.lower, 0.0]), np.array([*arm.upper, arm.max_opening_m])
 
 
-def build_env_args(episode: Episode, arm: Arm) -> dict[str, Any]:
-    """Build robomimic's `env_args`."""
+def build_env_args(recording: Recording, arm: Arm, object_rows: int) -> dict[str, Any]:
+    """Build robomimic's `env_args`: what `gymnasium.make` needs beside a dataset, and the meaning of the actions."""
     low, high = compute_action_limits(arm)
     return {
         "env_name": ENVIRONMENT,
         "type": _GYM_TYPE,
-        "env_type": _GYM_TYPE,
-        "env_kwargs": {
-            "robot": episode.recording.robot,
-            "control_freq": 1.0 / episode.recording.step_s,
-            "action_low": low.tolist(),
-            "action_high": high.tolist(),
-            "action_names": [*arm.joint_names, "gripper_opening_m"],
-        },
+        "env_version": __version__,
+        "env_kwargs": {"robot": recording.robot, "max_objects": object_rows},
+        "control_freq": 1.0 / recording.step_s,
+        "action_low": low.tolist(),
+        "action_high": high.tolist(),
+        "action_names": [*arm.joint_names, "gripper_opening_m"],
     }
 
 
@@ -101,16 +104,14 @@ def _build_states(model: mujoco.MjModel, episode: Episode, arm: Arm) -> np.ndarr
     return np.concatenate([recording.time_s[:, None].astype(np.float64), qpos, qvel], axis=1)
 
 
-def _build_observations(model: mujoco.MjModel, episode: Episode, n_joints: int) -> dict[str, np.ndarray]:
+def _build_observations(
+    model: mujoco.MjModel, episode: Episode, n_joints: int, object_rows: int
+) -> dict[str, np.ndarray]:
     """Build low-dimensional observations under robosuite's names and, as there, with quaternions xyzw."""
-    recording, y_id = episode.recording, str(episode.row["y_id"])
-    body, reference = _find_body(model, episode, y_id), recording.poses_of(y_id)
-    if reference is None:
-        standing = np.concatenate([body.pos, body.quat]).astype(np.float32)
-        reference = np.tile(standing, (len(recording), 1))
-    tcp = recording.tcp[:, _XYZW]
+    recording = episode.recording
+    objects, tcp = pad_objects(read_object_poses(model, episode), object_rows), recording.tcp[:, _XYZW]
     return {
-        "object": np.concatenate([recording.object_pose[:, _XYZW], reference[:, _XYZW]], axis=1),
+        "object": objects[..., _XYZW].reshape(len(recording), -1),
         "robot0_eef_pos": tcp[:, :3],
         "robot0_eef_quat": tcp[:, 3:],
         "robot0_gripper_qpos": recording.qpos[:, n_joints:],

@@ -3,7 +3,8 @@
     data                attributes: total, env_args (JSON)
     data/demo_0         attributes: num_samples, model_file (MJCF), ep_meta (JSON: lang, scene, task, success)
         actions (n, j + 1)   rewards (n,)   dones (n,)   states (n, 1 + nq + nv)   obs/…   next_obs/…
-    mask/success, mask/failed    names of demonstrations; each exists if it has any
+        phase (n,)
+    mask/train, valid, test, success, failed    names of demonstrations; each exists if it has any
     assets/SCENE_ID/…   files that model_file references
 
 The layout is that of robomimic's public documentation, which does not know `assets`.
@@ -20,8 +21,10 @@ import numpy as np
 
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.dataset.splits import find_split
 from tableverse_factory.delivery.episodes.demonstration import Demonstration, build_demonstration, build_env_args
-from tableverse_factory.delivery.episodes.instructions import read_instruction
+from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction, read_instruction
+from tableverse_factory.delivery.episodes.observation import count_object_rows
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
     check_kind,
@@ -30,6 +33,8 @@ from tableverse_factory.delivery.episodes.selection import (
     open_episodes,
     select_rows,
 )
+
+_MASKS = {"train": "train", "validation": "valid", "test": "test"}  # robomimic's names of splits
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,36 +56,38 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        partial, total, first = Path(scratch) / "demos.hdf5", 0, None
-        names: dict[bool, list[str]] = {True: [], False: []}
+        partial, total, first, object_rows = Path(scratch) / "demos.hdf5", 0, None, count_object_rows(dataset)
+        masks: dict[str, list[str]] = {}
         with h5py.File(partial, "w") as file:
             data = file.create_group("data")
             for number, episode in enumerate(open_episodes(dataset, rows)):
                 first = first or get_kind(episode)
                 check_kind(first, episode)
                 arm = load_recorded_arm(episode.recording, robot)
-                demo = build_demonstration(episode, arm)
+                demo = build_demonstration(episode, arm, object_rows)
                 _write_demo(data.create_group(f"demo_{number}"), demo, episode.row)
                 _write_assets(file, episode.scene.scene_id, demo.assets)
-                names[bool(episode.row["success"])].append(f"demo_{number}")
+                for mask in (_MASKS[find_split(episode.scene.row)], "success" if episode.row["success"] else "failed"):
+                    masks.setdefault(mask, []).append(f"demo_{number}")
                 total += len(demo.actions)
-                data.attrs["env_args"] = json.dumps(build_env_args(episode, arm))
+                data.attrs["env_args"] = json.dumps(build_env_args(episode.recording, arm, object_rows))
             data.attrs["total"] = total
-            for key, success in (("success", True), ("failed", False)):
-                if names[success]:
-                    _write_array(file.require_group("mask"), key, np.array(names[success], dtype="S"))
+            for mask, names in sorted(masks.items()):
+                _write_array(file.require_group("mask"), mask, np.array(names, dtype="S"))
         partial.rename(dest)
     return RobomimicResult(len(rows), total)
 
 
 def _write_demo(group: Any, demo: Demonstration, row: Mapping[str, Any]) -> None:
     keys = ("scene_id", "task_id", "x_id", "y_id", "relation", "success", "failed_phase", "reason")
-    meta = {"lang": read_instruction(row), **{key: row[key] for key in keys}}
+    lang = read_instruction(row)
+    meta = {"lang": lang, "paraphrases": paraphrase_instruction(lang), **{key: row[key] for key in keys}}
     group.attrs["num_samples"] = len(demo.actions)
     group.attrs["model_file"] = demo.model
     group.attrs["ep_meta"] = json.dumps(meta)
     for name in ("actions", "rewards", "dones", "states"):
         _write_array(group, name, getattr(demo, name))
+    _write_array(group, "phase", demo.phases)
     following = np.minimum(np.arange(len(demo.actions)) + 1, len(demo.actions) - 1)
     for name, values in demo.observations.items():
         _write_array(group.require_group("obs"), name, values)

@@ -50,15 +50,16 @@ def test_data_holds_demonstrations_and_nothing_else(file):
     assert file["data"].attrs["total"] == sum(LENGTHS.values())
     arguments = json.loads(file["data"].attrs["env_args"])
     assert {"env_name", "type", "env_kwargs"} <= set(arguments)
-    assert arguments["type"] in (1, 2, 3)
-    assert arguments["env_kwargs"]["control_freq"] == pytest.approx(1 / STEP_S)
+    assert arguments["type"] == 2
+    assert arguments["env_kwargs"] == {"robot": "panda", "max_objects": 2}
+    assert arguments["control_freq"] == pytest.approx(1 / STEP_S)
 
 
 @pytest.mark.parametrize("demo", LENGTHS)
 def test_every_demonstration_has_the_documented_members(file, demo):
     group, length = file["data"][demo], LENGTHS[demo]
     assert group.attrs["num_samples"] == length
-    assert sorted(group) == ["actions", "dones", "next_obs", "obs", "rewards", "states"]
+    assert sorted(group) == ["actions", "dones", "next_obs", "obs", "phase", "rewards", "states"]
     assert group["actions"].shape == (length, 8)
     assert np.abs(group["actions"][()]).max() <= 1.0
     assert group["dones"][()].tolist() == [0] * (length - 1) + [1]
@@ -71,16 +72,23 @@ def test_every_demonstration_has_the_documented_members(file, demo):
     assert sorted(group["obs"]) == sorted(group["next_obs"]) == list(OBSERVATIONS)
 
 
+def read_masks(file):
+    return {key: [name.decode() for name in file["mask"][key][()]] for key in file["mask"]}
+
+
 def test_masks_tell_successes_from_failures(file):
-    assert sorted(file["mask"]) == ["failed", "success"]
-    names = {key: [name.decode() for name in file["mask"][key][()]] for key in file["mask"]}
-    assert names == {"success": ["demo_0", "demo_2"], "failed": ["demo_1"]}
+    everything = ["demo_0", "demo_1", "demo_2"]
+    assert read_masks(file) == {"success": ["demo_0", "demo_2"], "failed": ["demo_1"], "train": everything}
     assert file["mask/success"].dtype.kind == "S"
+
+
+def test_phases_are_the_recorded_ones(file):
+    assert file["data/demo_0/phase"][()].tolist() == recording().phase.tolist()
 
 
 def test_actions_scale_back_to_the_commands(file):
     """Normalised between the limits that stand in env_args; each is the command that leads to the next sample."""
-    limits = json.loads(file["data"].attrs["env_args"])["env_kwargs"]
+    limits = json.loads(file["data"].attrs["env_args"])
     low, high = np.array(limits["action_low"]), np.array(limits["action_high"])
     commands = low + (file["data/demo_0/actions"][()] + 1.0) / 2.0 * (high - low)
     assert np.abs(commands[:-1] - recording().command[1:]).max() < 1e-5
@@ -124,7 +132,7 @@ def test_the_same_bytes_again(out, made, tmp_path):
 def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
     assert export_robomimic(open_dataset(out), tmp_path / "made.hdf5").demos == 2
     with h5py.File(tmp_path / "made.hdf5") as file:
-        assert sorted(file["mask"]) == ["success"]
+        assert sorted(file["mask"]) == ["success", "train"]
 
 
 def test_nothing_is_overwritten(out, tmp_path):
@@ -138,15 +146,16 @@ def test_nothing_is_overwritten(out, tmp_path):
 def test_what_was_pushed_is_in_states_and_observations(out):
     taken = recording(pushed=True)
     row = {"x_id": X_ID, "y_id": Y_ID, "success": True, "scene_id": "a-1", "task_id": "task_000"}
-    made = build_demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), load_arm("panda"))
+    made = build_demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), load_arm("panda"), 3)
     model = mujoco.MjModel.from_xml_string(made.model, dict(made.assets))
     at = int(model.joint(int(model.body(Y_ID).jntadr[0])).qposadr[0])
     pushed = taken.moved_poses[:, 0]
     assert made.states[:, 1 + at : 8 + at] == pytest.approx(pushed, abs=1e-7)
     assert made.observations["object"][:, 7:10] == pytest.approx(pushed[:, :3], abs=1e-7)
+    assert (made.observations["object"][:, 14:] == 0).all(), "of a third object, which other scenes may have"
     speed = made.states[1:, 1 + model.nq + int(model.body(Y_ID).dofadr[0])]
     assert speed == pytest.approx(np.full(40, -0.06 / 40 / STEP_S), abs=1e-4)
     with pytest.raises(InputError, match="'table' is no object that can move"):
         build_demonstration(
-            Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",))), load_arm("panda")
+            Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",))), load_arm("panda"), 3
         )
