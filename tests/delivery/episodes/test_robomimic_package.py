@@ -58,6 +58,7 @@ def test_robomimic_trains_and_validates_on_it(made, tmp_path):
         config.train.data, config.train.output_dir = str(made), str(tmp_path / "runs")
         config.train.hdf5_filter_key, config.train.hdf5_validation_filter_key = "train", "valid"
         config.train.num_epochs, config.train.batch_size, config.train.num_data_workers = 2, 16, 0
+        config.experiment.save.enabled, config.experiment.save.every_n_epochs = True, 1
         config.experiment.validate, config.experiment.rollout.enabled = True, False
         config.experiment.epoch_every_n_steps = config.experiment.validation_epoch_every_n_steps = 10
         config.experiment.logging.log_tb = config.experiment.logging.terminal_output_to_txt = False
