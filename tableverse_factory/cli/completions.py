@@ -13,7 +13,7 @@ def complete_scene_ids(context: Context, incomplete: str) -> list[str]:
     from tableverse_factory.core.errors import TableverseError
     from tableverse_factory.dataset.dataset import open_dataset
 
-    out = context.params.get("out")
+    out = context.params.get("out") or next(iter(context.args), None)  # an option without its value ends the parsing
     if not isinstance(out, str) or not Path(out).is_dir():
         return []
     try:

@@ -55,9 +55,9 @@ def bash(here: Path, line: str) -> list[str]:
         ("tableverse query out --table o", {"objects"}, {"scenes"}),
         ("tableverse query out --table objects --columns mass", {"mass_kg"}, {"status"}),
         ("tableverse query out --columns scene_id,stat", {"scene_id,status"}, {"scene_id,usable"}),
-        ("tableverse extract out c", {"c-3", "c-4"}, {"a-1", "b-2"}),
-        ("tableverse extract nowhere c", set(), {"c-3"}),
-        ("tableverse extract out c-3 there --texture marb", {"marble-"}, set()),
+        ("tableverse extract out there --scene c", {"c-3", "c-4"}, {"a-1", "b-2"}),
+        ("tableverse extract nowhere there --scene c", set(), {"c-3"}),
+        ("tableverse extract out there --texture marb", {"marble-"}, set()),
         ("tableverse failures out --stage cur", {"curate"}, set()),
         ("tableverse export ler", {"lerobot"}, set()),
     ],
@@ -76,14 +76,16 @@ def test_the_printed_script_works_in_bash(here):
     """The script is loaded and its function called as bash does when the tab key is pressed."""
     script = run(here, "tableverse", "--show-completion", "bash", _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1")
     assert "complete -o default" in script, "where nothing is offered, bash completes files"
-    press = (
-        'COMP_WORDS=(tableverse extract out c); COMP_CWORD=3; _tableverse_completion tableverse; echo "${COMPREPLY[@]}"'
-    )
+    words = "COMP_WORDS=(tableverse extract out there --scene c); COMP_CWORD=5"
+    press = f'{words}; _tableverse_completion tableverse; echo "${{COMPREPLY[@]}}"'
     assert run(here, shutil.which("bash") or "bash", "--norc", "-c", f"{script}\n{press}") == "c-3 c-4\n"
 
 
 def test_zsh_and_fish_are_answered_in_their_own_terms(here):
-    asked = {"_TYPER_COMPLETE_ARGS": "tableverse extract out c", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    asked = {
+        "_TYPER_COMPLETE_ARGS": "tableverse extract out there --scene c",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+    }
     assert '"c-3"' in run(here, "tableverse", _TABLEVERSE_COMPLETE="complete_zsh", **asked)
     assert "c-3" in run(here, "tableverse", _TABLEVERSE_COMPLETE="complete_fish", **asked)
 

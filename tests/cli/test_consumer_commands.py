@@ -81,14 +81,27 @@ def test_query_points_at_the_error(tableverse, out):
 
 
 def test_extract_gives_a_scene_that_mujoco_loads(tableverse, out, tmp_path):
-    answer = tableverse("extract", out, "c-3", tmp_path / "scene")
+    answer = tableverse("extract", out, tmp_path / "scene", "--scene", "c-3")
     assert answer.code == 0
     mujoco.MjModel.from_xml_path(str(tmp_path / "scene" / "scene.xml"))
     for name, data in scene_files("c-3"):
         assert (tmp_path / "scene" / name).read_bytes() == data
-    assert tableverse("extract", out, "c-3", tmp_path / "scene").code == 1
-    assert "not_at_rest" in tableverse("extract", out, "b-2", tmp_path / "other").err
+    assert tableverse("extract", out, tmp_path / "scene", "--scene", "c-3").code == 1
+    assert "not_at_rest" in tableverse("extract", out, tmp_path / "other", "--scene", "b-2").err
     assert not (tmp_path / "other").exists()
+
+
+def test_extract_writes_many_scenes_and_fails_where_one_is_missing(tableverse, out, tmp_path):
+    answer = tableverse("extract", out, tmp_path / "scenes", "--where", "n_objects = 1", "--jobs", "1")
+    assert (answer.code, answer.out) == (0, f"3 scenes written to {tmp_path / 'scenes'}\n")
+    again = tableverse("extract", out, tmp_path / "scenes", "--jobs", "1")
+    assert again.out == f"0 scenes written to {tmp_path / 'scenes'}, 3 were there\n"
+    assert tableverse("extract", out, tmp_path / "x", "--scene", "c-3", "--where", "n_objects = 1").code == 2
+    tar = next((out / "mjcf").glob("*0.tar"))
+    tar.write_bytes(tar.read_bytes().replace(b'<body name="obj_000"', b'<body name="../../x"'))
+    answer = tableverse("extract", out, tmp_path / "urdf", "--format", "urdf", "--jobs", "1")
+    assert answer.code == 1
+    assert "  not a-1: a body of the scene cannot be a file" in answer.out
 
 
 def test_manifest_counts_what_it_found(tableverse, tmp_path):

@@ -54,7 +54,7 @@ def test_nothing_heavy_is_imported_before_a_command_runs():
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("extract", "nowhere", "a", "b"),
+        ("extract", "nowhere", "a"),
         ("query", "nowhere"),
         ("manifest", "nowhere", "--out", "m.parquet"),
         ("config", "--set", "rectify.clearence_m=1"),

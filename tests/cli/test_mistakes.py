@@ -81,7 +81,7 @@ def home(tmp_path_factory) -> Path:
         ("extract out c-3 photos", 1, ["photos", "new or an empty folder"]),
         ("extract out c-3 new --format ubs", 2, ["'ubs'", "'usd'"]),
         ("extract out c-3 new --texture marbel-3", 1, ["'marbel-3'", "did you mean marble?"]),
-        ("extract out", 2, ["SCENE_ID is missing", "tableverse extract out "]),
+        ("extract out", 2, ["DEST is missing", "tableverse extract out "]),
         ("verify empty", 1, ["empty", "OUT of `tableverse build`"]),
         ("verify out --robot arm.xml", 2, ["--robot", "--trajectories"]),
         ("report nowhere", 1, ["nowhere", "OUT of `tableverse build`"]),

@@ -221,7 +221,7 @@ def test_seeds_of_numpy_are_seeds(scene):
 @pytest.mark.heavy
 def test_the_command_extracts_a_restyled_scene_that_verifies(scene, out, tmp_path):
     folder = tmp_path / "scene"
-    arguments = ["extract", str(out), "scene", str(folder), "--texture", "square_tiles-0", "--lights", "2"]
+    arguments = ["extract", str(out), str(folder), "--scene", "scene", "--texture", "square_tiles-0", "--lights", "2"]
     assert CliRunner().invoke(app, arguments).exit_code == 0
     assert CliRunner().invoke(app, ["verify", str(folder)]).exit_code == 0
     assert mujoco.MjModel.from_xml_path(str(folder / "scene.xml")).ntex == scene.model().ntex

@@ -8,7 +8,7 @@ from schemas.identity import check_id, clean_label
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.formats.folders import SCENE_GLB
+from tableverse_factory.delivery.formats.folders import SCENE_GLB, SCENE_XML
 from tableverse_factory.delivery.formats.glb import encode_glb
 from tableverse_factory.delivery.formats.model_contents import ModelContents, read_model_contents
 from tableverse_factory.delivery.formats.urdf import encode_urdf
@@ -48,3 +48,5 @@ FORMATS: dict[str, Callable[[Scene, ModelContents, Mapping[str, str]], dict[str,
     "urdf": lambda _, contents, labels: encode_urdf(contents, labels),
     "usd": lambda _, contents, labels: encode_usd(contents, labels),
 }
+MAIN_FILES = {"mjcf": SCENE_XML, "glb": SCENE_GLB, "urdf": "scene.urdf", "usd": "scene.usd"}
+"""The file of each format that refers to all others."""

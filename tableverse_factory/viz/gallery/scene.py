@@ -92,7 +92,7 @@ def list_commands(out: str, scene_id: str) -> tuple[tuple[str, str], ...]:
     """List commands for the scene with their descriptions."""
     return (
         ("view it in the browser, play its physics", f"tableverse view {shlex.quote(out)} {scene_id}"),
-        ("extract its files", f"tableverse extract {shlex.quote(out)} {scene_id} scene/"),
+        ("extract its files", f"tableverse extract {shlex.quote(out)} scene --scene {scene_id}"),
         ("open them in the viewer of MuJoCo", "python -m mujoco.viewer --mjcf scene/scene.xml"),
         ("measure its certificate again", "tableverse verify scene/"),
     )

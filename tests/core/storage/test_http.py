@@ -86,9 +86,9 @@ def test_the_tables_are_read_and_queried(server, run):
 
 @pytest.mark.heavy
 def test_a_scene_is_extracted(server, run, tmp_path):
-    assert run("extract", server.address, "s-1-1", tmp_path / "scene")[0] == 0
+    assert run("extract", server.address, tmp_path / "scene", "--scene", "s-1-1")[0] == 0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "scene" / "scene.xml")).nbody == 3
-    code, _, errors = run("extract", server.address, "s-1-11", tmp_path / "other")
+    code, _, errors = run("extract", server.address, tmp_path / "other", "--scene", "s-1-11")
     assert code == 1
     assert "nearest: s-1-1" in errors
 

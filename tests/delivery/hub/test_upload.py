@@ -339,7 +339,7 @@ def test_a_scene_opens_from_the_hub_by_its_own_bytes(hub, dataset, run, tmp_path
     tar = sha256((dataset / "mjcf" / "shard-00002.tar").read_bytes())
     assert hub.sent[f"/cdn/{tar}"] == scene.row["tar_size"]
     assert not hub.tokens_seen, "where the Hub sends us on to is not told the token"
-    assert run("extract", f"hf://datasets/{NAME}", "s-0-1", tmp_path / "scene")[0] == 0
+    assert run("extract", f"hf://datasets/{NAME}", tmp_path / "scene", "--scene", "s-0-1")[0] == 0
     assert "s-1-0" in run("query", f"hf://datasets/{NAME}@main", "--where", "shard = 1")[1]
 
 

@@ -42,7 +42,7 @@ def test_a_dataset_in_a_store_is_queried_and_extracted(store, run, tmp_path):
     upload(write_small_dataset(tmp_path / "out"), store)
     code, text, _ = run("query", store, "--where", "status = 'done'", "--json")
     assert (code, [row["scene_id"] for row in json.loads(text)]) == (0, ["a-1", "c-3", "c-4"])
-    assert run("extract", store, "a-1", tmp_path / "scene")[0] == 0
+    assert run("extract", store, tmp_path / "scene", "--scene", "a-1")[0] == 0
     assert (tmp_path / "scene" / "scene.xml").read_bytes() == dict(scene_files("a-1"))["scene.xml"]
     assert run("stats", store, "--json")[0] == 0
     code, _, errors = run("query", parse_path("s3://no-such-bucket/x"))
