@@ -16,7 +16,7 @@ WEIGHTS = "weights.safetensors"
 
 @dataclass(frozen=True, slots=True)
 class PictureSettings:
-    """Settings that determine the weights, besides the device and the number of processes that train.
+    """Settings that determine the weights, with the meshes of the pool and the device.
 
     Attributes:
         steps: Of `batch` views; a continued training may change them, and with them its schedule.

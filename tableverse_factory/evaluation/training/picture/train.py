@@ -45,7 +45,7 @@ Log = Callable[[str], object]
 
 @dataclass(frozen=True, slots=True)
 class TrainRun:
-    """How a training is run; none of it changes the weights, but the device and `start`.
+    """How a training is run; of it, only pool, start and device change the weights.
 
     Attributes:
         folder: Of the checkpoint and of the weights.
