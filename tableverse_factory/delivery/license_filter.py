@@ -20,6 +20,7 @@ from tableverse_factory.dataset.consolidated_tables import write_merged_tables
 from tableverse_factory.dataset.licences import PROFILES, LicenceVerdict, scene_license
 from tableverse_factory.dataset.shard_plan import Plan, read_plan, write_plan
 from tableverse_factory.dataset.shards import SPARSE, TarShard, committed_shards, shard_path, tar_sort_key
+from tableverse_factory.models.local.catalogue import DEFAULT_WEIGHTS
 from tableverse_factory.models.local.hf_weights import parse_hub_name
 from tableverse_factory.run_record import diff_run_records, read_run, resume_refused_error, write_run
 
@@ -166,8 +167,8 @@ def _redact_value(key: str, value: Any, section: Mapping[str, Any]) -> Any:
     if key.endswith("_command"):
         return [_redact_program(str(word)) if place == 0 else _REDACTED for place, word in enumerate(value)]
     if key.endswith("_weights"):
-        is_file = key == "detector_weights" and section.get("detector") == "learned"
-        on_hub = not is_file and parse_hub_name(str(value)) is not None
+        fetched = section.get(key.removesuffix("_weights")) in DEFAULT_WEIGHTS  # the others read files of ours
+        on_hub = fetched and parse_hub_name(str(value)) is not None
         return value if on_hub else _strip_folders(str(value))
     return redact_uri(str(value)) if key == "robot" else value
 

@@ -201,6 +201,9 @@ def test_what_the_public_cannot_open_becomes_a_name(uri, public):
     ("detector", "weights", "public"),
     [
         ("learned", "acme/net.onnx", "net.onnx"),
+        ("picture", "acme/net.onnx", "net.onnx"),
+        ("ensemble", "acme/net.onnx", "net.onnx"),
+        ("auto", "acme/net.onnx", "net.onnx"),
         ("grounding_dino", "acme/dino@v1", "acme/dino@v1"),
         ("grounding_dino", "/home/me/dino", "dino"),
     ],
@@ -263,10 +266,10 @@ def test_of_a_command_only_the_program_is_passed_on(command, public):
         ("", ""),
     ],
 )
-@pytest.mark.parametrize("key", ["depth_weights", "segmenter_weights"])
-def test_of_weights_on_the_disk_no_folder_is_passed_on(key, weights, public):
-    assert redact_config({key: weights}) == {key: public}
-    assert redact_config({key: public}) == {key: public}
+@pytest.mark.parametrize(("key", "backend"), [("depth", "moge_2"), ("segmenter", "sam3")])
+def test_of_weights_on_the_disk_no_folder_is_passed_on(key, backend, weights, public):
+    assert redact_config({key: backend, f"{key}_weights": weights}) == {key: backend, f"{key}_weights": public}
+    assert redact_config({key: backend, f"{key}_weights": public}) == {key: backend, f"{key}_weights": public}
 
 
 def test_what_is_unfinished_or_somebody_elses_is_left_alone(dataset, tmp_path):
