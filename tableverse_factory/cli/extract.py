@@ -37,7 +37,7 @@ def extract(
     camera: Annotated[int | None, typer.Option(min=0, metavar="SEED", help="A slightly moved camera.")] = None,
     jobs: Jobs = None,
 ) -> None:
-    """Write scenes as MJCF, GLB, URDF or USD, each into a folder of its own.
+    """Write scenes as MJCF, GLB, URDF or USD, a folder each.
 
     DEST/index.jsonl has a line for each: path, split by picture, licence, tasks. The same command again goes on.
 
