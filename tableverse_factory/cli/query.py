@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 
 
 SHOWN_ROWS = 100
-SHOWN_CHARS = 60
+LEAST_CHARS = 12  # of a column of text, which a terminal wraps
 SHOWN_COLUMNS = {
     "scenes": ("scene_id", "kind", "status", "stage", "reason", "n_objects", "usable", "quality_score"),
     "objects": ("scene_id", "object_id", "relabel_name", "mass_kg", "size_x_m", "size_y_m", "size_z_m", "contained_in"),
     "tasks": ("scene_id", "task_id", "instruction", "accepted", "refusal"),
     "trajectories": ("scene_id", "task_id", "instruction", "success", "failed_phase", "reason", "duration_s"),
 }
+
+_GAP, _UNBOUNDED = 2, 1_000_000
 
 
 def query(
@@ -42,7 +44,7 @@ def query(
     limit: Annotated[int | None, typer.Option("--limit", "-n", min=0, metavar="N", help="Most rows to print.")] = None,
     output: Annotated[
         Literal["table", "json", "csv"],
-        typer.Option("--format", "-f", help="A table for people, or all rows for a script."),
+        typer.Option("--format", "-f", help="A table for people, wrapped on a terminal; or all rows for a script."),
     ] = "table",
     as_json: Annotated[bool, typer.Option("--json", help="The same as --format json.")] = False,
 ) -> None:
@@ -87,17 +89,18 @@ def _print_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], bounde
     from rich.text import Text
 
     shown = rows[:SHOWN_ROWS] if bounded else rows
-    grid = make_table()
-    for name in names:
-        # A figure that is cut is a wrong figure, and an id that is cut cannot be copied.
+    cells = [[_format_cell(row[name]) for name in names] for row in shown]
+    grid, widths = make_table(), []
+    for number, name in enumerate(names):
+        # A figure that is wrapped is a wrong figure, and an id that is wrapped cannot be copied.
         whole = name.endswith("_id") or not any(isinstance(row[name], str | list) for row in shown)
-        width = max([len(name), *(len(_format_cell(row[name])) for row in shown)]) if whole else min(len(name), 8)
-        grid.add_column(name, overflow="ellipsis", no_wrap=True, min_width=width)
-    for row in shown:
-        grid.add_row(*(Text(_format_cell(row[name])) for name in names))
-    wide = Console(width=10_000)
-    narrowest = wide.measure(grid).minimum  # below it a column would be lost: better that the terminal wraps
-    width = max(Console().width, narrowest) if sys.stdout.isatty() else wide.width
+        longest = max([len(name), *(len(row[number]) for row in cells)])
+        widths.append(longest if whole else min(longest, max(len(name), LEAST_CHARS)))
+        grid.add_column(name, overflow="fold", no_wrap=whole, min_width=widths[-1])
+    for texts in cells:
+        grid.add_row(*map(Text, texts))
+    narrowest = sum(widths) + _GAP * len(widths)  # below it a column would be lost: better that the terminal wraps
+    width = max(Console().width, narrowest) if sys.stdout.isatty() else Console(width=_UNBOUNDED).measure(grid).maximum
     Console(width=width, soft_wrap=True).print(grid)
     if not rows:
         print("0 rows", file=sys.stderr)
@@ -113,7 +116,8 @@ def _format_cell(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
-    return sanitize_line(", ".join(map(str, value)) if isinstance(value, list) else str(value), SHOWN_CHARS)
+    text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return sanitize_line(text, 10 * len(text))
 
 
 def _print_json(rows: Iterable[dict[str, Any]]) -> None:

@@ -63,7 +63,7 @@ def _check_shape(name: str, width: int, height: int) -> None:
         problem = f"{name} is {width} x {height} pixels: give at least {MIN_SIDE_PX} on each side"
         raise InputError(problem, "picture_too_small")
     if longer > MAX_ASPECT * shorter:
-        problem = f"{name} is {width} x {height} pixels: crop it, one side may be {MAX_ASPECT:g} times the other"
+        problem = f"{name} is {width} x {height} pixels: crop it, one side is at most {MAX_ASPECT:g} times the other"
         raise InputError(problem, "picture_too_narrow")
 
 

@@ -3,6 +3,8 @@
 import csv
 import io
 import json
+import re
+import sys
 
 import mujoco
 import pyarrow.parquet as pq
@@ -12,7 +14,8 @@ from schemas.config import Config
 from schemas.tables import OBJECTS
 from tableverse_factory.core.config import fingerprint_config, load_config
 from tests.helpers.captures_on_disk import write_capture, write_picture
-from tests.helpers.small_dataset import scene_files, write_small_dataset
+from tests.helpers.small_dataset import LONG_DETAIL, scene_files, write_small_dataset
+from tests.helpers.terminal import watch
 
 
 @pytest.fixture
@@ -68,6 +71,26 @@ def test_query_takes_no_more_than_asked(tableverse, out, monkeypatch):
     assert "the first 3 rows" in answer.err
     assert tableverse("query", out, "--limit", "5").err == ""
     assert json.loads(tableverse("query", out, "--limit", "0", "--json").out) == []
+
+
+def test_a_reason_can_be_read_to_its_end(tableverse, out):
+    """Whole in a pipe, wrapped on a terminal, where ids and figures stay on one line."""
+    columns = ("-c", "scene_id,attempts,detail", "--where", "status = 'failed'")
+    assert LONG_DETAIL in tableverse("query", out, *columns).out
+    command = [
+        sys.executable,
+        "-c",
+        "from tableverse_factory.cli.main import main; main()",
+        "query",
+        str(out),
+        *columns,
+    ]
+    seen = watch(command, size=(60, 30))
+    assert seen.code == 0
+    assert re.match(r"d-5 +1 +signal 11", seen.screen[1])
+    words = " ".join(seen.screen[1:]).split()
+    assert words[2:] == LONG_DETAIL.split()
+    assert max(map(len, seen.screen)) <= 60
 
 
 def test_query_points_at_the_error(tableverse, out):

@@ -31,9 +31,12 @@ def scene_files(scene_id: str) -> tuple[tuple[str, bytes], ...]:
     )
 
 
+LONG_DETAIL = "signal 11 after 12.3 s, when the mesh of obj_003 was registered for the second time with all points"
+
+
 def write_small_dataset(out: Path) -> Path:
     _write_shard(out, 0, ["a-1"], [_row("b-2", "dropped", "settle", reason="not_at_rest", detail=f"drift {ESCAPE}")])
-    _write_shard(out, 1, ["c-3", "c-4"], [_row("d-5", "failed", "place", error_kind="crash", detail="signal 11")])
+    _write_shard(out, 1, ["c-3", "c-4"], [_row("d-5", "failed", "place", error_kind="crash", detail=LONG_DETAIL)])
     _write_shard(out, 2, ["e-6"], [])
     shard_path(out, "scenes", 2).unlink()
     (out / "run.json").write_text("{}")
