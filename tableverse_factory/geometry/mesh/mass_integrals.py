@@ -8,6 +8,9 @@ from jaxtyping import Float64
 from schemas.geometry import Matrix3, Points, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.aabb import aabb
 
+# Least share of its box that a mesh fills, and least volume of the box [m³], to enclose a volume
+_MIN_FILLED_SHARE, _MIN_VOLUME_M3 = 1e-3, 1e-10
+
 Rows = Float64[np.ndarray, "3 m"]
 
 
@@ -32,6 +35,18 @@ def compute_signed_volume(mesh: TriangleMesh) -> float:
     """Compute the volume by the divergence theorem [m³]; negative for closed meshes that are inside out."""
     _, six_volumes = _make_tetrahedra(mesh.vertices, mesh.faces)
     return float(six_volumes.sum() / 6)
+
+
+def encloses_volume(mesh: TriangleMesh) -> bool:
+    """Whether the faces, seen from their middle, enclose a volume on the whole, as open scans do and sheets do not."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    if not areas.sum() > 0.0:
+        return False
+    middle = areas @ (a + b + c) / (3 * areas.sum())
+    _, six_volumes = _make_tetrahedra(mesh.vertices - middle, mesh.faces)
+    low, high = aabb(mesh.vertices)
+    return bool(six_volumes.sum() / 6 > _MIN_FILLED_SHARE * max(float(np.prod(high - low)), _MIN_VOLUME_M3))
 
 
 def compute_volumes_and_centers(

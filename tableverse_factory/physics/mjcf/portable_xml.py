@@ -15,12 +15,15 @@ def make_portable_xml(xml: str, bodies: Mapping[str, tuple[Pose, MassProperties]
     Poses and inertias are written in full: MuJoCo writes six digits, which moves far poses by micrometres, and leaves
     its compiler's rounding noise as the pose of every mesh geom, whose frame is the body's own. The colour space of a
     texture is always `auto`, which MuJoCo 3.3 does not know; several contacts per pair of pieces, which stable rest
-    needs, are the default of MuJoCo 4 alone.
+    needs, are the default of MuJoCo 4 alone. Other readers of MJCF take an omitted damping ratio of contacts for 0.
     """
     root = ET.fromstring(xml)  # noqa: S314 - written by MuJoCo a moment ago
     find_or_add_child(find_or_add_child(root, "option"), "flag").set("multiccd", "enable")
     for texture in root.iter("texture"):
         texture.attrib.pop("colorspace", None)
+    for geom in root.iter("geom"):
+        if len(solref := geom.get("solref", "").split()) == 1:
+            geom.set("solref", f"{solref[0]} 1")
     for element in root.iter("body"):
         if (name := element.get("name", "")) in bodies:
             _write_body(element, *bodies[name])

@@ -17,6 +17,7 @@ from schemas.identity import make_file_stem
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import OPENCV_TO_OPENGL, multiply_quaternions, quaternion_about_z
+from tableverse_factory.geometry.mesh.mass_integrals import encloses_volume
 from tableverse_factory.physics.mjcf.inertia import MassProperties
 from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
 from tableverse_factory.physics.mjcf.portable_xml import make_portable_xml
@@ -33,6 +34,12 @@ TABLE_ROLLING_FRICTION = 1e-4  # a contact takes the larger of two frictions: th
 # to two steps. Objects sink in by 0.08 mm at most, light ones under heavy ones, and by 0.4 mm at MuJoCo's defaults.
 CONTACT_TIME_S = 0.004
 IMPEDANCE = (0.99, 0.999, 0.0002)
+REST_OPTIONS = {
+    "integrator": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "cone": mujoco.mjtCone.mjCONE_ELLIPTIC,
+    "impratio": 100.0,
+    "noslip_iterations": 5,
+}
 
 # Lamp over the table's middle, of the strength of the viewer's own lamp and of what comes from everywhere.
 LIGHT, TO_LIGHT = 0.45, np.array([-0.6, -0.8, 1.7])
@@ -180,10 +187,8 @@ def make_scene_spec(
 
 def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     spec.option.timestep = timestep_s
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 100.0
-    spec.option.noslip_iterations = 5
+    for name, value in REST_OPTIONS.items():
+        setattr(spec.option, name, value)
     visual = spec.add_default("visual", spec.default).geom
     visual.group, visual.contype, visual.conaffinity = VISUAL_GROUP, 0, 0
     collision = spec.add_default("collision", spec.default).geom
@@ -263,14 +268,15 @@ def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) ->
     part.explicitinertial = True
     for index, hull in enumerate(body.hulls):
         name = f"{make_file_stem(body.object_id)}_piece_{index:02d}"
-        geom = _add_mesh_geom(spec, part, name, "collision", encode_obj(hull), assets)
+        geom = _add_mesh_geom(spec, part, name, "collision", encode_obj(hull), assets, solid=True)
         geom.friction = [body.friction, TORSIONAL_FRICTION, body.rolling_friction]
     return part
 
 
 def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, assets: dict[str, bytes]) -> None:
     name = make_file_stem(body.object_id)
-    geom = _add_mesh_geom(spec, part, name, "visual", encode_obj(body.mesh, body.appearance), assets)
+    solid = encloses_volume(body.mesh)
+    geom = _add_mesh_geom(spec, part, name, "visual", encode_obj(body.mesh, body.appearance), assets, solid)
     if body.appearance is None:
         geom.rgba = [*(np.array(body.color) / 255.0), 1.0]
         return
@@ -280,9 +286,10 @@ def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, asse
 
 
 def _add_mesh_geom(
-    spec: mujoco.MjSpec, part: mujoco.MjsBody, name: str, kind: str, data: bytes, assets: dict[str, bytes]
+    spec: mujoco.MjSpec, part: mujoco.MjsBody, name: str, kind: str, data: bytes, assets: dict[str, bytes], solid: bool
 ) -> mujoco.MjsGeom:
     assets[f"{ASSETS}/{name}.obj"] = data
-    # The body has explicit inertia; `shell` keeps MuJoCo from refusing open or thin meshes.
-    spec.add_mesh(name=name, file=f"{name}.obj", inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh = spec.add_mesh(name=name, file=f"{name}.obj")
+    if not solid:  # the body has explicit inertia; `shell`, which MuJoCo 3.2 does not know, lets sheets compile
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     return part.add_geom(spec.find_default(kind), name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)

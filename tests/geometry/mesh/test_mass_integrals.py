@@ -5,7 +5,11 @@ import pytest
 import trimesh
 
 from schemas.geometry import TriangleMesh
-from tableverse_factory.geometry.mesh.mass_integrals import compute_volumes_and_centers, integrate_volume
+from tableverse_factory.geometry.mesh.mass_integrals import (
+    compute_volumes_and_centers,
+    encloses_volume,
+    integrate_volume,
+)
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tests.helpers.simple_scenes import ball, box
 
@@ -44,3 +48,13 @@ def test_moments_of_a_turned_box_are_those_of_the_formula() -> None:
     assert volume == pytest.approx(0.006)
     np.testing.assert_allclose(center, [0.5, 0.5, 0.5])
     np.testing.assert_allclose(second, turn @ np.diag(0.006 * size**2 / 12) @ turn.T, atol=1e-12)
+
+
+def test_open_scans_enclose_a_volume_and_sheets_and_inverted_solids_do_not() -> None:
+    whole = box(0.1, 0.06, 0.03)
+    far = TriangleMesh(whole.vertices + 5.0, whole.faces)
+    assert encloses_volume(far)
+    assert encloses_volume(TriangleMesh(far.vertices, whole.faces[2:])), "a side is missing"
+    assert not encloses_volume(TriangleMesh(far.vertices, whole.faces[:, ::-1]))
+    assert not encloses_volume(TriangleMesh(far.vertices, whole.faces[:2])), "one side alone"
+    assert not encloses_volume(TriangleMesh(np.zeros((4, 3)), whole.faces[:2] % 4))

@@ -99,7 +99,9 @@ def test_words_that_older_mujoco_does_not_know_are_not_written() -> None:
     xml = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB).xml
     assert "colorspace" not in xml
     assert "directional" not in xml
+    assert "shell" not in xml
     assert '<flag multiccd="enable" />' in xml
+    assert 'solref="0.004 1"' in xml, "Newton takes an omitted damping ratio for 0"
 
 
 def test_loads_from_an_extracted_folder_as_from_memory(tmp_path: Path) -> None:
