@@ -8,6 +8,8 @@ from tableverse_factory.core.version import __version__
 if TYPE_CHECKING:
     from tableverse_factory.dataset.dataset import Dataset, open_dataset
     from tableverse_factory.dataset.scene import Scene
+    from tableverse_factory.delivery.learning.attach import attach_scene, find_unfit_settings
+    from tableverse_factory.delivery.learning.dm_control import attach_to_dm_control
     from tableverse_factory.delivery.learning.dataset_environment import DatasetEnv
     from tableverse_factory.delivery.learning.environment import TableEnv
     from tableverse_factory.delivery.learning.grid import SceneGrid, build_scene_grid
@@ -27,7 +29,10 @@ __all__ = [
     "Variation",
     "VectorSim",
     "__version__",
+    "attach_scene",
+    "attach_to_dm_control",
     "build_scene_grid",
+    "find_unfit_settings",
     "open_dataset",
 ]
 
@@ -41,7 +46,10 @@ _MODULES = {
     "TableEnv": "delivery.learning.environment",
     "Variation": "delivery.learning.variation",
     "VectorSim": "delivery.learning.vector_sim",
+    "attach_scene": "delivery.learning.attach",
+    "attach_to_dm_control": "delivery.learning.dm_control",
     "build_scene_grid": "delivery.learning.grid",
+    "find_unfit_settings": "delivery.learning.attach",
     "open_dataset": "dataset.dataset",
 }
 _INSTALL = {"torch": "pip install torch", "gymnasium": "pip install 'tableverse-factory[gym]'"}

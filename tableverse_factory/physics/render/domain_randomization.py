@@ -6,17 +6,16 @@ Bodies, geoms, masses and contacts stay, so that the certificate stays valid.
 import posixpath
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 
 import numpy as np
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, normalize_quaternion
+from tableverse_factory.physics.mjcf.load import parse_document
 from tableverse_factory.physics.mjcf.portable_xml import find_or_add_child
 from tableverse_factory.physics.mjcf.spec import ASSETS, TABLE
 
-MAX_XML_BYTES = 64 * 1024 * 1024
 CAMERA = "observation"
 CAMERA_SHIFT_M = 0.03  # most shift of the camera along each axis
 CAMERA_TURN_RAD = float(np.deg2rad(2.0))  # and rotation about each
@@ -44,7 +43,7 @@ def randomize_appearance(
     Raises:
         InputError: `bad_mjcf` if `scene.xml` is absent or no MJCF, or has no table to change.
     """
-    root = _parse_document(files)
+    root = parse_document(files)
     randomized = dict(files)
     if table_png is not None:
         randomized[f"{ASSETS}/{TABLE}.png"] = table_png
@@ -56,32 +55,6 @@ def randomize_appearance(
     ET.indent(root)
     randomized["scene.xml"] = (ET.tostring(root, encoding="unicode") + "\n").encode()
     return randomized
-
-
-def _parse_document(files: Mapping[str, bytes]) -> ET.Element:
-    data = files.get("scene.xml")
-    if data is None:
-        raise InputError("there is no scene.xml", "bad_mjcf")
-    if len(data) > MAX_XML_BYTES:
-        raise InputError("scene.xml: longer than 64 MiB", "bad_mjcf")
-    text = _decode_text(data)
-    if "<!" in text.replace("<!--", ""):
-        raise InputError("scene.xml declares entities, which MJCF never does", "bad_mjcf")
-    try:
-        root = ET.fromstring(text)  # noqa: S314 - no declarations, so no entities that expand
-    except ET.ParseError as error:
-        raise InputError(f"scene.xml does not parse: {error}", "bad_mjcf") from None
-    if root.tag != "mujoco":
-        raise InputError(f"scene.xml is no MJCF: its root is <{root.tag[:40]}>", "bad_mjcf")
-    return root
-
-
-def _decode_text(data: bytes) -> str:
-    """Decode UTF-8 only: a parser would detect UTF-16, where a search for `<!` finds none."""
-    if b"\0" not in data:
-        with suppress(UnicodeDecodeError):
-            return data.decode("utf-8-sig")
-    raise InputError("scene.xml is not in UTF-8, the one encoding that MuJoCo reads", "bad_mjcf")
 
 
 def _cover_table(root: ET.Element, tile_m: float) -> None:
