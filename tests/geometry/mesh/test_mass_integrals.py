@@ -56,5 +56,5 @@ def test_open_scans_enclose_a_volume_and_sheets_and_inverted_solids_do_not() -> 
     assert encloses_volume(far)
     assert encloses_volume(TriangleMesh(far.vertices, whole.faces[2:])), "a side is missing"
     assert not encloses_volume(TriangleMesh(far.vertices, whole.faces[:, ::-1]))
-    assert not encloses_volume(TriangleMesh(far.vertices, whole.faces[:2])), "one side alone"
+    assert not encloses_volume(TriangleMesh(far.vertices, whole.faces[:1])), "one triangle alone"
     assert not encloses_volume(TriangleMesh(np.zeros((4, 3)), whole.faces[:2] % 4))
