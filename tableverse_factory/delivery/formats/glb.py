@@ -1,4 +1,4 @@
-"""GLB of a scene: a node per object at its settled pose, table included, textures embedded, Y-up as in glTF."""
+"""GLB of a scene: a node per object at its settled pose, table included, with textures and normals; Y-up as in glTF."""
 
 from collections.abc import Mapping
 
@@ -11,8 +11,10 @@ from trimesh.visual.material import PBRMaterial
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP, homogeneous_matrix, matrix_from_pose
+from tableverse_factory.physics.render.normals import compute_corner_normals
 
 ROUGHNESS = 0.8
+_NORMAL_DECIMALS = 4
 
 
 def encode_glb(contents: ModelContents, labels: Mapping[str, str]) -> bytes:
@@ -23,7 +25,7 @@ def encode_glb(contents: ModelContents, labels: Mapping[str, str]) -> bytes:
     scene = trimesh.Scene(base_frame="scene")
     for content in (*contents.objects, *contents.still):
         _add_object(scene, content, labels.get(content.name))
-    return scene.export(file_type="glb", include_normals=False)
+    return scene.export(file_type="glb", include_normals=True)
 
 
 def _add_object(scene: trimesh.Scene, content: ModelObject, label: str | None) -> None:
@@ -41,20 +43,30 @@ def _add_object(scene: trimesh.Scene, content: ModelObject, label: str | None) -
 
 
 def _build_mesh(look: VisualMesh) -> trimesh.Trimesh:
-    mesh, texture = look.mesh, look.mesh.texture
+    texture = look.mesh.texture
+    vertices, faces, normals, uv = split_corners(look.mesh, texture)
     if texture is None:
         color = [*look.color, 255]
         material = PBRMaterial(baseColorFactor=color, metallicFactor=0.0, roughnessFactor=ROUGHNESS)
-        return trimesh.Trimesh(mesh.vertices, mesh.faces, visual=TextureVisuals(material=material), process=False)
-    vertices, faces, uv = split_at_seams(mesh, texture)
-    picture = Image.fromarray(np.asarray(texture.picture))
-    material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=ROUGHNESS)
-    return trimesh.Trimesh(vertices, faces, visual=TextureVisuals(uv=uv, material=material), process=False)
+    else:
+        picture = Image.fromarray(np.asarray(texture.picture))
+        material = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=ROUGHNESS)
+    visual = TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
 
 
-def split_at_seams(mesh: TriangleMesh, texture: Texture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and a texture coordinate per vertex, duplicating vertices where faces disagree on it."""
-    corners = np.column_stack([mesh.faces.reshape(-1), texture.corner_uv.reshape(-1, 2)])
+def split_corners(
+    mesh: TriangleMesh, texture: Texture | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return vertices, faces, and a unit normal and a texture coordinate per vertex.
+
+    Vertices are duplicated where faces disagree on either: at creases and seams.
+    """
+    normals = np.round(compute_corner_normals(mesh).reshape(-1, 3), _NORMAL_DECIMALS) + 0.0
+    normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)  # of faces without area
+    uv = np.zeros((len(normals), 0)) if texture is None else texture.corner_uv.reshape(-1, 2)
+    corners = np.column_stack([mesh.faces.reshape(-1), normals, uv])
     distinct, index = np.unique(corners, axis=0, return_inverse=True)
-    vertices = mesh.vertices[distinct[:, 0].astype(np.int64)]
-    return vertices, index.reshape(-1, 3).astype(np.int64), distinct[:, 1:]
+    vertices, sides = mesh.vertices[distinct[:, 0].astype(np.int64)], distinct[:, 1:4]
+    sides = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    return vertices, index.reshape(-1, 3).astype(np.int64), sides, None if texture is None else distinct[:, 4:]

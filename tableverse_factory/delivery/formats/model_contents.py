@@ -5,8 +5,16 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
+from tableverse_factory.delivery.formats.model_views import (
+    ModelCamera,
+    ModelLight,
+    read_ambient,
+    read_cameras,
+    read_lights,
+)
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
@@ -42,24 +50,32 @@ class ModelObject(Frozen):
     friction: float  # largest sliding friction of the colliders
 
 
-@dataclass(frozen=True, slots=True)
-class ModelContents:
-    """Objects of a scene."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelContents(Frozen):
+    """Objects of a scene, and how it is lit and seen."""
 
     objects: tuple[ModelObject, ...]  # movable ones; in a model without any, every body on the world but the table
     still: tuple[ModelObject, ...]  # usually the table
+    lights: tuple[ModelLight, ...]
+    ambient: Float64[np.ndarray, "3"]  # light from everywhere; 1 is white
+    cameras: tuple[ModelCamera, ...]
 
 
 def read_model_contents(model: mujoco.MjModel) -> ModelContents:
     """Read a model in its initial state."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
     roots = [int(root) for root in np.unique(model.body_rootid[model.geom_bodyid])]
     moving = {int(root) for root in np.unique(model.body_rootid[model.jnt_bodyid])}
     chosen = moving or {root for root in roots if root > 0 and not is_table(body_name(model, root))}
     return ModelContents(
         tuple(_read_object(model, data, root) for root in roots if root in chosen),
         tuple(_read_object(model, data, root) for root in roots if root not in chosen),
+        read_lights(model, data),
+        read_ambient(model),
+        read_cameras(model, data),
     )
 
 

@@ -1,4 +1,7 @@
-"""USD with physics: rigid bodies with mass and inertia, convex colliders, preview surfaces; z up, meters."""
+"""USD with physics: rigid bodies with mass and inertia, convex colliders, preview surfaces; z up, meters.
+
+Lamps and cameras are those of the model, with UsdLux's intensities: a lamp of 1 lights white as bright as white is.
+"""
 
 import tempfile
 from collections.abc import Mapping
@@ -6,16 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from schemas.geometry import Matrix3, Quaternion, TriangleMesh
 from schemas.identity import make_file_stem
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
+from tableverse_factory.delivery.formats.usd_views import add_cameras, add_lights
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
+from tableverse_factory.physics.render.normals import compute_corner_normals
 
 if TYPE_CHECKING:
-    from pxr import Usd, UsdGeom, UsdShade
+    from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 ROOT = "/World"
 TEXTURES = "textures"
@@ -41,6 +47,8 @@ def encode_usd(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, 
         physics = UsdPhysics.Scene.Define(stage, f"{ROOT}/physics")
         physics.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
         physics.CreateGravityMagnitudeAttr(9.81)
+        add_lights(stage, f"{ROOT}/lights", contents)
+        add_cameras(stage, f"{ROOT}/cameras", contents)
         for content in contents.still:
             files |= _add_object(stage, content, None)
         for content in contents.objects:
@@ -51,7 +59,7 @@ def encode_usd(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, 
 
 def _add_object(stage: "Usd.Stage", content: ModelObject, label: str | None) -> dict[str, bytes]:
     """Add an object, static if its label is None."""
-    from pxr import Gf, Tf, UsdGeom
+    from pxr import Gf, Tf, UsdGeom, UsdSemantics
 
     path = _find_free_path(stage, Tf.MakeValidIdentifier(content.name))
     body = UsdGeom.Xform.Define(stage, path)
@@ -63,6 +71,7 @@ def _add_object(stage: "Usd.Stage", content: ModelObject, label: str | None) -> 
         body.GetPrim().SetCustomDataByKey("label", label)
         body.GetPrim().SetDisplayName(label or content.name)
         _add_mass(body, content)
+    UsdSemantics.LabelsAPI.Apply(body.GetPrim(), "class").CreateLabelsAttr([label or content.name])
     files: dict[str, bytes] = {}
     stem = make_file_stem(content.name)
     for index, look in enumerate(content.looks):
@@ -100,7 +109,7 @@ def compute_principal_axes(inertia: Matrix3) -> tuple[np.ndarray, Quaternion]:
 
 
 def _add_visual(stage: "Usd.Stage", path: str, look: VisualMesh, stem: str) -> dict[str, bytes]:
-    from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
+    from pxr import Gf, Sdf, UsdShade
 
     mesh = _define_mesh(stage, path, look.mesh)
     material = UsdShade.Material.Define(stage, f"{path}/material")
@@ -116,10 +125,7 @@ def _add_visual(stage: "Usd.Stage", path: str, look: VisualMesh, stem: str) -> d
         color.Set(plain)
         mesh.CreateDisplayColorAttr([plain])
         return {}
-    points = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
-        "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
-    )
-    points.Set(Vt.Vec2fArray.FromNumpy(np.asarray(texture.corner_uv, dtype=np.float32).reshape(-1, 2)))
+    _set_at_corners(mesh, "st", Sdf.ValueTypeNames.TexCoord2fArray, texture.corner_uv)
     _add_texture(stage, f"{path}/material", color, f"./{TEXTURES}/{stem}.png")
     return {f"{TEXTURES}/{stem}.png": encode_png(np.asarray(texture.picture))}
 
@@ -159,7 +165,7 @@ def _add_colliders(stage: "Usd.Stage", path: str, content: ModelObject) -> None:
 
 
 def _define_mesh(stage: "Usd.Stage", path: str, mesh: TriangleMesh) -> "UsdGeom.Mesh":
-    from pxr import UsdGeom, Vt
+    from pxr import Sdf, UsdGeom, Vt
 
     prim = UsdGeom.Mesh.Define(stage, path)
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float32)
@@ -167,5 +173,19 @@ def _define_mesh(stage: "Usd.Stage", path: str, mesh: TriangleMesh) -> "UsdGeom.
     prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(mesh.faces), 3))
     prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(mesh.faces.reshape(-1))))
     prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    _set_at_corners(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, compute_corner_normals(mesh))
     prim.CreateExtentAttr([vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()])
     return prim
+
+
+def _set_at_corners(
+    mesh: "UsdGeom.Mesh", name: str, kind: "Sdf.ValueTypeName", values: Float[np.ndarray, "m 3 k"]
+) -> None:
+    """Set a primvar at each face's corners, its distinct values indexed."""
+    from pxr import UsdGeom, Vt
+
+    distinct, index = np.unique(values.reshape(-1, values.shape[2]).astype(np.float32), axis=0, return_inverse=True)
+    array = Vt.Vec3fArray if values.shape[2] == 3 else Vt.Vec2fArray
+    primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, UsdGeom.Tokens.faceVarying)
+    primvar.Set(array.FromNumpy(np.ascontiguousarray(distinct)))
+    primvar.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(index.reshape(-1), dtype=np.int32)))
