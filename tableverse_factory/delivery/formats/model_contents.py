@@ -48,6 +48,7 @@ class ModelObject(Frozen):
     center: Vector3  # of mass [m]
     inertia: Matrix3  # about the center of mass [kg m²]
     friction: float  # largest sliding friction of the colliders
+    spin_roll: tuple[float, float]  # largest torsional and rolling friction of the colliders [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,9 +94,10 @@ def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Model
     undrawn = find_undrawn_geoms(model, data, seen, solid)
     unseen = [look.mesh for geom in undrawn if (look := _load_visual(model, data, geom, pose))]
     hulls = [hull for geom in solid if (hull := _compute_hull(model, data, geom, pose))]
-    friction = float(model.geom_friction[solid, 0].max()) if solid else 1.0
+    friction, spin, roll = model.geom_friction[solid].max(axis=0).tolist() if solid else (1.0, 0.0, 0.0)
     properties = _compute_mass_properties(model, data, root, pose)
-    return ModelObject(body_name(model, root), pose, tuple(looks), tuple(unseen), tuple(hulls), *properties, friction)
+    shapes = tuple(looks), tuple(unseen), tuple(hulls)
+    return ModelObject(body_name(model, root), pose, *shapes, *properties, friction, (spin, roll))
 
 
 def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:

@@ -1,26 +1,30 @@
-"""URDF: a file per object, and one of the whole scene with every object on a floating joint at its settled pose.
+"""URDF: a file per object and support, and one of the whole scene with every object on a floating joint.
 
-Meshes are OBJ files under `meshes/`. Labels and friction, which URDF lacks, are in extra elements (`label`, and
-Gazebo's and Bullet's for friction) that other readers ignore.
+Readers that know no floating joints, such as Bullet, load the files one by one, at the poses of `poses.json`. Meshes
+are OBJ files under `meshes/`. Labels and friction, which URDF lacks, are in extra elements (`label`, and Bullet's
+`contact`) that other readers ignore.
 """
 
+import json
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from schemas.geometry import Matrix3, Pose
+from schemas.geometry import Matrix3, Pose, TriangleMesh
 from schemas.identity import make_file_stem
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
 
 MESHES = "meshes"
 WORLD = "world"
+_FLAT_M = 1e-7
 
 
 def encode_urdf(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
@@ -35,14 +39,14 @@ def encode_urdf(contents: ModelContents, labels: Mapping[str, str]) -> dict[str,
         files += meshes
         scene.append(link)
         scene.append(_build_joint(content, "floating" if moves else "fixed"))
-        if moves:
-            alone = _make_robot(content.name)
-            alone.append(link)
-            if (label := labels.get(content.name)) is not None:
-                for root in (alone, scene):
-                    ET.SubElement(root, "label", link=content.name).text = label
-            files.append((f"{make_file_stem(content.name)}.urdf", _serialize(alone)))
+        alone = _make_robot(content.name)
+        alone.append(link)
+        if moves and (label := labels.get(content.name)) is not None:
+            for root in (alone, scene):
+                ET.SubElement(root, "label", link=content.name).text = label
+        files.append((f"{make_file_stem(_name_link(content))}.urdf", _serialize(alone)))
     files.append(("scene.urdf", _serialize(scene)))
+    files.append(("poses.json", _encode_poses(contents)))
     _check_unique_names("files", [name for name, _ in files])
     return dict(files)
 
@@ -79,10 +83,12 @@ def _build_link(content: ModelObject, moves: bool) -> tuple[ET.Element, list[tup
         link.append(visual)
     for index, hull in enumerate(content.hulls):
         name = f"{stem}_piece_{index:02d}"
-        files.append((f"{MESHES}/{name}.obj", encode_obj(hull)))
-        link.append(_build_shape("collision", name))
-    contact = ET.SubElement(link, "contact")
-    ET.SubElement(contact, "lateral_friction", value=_format_numbers([content.friction]))
+        if is_box(hull):  # exact everywhere; Bullet rounds convex meshes by a margin
+            link.append(_build_box(name, hull))
+        else:
+            files.append((f"{MESHES}/{name}.obj", encode_obj(hull)))
+            link.append(_build_shape("collision", name))
+    link.append(_build_contact(content))
     return link, files
 
 
@@ -101,10 +107,50 @@ def _build_inertial(content: ModelObject) -> ET.Element:
     return inertial
 
 
+def _build_contact(content: ModelObject) -> ET.Element:
+    """Build Bullet's element. Bullet multiplies the sliding frictions of a pair, where MuJoCo takes the larger."""
+    spin, roll = content.spin_roll
+    values = {"lateral_friction": content.friction**0.5, "spinning_friction": spin, "rolling_friction": roll}
+    contact = ET.Element("contact")
+    for name, value in values.items():
+        ET.SubElement(contact, name, value=_format_numbers([value]))
+    return contact
+
+
+def _encode_poses(contents: ModelContents) -> bytes:
+    """Encode the poses of the files' frames in the world [m], quaternions as Bullet and ROS have them."""
+    poses = [
+        {
+            "urdf": f"{make_file_stem(_name_link(content))}.urdf",
+            "moves": moves,
+            "position": content.pose.position.tolist(),
+            "quaternion_xyzw": np.roll(content.pose.quaternion_wxyz, -1).tolist(),
+        }
+        for moves, group in ((False, contents.still), (True, contents.objects))
+        for content in group
+    ]
+    return (json.dumps(poses, indent=1) + "\n").encode()
+
+
 def _build_shape(kind: str, mesh: str) -> ET.Element:
     shape = ET.Element(kind, name=mesh)
     ET.SubElement(shape, "origin", xyz="0 0 0", rpy="0 0 0")
     ET.SubElement(ET.SubElement(shape, "geometry"), "mesh", filename=f"{MESHES}/{mesh}.obj")
+    return shape
+
+
+def is_box(hull: TriangleMesh) -> bool:
+    """Whether a hull is the box around it."""
+    low, high = aabb(hull.vertices)
+    at_corner = np.minimum(np.abs(hull.vertices - low), np.abs(hull.vertices - high)).max(initial=0.0) < _FLAT_M
+    return bool(len(hull.vertices) == 8 and at_corner)
+
+
+def _build_box(name: str, hull: TriangleMesh) -> ET.Element:
+    low, high = aabb(hull.vertices)
+    shape = ET.Element("collision", name=name)
+    ET.SubElement(shape, "origin", xyz=_format_numbers((low + high) / 2), rpy="0 0 0")
+    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_format_numbers(high - low))
     return shape
 
 

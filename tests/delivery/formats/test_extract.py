@@ -1,5 +1,6 @@
 """Every format, read back by somebody else's reader: the same shapes at the same places, the same masses, any label."""
 
+import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -157,6 +158,51 @@ def test_urdf_of_one_object_keeps_its_mass_and_meshes(scene, tmp_path):
     assert loaded.volume == pytest.approx(0.1 * 0.08 * 0.04, rel=1e-5)
 
 
+def test_urdf_has_the_table_its_poses_and_all_frictions(scene, tmp_path):
+    extract_scene(scene, tmp_path, "urdf")
+    entries = {entry["urdf"]: entry for entry in json.loads((tmp_path / "poses.json").read_text())}
+    assert {name: entry["moves"] for name, entry in entries.items()} == {
+        "table.urdf": False, "obj_000.urdf": True, "obj_001.urdf": True, "obj_002.urdf": True,
+    }  # fmt: skip
+    model = scene.model()
+    for name, entry in entries.items():
+        np.testing.assert_allclose(entry["position"], model.body(name.removesuffix(".urdf")).pos, atol=1e-9)
+        x, y, z, w = entry["quaternion_xyzw"]
+        np.testing.assert_allclose([w, x, y, z], model.body(name.removesuffix(".urdf")).quat, atol=1e-9)
+        contact = ET.parse(tmp_path / name).getroot().find("link/contact")
+        frictions = {child.tag: float(child.get("value")) for child in contact}
+        geom = model.geom("table" if name == "table.urdf" else f"{name.removesuffix('.urdf')}_piece_00")
+        slide, spin, roll = geom.friction
+        assert frictions["lateral_friction"] ** 2 == pytest.approx(slide), "Bullet multiplies those of a pair"
+        assert (frictions["spinning_friction"], frictions["rolling_friction"]) == pytest.approx((spin, roll))
+    box = ET.parse(tmp_path / "table.urdf").getroot().find("link/collision/geometry/box")
+    np.testing.assert_allclose([float(side) for side in box.get("size").split()], 2 * model.geom("table").size)
+
+
+@pytest.mark.slow
+def test_things_stay_on_the_table_in_bullet(scene, tmp_path):
+    """Run with pybullet 3.2.7, as docs/simulators.md says; its margins lift convex meshes by a millimetre."""
+    bullet = pytest.importorskip("pybullet", reason="installed where it is tested")
+    extract_scene(scene, tmp_path, "urdf")
+    bullet.connect(bullet.DIRECT)
+    bullet.setGravity(0, 0, -9.81)
+    bullet.setTimeStep(0.002)
+    things = []
+    for entry in json.loads((tmp_path / "poses.json").read_text()):
+        body = bullet.loadURDF(str(tmp_path / entry["urdf"]), useFixedBase=not entry["moves"])
+        center = bullet.getDynamicsInfo(body, -1)[3:5]
+        start = bullet.multiplyTransforms(entry["position"], entry["quaternion_xyzw"], *center)
+        bullet.resetBasePositionAndOrientation(body, *start)
+        if entry["moves"]:
+            things.append((body, np.array(start[0])))
+    for _ in range(1000):
+        bullet.stepSimulation()
+    moved = [np.linalg.norm(np.array(bullet.getBasePositionAndOrientation(body)[0]) - at) for body, at in things]
+    bullet.disconnect()
+    assert len(moved) == 3
+    assert max(moved) < 0.003
+
+
 def test_urdf_survives_hostile_labels(scene, tmp_path):
     extract_scene(scene, tmp_path / "urdf", "urdf")
     for path in (tmp_path / "urdf").glob("*.urdf"):
@@ -289,7 +335,7 @@ def _bodies(*names: str) -> bytes:
     return f"<mujoco><worldbody>{''.join(rows)}</worldbody></mujoco>".encode()
 
 
-@pytest.mark.parametrize("names", [("scene", "b"), ("Scene", "b"), ("a", "a_look_01"), ("a", "a_piece_00"), ("B", "b")])
+@pytest.mark.parametrize("names", [("scene", "b"), ("Scene", "b"), ("a", "a_look_01"), ("B", "b")])
 def test_no_object_takes_a_urdf_file_from_another(names, tmp_path):
     bad = Scene("scene", {}, {"scene.xml": _bodies(*names), "meta.json": b'{"objects": []}'})
     with pytest.raises(InputError, match="would be called") as caught:

@@ -39,6 +39,7 @@ CANNOT = (
 PYTHON_CANNOT = (
     (r"from lerobot\.", "lerobot brings a gigabyte"),
     (r"from dm_control", "dm_control wants a MuJoCo of its own; tests/delivery/learning has a test for it"),
+    (r"import pybullet", "pybullet compiles for minutes; tests/delivery/formats has a test for it"),
     (r"serve_forever", "serves until it is stopped"),
     (r"open_library", "needs textures that somebody photographed"),
     (r"(hf|s3|https?)://", "needs a server"),
