@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.detection import DetectionRecord
-from schemas.geometry import Camera, Colors, Frozen, IdImage, Points, Pose, TriangleMesh
+from schemas.geometry import Camera, Colors, ConvexPieces, Frozen, IdImage, Points, Pose, TriangleMesh
 from schemas.observation import IntrinsicsSource, Observation, ScaleSource
 
 
@@ -140,6 +140,7 @@ class PlacedObject(Frozen):
         copy_of: The object whose mesh, label and pose this one repeats, where it was counted but not seen by itself.
         uncertainty: Of the pose as the picture gave it; None for a layout.
         mesh_licence: Licence of the model that made the mesh; None if none did.
+        pieces: Convex pieces of the mesh, where they are known already, as those of a cousin from its parent.
     """
 
     object_id: str
@@ -155,6 +156,7 @@ class PlacedObject(Frozen):
     copy_of: str | None = None
     uncertainty: FitUncertainty | None = None
     mesh_licence: str | None = None
+    pieces: ConvexPieces | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,6 +191,7 @@ class PlacedObjects(Frozen):
         evidence: The picture it came from; None for a layout file.
         left_out: Ids of objects that were found but could not be used or placed, with the reason.
         explanation: As in `PerceivedObjects`.
+        changes: What a cousin changes of its parent, e.g. `turn:obj_003=+85`.
     """
 
     scene_id: str
@@ -199,3 +202,4 @@ class PlacedObjects(Frozen):
     left_out: tuple[tuple[str, str], ...] = ()
     detection: DetectionRecord | None = None
     explanation: Explanation | None = None
+    changes: tuple[str, ...] = ()

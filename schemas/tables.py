@@ -27,6 +27,11 @@ SCENES = pa.schema(
         ("detail", pa.string()),  # one line for people, of a drop or a failure
         ("attempts", pa.int32()),
         ("known_length", pa.string()),  # of the manifest
+        ("parent", pa.string()),  # this and the next two are null for all but cousins
+        ("recipe", pa.string()),  # what was planned to change, of the manifest
+        ("changes", pa.list_(pa.string())),  # what was changed; null unless done
+        ("family", pa.string()),  # the scene itself, or the first ancestor of a cousin
+        ("fold", pa.int32()),  # of the family: one of dataset.families.FOLDS
         ("scale_source", pa.string()),  # sensor | estimated | measured | given
         ("scale_sigma", pa.float64()),  # relative standard deviation; null for layouts, and where nothing tells it
         ("scale_deviation", pa.float64()),  # of a known length from the estimate, in standard deviations; or null

@@ -9,6 +9,7 @@ from schemas.scene import ExportedScene
 from tableverse_factory.models.services import Services
 from tableverse_factory.robotics.robots.recorded import record_robot
 from tableverse_factory.stage import Pipelines, Stage
+from tableverse_factory.stages.cousins.derive import derive_cousin
 from tableverse_factory.stages.curate.curate import curate
 from tableverse_factory.stages.curate.recorded import record_answers, record_prompts
 from tableverse_factory.stages.export.export import export
@@ -57,6 +58,7 @@ PIPELINES: Pipelines = {
     SceneKind.IMAGE: STAGES,
     SceneKind.CAPTURE: STAGES,
     SceneKind.LAYOUT: (Stage("read_layout", "perception", read_layout, reads=("observe",)), *_FROM_LAYOUT),
+    SceneKind.COUSIN: (Stage("derive_cousin", "geometry", derive_cousin, reads=("observe",)), *_FROM_LAYOUT),
 }
 
 

@@ -19,7 +19,7 @@ from tableverse_factory.dataset.shards import committed_shards, shard_path
 MANIFEST_STAGE = "manifest"
 _COLUMNS = (
     *("scene_id", "kind", "uri", "name", "content_sha256", "url", "source", "licence", "known_length"),
-    *("stage", "reason", "detail"),
+    *("parent", "family", "recipe", "stage", "reason", "detail"),
 )
 
 
@@ -89,5 +89,6 @@ def _make_manifest_row(record: Mapping[str, Any]) -> ImageRow:
     """Make a scene's manifest row, with the reason if it was rejected."""
     rejected = record["stage"] == MANIFEST_STAGE
     own = {name: record[name] or "" for name in ImageRow.model_fields if name in record}
+    own["family"] = own["family"] if own["parent"] else ""  # others are their own
     why = {"rejected": record["reason"] or "", "rejected_detail": record["detail"] or ""} if rejected else {}
     return ImageRow.model_validate({**own, **why})

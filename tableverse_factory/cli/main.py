@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 from tableverse_factory.cli.bench import bench
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
+from tableverse_factory.cli.cousins import cousins
 from tableverse_factory.cli.doctor import doctor
 from tableverse_factory.cli.estimate import estimate
 from tableverse_factory.cli.evaluate import evaluate
@@ -58,6 +59,7 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
         "manifest": manifest,
         "build": build,
         "trajectories": trajectories,
+        "cousins": cousins,
         "textures": textures,
         "models": models,
         "train": train,

@@ -14,7 +14,9 @@ from tableverse_factory.dataset.columns import TextColumn
 
 BATCH_ROWS = 64 * 1024  # of a table that is read
 _LINES = 4096  # rows that are in Python or JSON at once
-_LATER = ("known_length", "url")  # columns that finished datasets may lack: a row without them is hashed as in these
+# Columns that finished datasets may lack: a row without them is hashed as in these
+_LATER = ("family", "known_length", "parent", "recipe", "url")
+_PARSED = {"known_length", "recipe"}  # columns of JSON, which `ImageRow` parses
 _ESCAPED = r"[^ !#-\[\]-~]"  # characters that JSON in ASCII escapes
 
 
@@ -78,8 +80,8 @@ def find_valid(columns: Mapping[str, pa.Array]) -> pa.BooleanArray:
     valid = pc.is_in(columns["kind"], pa.array([kind.value for kind in SceneKind]))
     checks = [pc.match_substring_regex(columns["scene_id"], f"^(?:{SAFE_ID.pattern})$")]
     checks += [pc.invert(pc.match_substring(columns["scene_id"], "..")), pc.is_valid(columns["uri"])]
-    if "known_length" in columns:  # `ImageRow` parses it
-        checks.append(pc.equal(columns["known_length"], "").fill_null(True))
+    for name in _PARSED & columns.keys():
+        checks.append(pc.equal(columns[name], "").fill_null(True))
     for name, column in columns.items():
         for bound in ImageRow.model_fields[name].metadata:
             if (longest := getattr(bound, "max_length", None)) is not None:

@@ -3,11 +3,12 @@
 from typing import Any
 
 from schemas.work import SceneResult
+from tableverse_factory.dataset.families import find_fold
 from tableverse_factory.dataset.licences import scene_license
 from tableverse_factory.dataset.model_costs import make_cost_columns
 from tableverse_factory.dataset.parts import SceneRows
 
-_OF_MANIFEST = ("name", "url", "source", "licence", "content_sha256", "known_length")
+_OF_MANIFEST = ("name", "url", "source", "licence", "content_sha256", "known_length", "parent", "recipe")
 
 
 def complete_rows(result: SceneResult, own: SceneRows | None, shard: int, place: tuple[int, int] | None) -> SceneRows:
@@ -21,6 +22,7 @@ def complete_rows(result: SceneResult, own: SceneRows | None, shard: int, place:
     """
     tables = own or {"scenes": [{}], "objects": [], "tasks": [], "trajectories": []}
     row, (scene,), (offset, size) = result.row, tables["scenes"], place or (None, None)
+    family = row.family or row.scene_id
     scene = {
         **scene,
         **{name: getattr(row, name) or None for name in _OF_MANIFEST},
@@ -29,6 +31,8 @@ def complete_rows(result: SceneResult, own: SceneRows | None, shard: int, place:
         "scene_id": row.scene_id,
         "kind": row.kind.value,
         "uri": row.uri,
+        "family": family,
+        "fold": find_fold(family),
         "licence_verdict": scene_license({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
         **make_cost_columns(result.costs),
         "shard": shard,

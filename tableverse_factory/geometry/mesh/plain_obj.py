@@ -2,9 +2,12 @@
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import Float64
 from pyarrow import csv
 
 from schemas.geometry import TriangleMesh
+
+CornerUv = Float64[np.ndarray, "m 3 2"]
 
 _PLAIN = b"0123456789.+-e vf\r\n"
 _NO_INDEX = (b".", b"e")
@@ -37,6 +40,28 @@ def read_plain_obj(data: bytes) -> TriangleMesh | None:
     if vertices.shape[1] == 6:
         colors = (255.0 * np.clip(vertices[:, 3:], 0.0, 1.0)).round().astype(np.uint8)
     return TriangleMesh(vertices[:, :3].copy(), indices, colors)
+
+
+def read_textured_obj(data: bytes) -> tuple[TriangleMesh, CornerUv] | None:
+    """Read a file of lines `v x y z`, `vt u v` and `f i/k j/l m/n`, in this order, as scenes are exported.
+
+    Also returns the texture coordinates at each face's corners. None for any other file.
+    """
+    first_uv, first_face = data.find(b"\nvt "), data.find(b"\nf ")
+    if not 0 <= first_uv < first_face:
+        return None
+    corners = data[first_face + 1 :].replace(b"/", b" ")
+    points = _table(data[first_uv + 1 : first_face].replace(b"vt", b"v"), b"v", pa.float64())
+    table = _table(corners, b"f", pa.int64())
+    if points is None or table is None or points.shape[1] != 2 or table.shape[1] != 6:
+        return None
+    vertices = _table(data[:first_uv], b"v", pa.float64())
+    if vertices is None or vertices.shape[1] != 3 or table.min() < 1:
+        return None
+    faces, uv = (table[:, ::2] - 1).astype(np.int32), (table[:, 1::2] - 1).astype(np.int64)
+    if np.abs(vertices).max() > _LARGEST or faces.max() >= len(vertices) or uv.max() >= len(points):
+        return None
+    return TriangleMesh(vertices.copy(), faces), np.clip(points, 0.0, 1.0)[uv]
 
 
 def _table(text: bytes, letter: bytes, kind: pa.DataType) -> np.ndarray | None:

@@ -34,6 +34,7 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, 
     return {
         "scene_id": scene.scene_id,
         **describe_metric(placed.evidence),
+        "changes": list(placed.changes) or None,
         "perception": placed.perception,
         "judge": scene.judge,
         "mesh_licences": sorted({item.mesh_licence for item in placed.objects if item.mesh_licence}) or None,

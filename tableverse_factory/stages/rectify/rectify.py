@@ -42,7 +42,7 @@ def rectify(
     for placed in item.objects:
         try:
             _check_size(placed)
-            decomposed[placed.object_id] = decompose(placed.mesh, config.rectify, services.cache_dir)
+            decomposed[placed.object_id] = placed.pieces or decompose(placed.mesh, config.rectify, services.cache_dir)
         except GeometryError as error:
             refused[placed.object_id] = str(error)[:MAX_REASON_CHARS]
     if not decomposed:

@@ -1,0 +1,72 @@
+"""`tableverse cousins`: new scenes from those of a finished dataset."""
+
+from typing import Annotated
+
+import typer
+
+from tableverse_factory.cli import options
+from tableverse_factory.cli.build import make_display, report_summary
+from tableverse_factory.core.errors import InputError
+
+
+def cousins(
+    out: options.FinishedOut,
+    dest: Annotated[
+        str,
+        typer.Argument(
+            metavar="DEST", help="The dataset of cousins, a folder or s3://bucket/prefix; begun before, it goes on."
+        ),
+    ],
+    per_scene: Annotated[
+        int, typer.Option("--per-scene", min=1, max=1000, metavar="N", help="Cousins of a scene.")
+    ] = 10,
+    seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Another seed, other cousins.")] = 0,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    executor: options.Executor = "ray",
+    workers: options.Workers = None,
+    address: options.Address = None,
+    pools: options.Pools = None,
+    limit: options.Limit = None,
+    shards: options.Shards = None,
+    max_usd: options.MaxUsd = None,
+    max_calls: options.MaxCalls = None,
+    metrics: options.Metrics = None,
+) -> None:
+    """Make cousins of every finished scene: things swapped, rescaled, turned, moved, removed, scenes mirrored.
+
+    Each is separated, settled, judged and certified like any scene, or dropped with its reason; its row names its
+    parent, its family and what was changed. DEST.parquet keeps the manifest. The same command again goes on. Exit codes
+    are those of `build`.
+
+    Example: `tableverse cousins out out-cousins --per-scene 10`
+    """
+    from tableverse_factory.core.storage.files import parse_path
+    from tableverse_factory.dataset.cousin_rows import list_cousins
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.sources.manifest import write_manifest
+    from workers.api import build
+    from workers.driver.signals import StopSignals
+
+    source, place = parse_path(out), parse_path(dest)
+    if place == source:
+        raise InputError(f"{dest} is the dataset of the parents: give another folder for the cousins")
+    manifest = place.parent / f"{place.name}.parquet"
+    write_manifest(manifest, list_cousins(open_dataset(str(source.absolute())), per_scene, seed))
+    summary = build(
+        str(manifest),
+        dest,
+        config=config,
+        overrides=[*(overrides or []), f"run.seed={seed}"],
+        executor=executor,
+        workers=workers,
+        address=address,
+        pools=pools,
+        limit=limit,
+        shards=shards,
+        max_usd=max_usd,
+        max_calls=max_calls,
+        display=make_display(dest, metrics),
+        signals=StopSignals(),
+    )
+    report_summary(summary, dest)

@@ -1,0 +1,187 @@
+"""Manifest of cousins: for each finished scene of a dataset, rows that say what is to be changed, and a digest.
+
+Only tables are read. What becomes of the changes is decided where the scene's shapes are read, by
+`stages.cousins`.
+"""
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from schemas.cousins import MAX_DONORS, Change, Donor, Recipe
+from schemas.identity import content_hash
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.core.text import pluralize
+from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.dataset.families import find_fold
+
+Row = Mapping[str, Any]
+
+MAX_PER_SCENE = 1000
+THEMES: Sequence[tuple[Change, ...]] = (  # each cousin of a scene takes the next one
+    (Change.MOVE, Change.TURN),
+    (Change.SWAP, Change.TURN),
+    (Change.SCALE, Change.MOVE),
+    (Change.REMOVE, Change.TURN),
+    (Change.MOVE, Change.MIRROR),
+    (Change.SWAP, Change.MOVE),
+    (Change.SCALE, Change.TURN, Change.MIRROR),
+    (Change.REMOVE, Change.SWAP, Change.MOVE),
+    (Change.SCALE, Change.MOVE, Change.TURN),
+    (Change.SWAP, Change.MIRROR),
+)
+DONORS_PER_OBJECT = 3
+MAX_SIZE_RATIO = 1.6  # of each side, sorted, of things that may take each other's place
+_SCENE_COLUMNS = ("scene_id", "name", "url", "source", "licence", "family", "status", "shard", "mesh_licences")
+_POSES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+_SIDES = ("size_x_m", "size_y_m", "size_z_m")
+_OBJECT_COLUMNS = (
+    *("scene_id", "object_id", "label", "relabel_name", "contained_in", "n_pieces", "mass_kg"),
+    *(*_SIDES, *_POSES),
+)
+_TAIL = re.compile(r"\s(with|without|of|in|on|for|from|containing|and)\s.*")
+
+
+@dataclass(frozen=True, slots=True)
+class _Stock:
+    """Objects of a fold by kind, with their sides in ascending order [m]. Shape (n, 3)."""
+
+    rows: Sequence[Row]
+    sides: np.ndarray
+
+
+def list_cousins(dataset: Dataset, per_scene: int, seed: int) -> Iterator[ImageRow]:
+    """List the rows of `per_scene` cousins of each finished scene, in the dataset's order.
+
+    The same dataset and seed give the same rows, and the cousins of a scene do not depend on how many there are.
+
+    Raises:
+        InputError: if the dataset is not finished, or no scene of it is done.
+    """
+    _check_finished(dataset)
+    scenes = dataset.scenes.to_table(columns=list(_SCENE_COLUMNS)).to_pylist()
+    done = [row for row in scenes if row["status"] == "done"]
+    if not done:
+        raise InputError(f"{dataset.path}: none of {pluralize(len(scenes), 'scene')} is done: cousins have no parents")
+    family_of = {row["scene_id"]: row["family"] or row["scene_id"] for row in done}
+    objects: dict[str, list[Row]] = defaultdict(list)
+    for item in dataset.objects.to_table(columns=list(_OBJECT_COLUMNS)).to_pylist():
+        objects[item["scene_id"]].append(item)
+    stocks = _stock_objects(objects, family_of)
+    for row in done:
+        scene_id = row["scene_id"]
+        for index in range(per_scene):
+            rng = make_rng(seed, scene_id, f"cousin {index}")
+            donors = _choose_donors(objects[scene_id], stocks, find_fold(family_of[scene_id]), rng)
+            yield _make_row(dataset.path, row, family_of[scene_id], index, donors, objects, seed)
+
+
+def digest_objects(rows: Iterable[Row]) -> str:
+    """Hash what the tables say of objects: ids, labels, sizes and poses. A scene that was built anew differs."""
+    values = [[row[name] for name in _OBJECT_COLUMNS] for row in rows]
+    return content_hash(json.dumps(values, separators=(",", ":")).encode())
+
+
+def find_kind(name: str) -> str:
+    """Find the noun of a name: `cup` of `blue cup`, `spatula` of `spatula with purple head`."""
+    words = re.findall(r"[^\W\d_]+", _TAIL.sub("", name.lower()))
+    return words[-1] if words else ""
+
+
+def _check_finished(dataset: Dataset) -> None:
+    run = dataset.record()
+    if run is None:
+        raise InputError(f"{dataset.path}: no run.json, so nothing says whether it is finished")
+    known = dataset.scenes.count_rows()
+    if "published" not in run and known != run["manifest"]["scenes"]:
+        raise InputError(
+            f"{dataset.path} is not finished: {known} of {pluralize(run['manifest']['scenes'], 'scene')} have a row: "
+            "finish it with `tableverse build MANIFEST OUT` first"
+        )
+
+
+def _stock_objects(
+    objects: Mapping[str, Sequence[Row]], family_of: Mapping[str, str]
+) -> Mapping[tuple[int, str], _Stock]:
+    """Sort what stands freely by fold and kind."""
+    found: dict[tuple[int, str], list[Row]] = defaultdict(list)
+    for scene_id, family in family_of.items():
+        for item in objects[scene_id]:
+            if item["contained_in"] is None:
+                found[find_fold(family), find_kind(item["relabel_name"] or item["label"])].append(item)
+    return {key: _Stock(rows, np.array([_sort_sides(row) for row in rows])) for key, rows in found.items()}
+
+
+def _sort_sides(row: Row) -> list[float]:
+    return sorted(float(row[name]) for name in _SIDES)
+
+
+def _choose_donors(
+    objects: Sequence[Row], stocks: Mapping[tuple[int, str], _Stock], fold: int, rng: np.random.Generator
+) -> tuple[Donor, ...]:
+    """Choose donors at random for as many objects as a recipe holds, each of another size than the object."""
+    chosen: list[Donor] = []
+    for place in rng.permutation(len(objects)).tolist():
+        item = objects[place]
+        stock = stocks.get((fold, find_kind(item["relabel_name"] or item["label"])))
+        if stock is None or item["contained_in"] is not None:
+            continue
+        ratio = stock.sides / np.array(_sort_sides(item))
+        like = np.flatnonzero(
+            (np.maximum(ratio, 1 / ratio).max(axis=1) <= MAX_SIZE_RATIO) & (np.abs(ratio - 1.0).max(axis=1) > 1e-6)
+        )
+        for number in rng.permutation(like)[:DONORS_PER_OBJECT].tolist():
+            donor = stock.rows[number]
+            chosen.append(Donor(replaces=item["object_id"], scene_id=donor["scene_id"], object_id=donor["object_id"]))
+        if len(chosen) + DONORS_PER_OBJECT > MAX_DONORS:
+            break
+    return tuple(chosen)
+
+
+def _make_row(
+    path: str,
+    parent: Row,
+    family: str,
+    index: int,
+    donors: tuple[Donor, ...],
+    objects: Mapping[str, Sequence[Row]],
+    seed: int,
+) -> ImageRow:
+    theme = THEMES[index % len(THEMES)]
+    if not donors:
+        theme = tuple(dict.fromkeys(Change.TURN if change is Change.SWAP else change for change in theme))
+    recipe = Recipe(changes=theme, donors=donors if Change.SWAP in theme else ())
+    content = digest_inputs(parent["scene_id"], recipe, objects)
+    identity = content_hash(content.encode(), f"{parent['scene_id']} {index} {seed}".encode())
+    name = f"{_name_parent(parent)}-c{index:02d}"
+    return ImageRow(
+        scene_id=f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[-60:].strip('-_')}-{identity[:12]}",
+        kind=SceneKind.COUSIN,
+        uri=path,
+        name=name,
+        content_sha256=content,
+        url=parent["url"] or "",
+        source=parent["source"] or "",
+        licence=parent["licence"] or "",
+        parent=parent["scene_id"],
+        family=family,
+        recipe=recipe.model_dump_json(exclude_defaults=True),
+    )
+
+
+def digest_inputs(parent: str, recipe: Recipe, objects: Mapping[str, Sequence[Row]]) -> str:
+    """Hash what the tables say of a cousin's parent and of the objects that may come into it; `objects` by scene."""
+    lent = [row for donor in recipe.donors for row in objects[donor.scene_id] if row["object_id"] == donor.object_id]
+    return content_hash(digest_objects(objects[parent]).encode(), digest_objects(lent).encode())
+
+
+def _name_parent(parent: Row) -> str:
+    name = str(parent["name"] or parent["scene_id"])
+    return re.sub(r"\.(json|jpe?g|png|webp)$", "", name)[:200]
