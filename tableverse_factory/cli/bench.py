@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.bench_cousins import bench_cousins
 from tableverse_factory.cli.bench_cpu_time import bench_stages, bench_trajectories
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
 from tableverse_factory.cli.bench_picture import bench_picture
@@ -29,6 +30,7 @@ bench.command("picture")(bench_picture)
 bench.command("placement")(bench_placement)
 bench.command("completion")(bench_completion)
 bench.command("twin")(bench_twin)
+bench.command("cousins")(bench_cousins)
 
 
 Truth = Annotated[

@@ -38,6 +38,7 @@ THEMES: Sequence[tuple[Change, ...]] = (  # each cousin of a scene takes the nex
     (Change.SWAP, Change.MIRROR),
 )
 DONORS_PER_OBJECT = 3
+LEAST_SHAPE_RATIO = 1.02  # between the ratios of two things' sides: below, they may be the same thing
 MAX_SIZE_RATIO = 1.6  # of each side, sorted, of things that may take each other's place
 _SCENE_COLUMNS = ("scene_id", "name", "url", "source", "licence", "family", "status", "shard", "mesh_licences")
 _POSES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
@@ -126,7 +127,7 @@ def _sort_sides(row: Row) -> list[float]:
 def _choose_donors(
     objects: Sequence[Row], stocks: Mapping[tuple[int, str], _Stock], fold: int, rng: np.random.Generator
 ) -> tuple[Donor, ...]:
-    """Choose donors at random for as many objects as a recipe holds, each of another size than the object."""
+    """Choose donors at random for as many objects as a recipe holds, each of another shape than the object."""
     chosen: list[Donor] = []
     for place in rng.permutation(len(objects)).tolist():
         item = objects[place]
@@ -134,10 +135,9 @@ def _choose_donors(
         if stock is None or item["contained_in"] is not None:
             continue
         ratio = stock.sides / np.array(_sort_sides(item))
-        like = np.flatnonzero(
-            (np.maximum(ratio, 1 / ratio).max(axis=1) <= MAX_SIZE_RATIO) & (np.abs(ratio - 1.0).max(axis=1) > 1e-6)
-        )
-        for number in rng.permutation(like)[:DONORS_PER_OBJECT].tolist():
+        like = np.maximum(ratio, 1 / ratio).max(axis=1) <= MAX_SIZE_RATIO
+        other = ratio.max(axis=1) / ratio.min(axis=1) >= LEAST_SHAPE_RATIO
+        for number in rng.permutation(np.flatnonzero(like & other))[:DONORS_PER_OBJECT].tolist():
             donor = stock.rows[number]
             chosen.append(Donor(replaces=item["object_id"], scene_id=donor["scene_id"], object_id=donor["object_id"]))
         if len(chosen) + DONORS_PER_OBJECT > MAX_DONORS:

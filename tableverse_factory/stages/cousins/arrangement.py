@@ -4,6 +4,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import networkx as nx
 import numpy as np
 from jaxtyping import Float64
 
@@ -57,7 +58,7 @@ class Arrangement:
         return self._objects
 
     def list_units(self) -> list[Unit]:
-        """List what can be taken up as one, the order following the ids; each set of things once, by its lowest."""
+        """List what can be taken up as one, whole piles included; each set of things once, by the first of its ids."""
         found: dict[frozenset[str], Unit] = {}
         for name in sorted(self._objects):
             members = self._collect_dependents(name)
@@ -65,6 +66,8 @@ class Arrangement:
             if leaning - {name} or (leaning and members != {name}):
                 continue  # they would lose what else carries them
             found.setdefault(members, Unit(name, members, stands=not leaning))
+        for members in self._list_piles():
+            found.setdefault(members, Unit(min(members), members, stands=True))
         return list(found.values())
 
     def find_supports(self, names: Collection[str]) -> frozenset[str]:
@@ -112,6 +115,13 @@ class Arrangement:
         """Take a thing away on which nothing depends."""
         del self._objects[name], self._solids[name]
         self._depends = frozenset(pair for pair in self._depends if name not in pair)
+
+    def _list_piles(self) -> list[frozenset[str]]:
+        """List the sets of things that depend on one another in the end, by the first of their ids."""
+        graph = nx.Graph()
+        graph.add_nodes_from(self._objects)
+        graph.add_edges_from(self._depends)
+        return sorted((frozenset(pile) for pile in nx.connected_components(graph)), key=min)
 
     def _collect_dependents(self, name: str) -> frozenset[str]:
         members, waiting = {name}, [name]

@@ -1,6 +1,6 @@
 """Changes of an arrangement, drawn at random where there is room: nothing comes into another thing or off the table."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +19,12 @@ SCALES = ((0.8, 0.92), (1.09, 1.25))
 PLACES, HEADINGS = 60, 12  # that are tried for a thing
 EDGE_M = 0.03  # least distance of a moved thing from the table's edge, where the table has no wider margin free
 LIFT_M = 0.0005
+ROUND = 0.06  # greatest difference of the outline's reach in different directions, over the reach
+LEAST_CHANGES = 2
+FILLING = (Change.MOVE, Change.SCALE, Change.TURN)
 LARGEST_ON_OTHERS = 1.15  # sides of a thing over those of the one whose place on another it takes
+_ANGLES = np.arange(16) * (2 * np.pi / 16)
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _MORE = {Change.REMOVE: 0.15, Change.SWAP: 0.5, Change.SCALE: 0.3, Change.MOVE: 0.4, Change.TURN: 0.4}
 """Probability that a change is made to each further unit, besides the first."""
 
@@ -38,14 +43,28 @@ class Draft:
 
     def make(self, change: Change) -> None:
         """Make a change to some units: to at least one, if there is room for it anywhere."""
-        units = [unit for unit in self.arrangement.list_units() if _MAY[change](self, unit)]
+        units = self._list_units(change, set())
         wanted = 1 + int(self.rng.binomial(max(len(units) - 1, 0), _MORE[change]))
         touched: set[str] = set()
-        for place in self.rng.permutation(len(units)).tolist():
-            unit = units[place]
-            if wanted and not unit.members & touched and _MAKE[change](self, unit):
-                touched |= unit.members
-                wanted -= 1
+        while wanted and (unit := self._make_one(change, units)):
+            touched |= unit.members
+            wanted -= 1
+            units = self._list_units(change, touched)  # what lay under the unit may be free now
+
+    def _list_units(self, change: Change, touched: Collection[str]) -> list[Unit]:
+        units = self.arrangement.list_units()
+        return [unit for unit in units if unit.members.isdisjoint(touched) and _MAY[change](self, unit)]
+
+    def _make_one(self, change: Change, units: Sequence[Unit]) -> Unit | None:
+        """Make a change to the first unit, in random order, that has the room; None if there is none."""
+        shuffled = (units[place] for place in self.rng.permutation(len(units)).tolist())
+        return next((unit for unit in shuffled if _MAKE[change](self, unit)), None)
+
+    def fill(self) -> None:
+        """Make further changes until there are as many as make a scene another one, if there is room."""
+        for change in FILLING:
+            if len(self.changes) < LEAST_CHANGES:
+                self.make(change)
 
     def members(self, unit: Unit) -> list[PlacedObject]:
         """The objects of a unit, in the order of the scene."""
@@ -164,8 +183,12 @@ def _format_angle(angle: float) -> str:
     return f"{degrees - 360.0 if degrees > 180.0 else degrees:+.0f}"
 
 
-def _may_turn(draft: Draft, unit: Unit) -> bool:  # noqa: ARG001
-    return unit.stands
+def _may_turn(draft: Draft, unit: Unit) -> bool:
+    """Whether a turn of the unit changes anything: it does not where the outline is round."""
+    points = draft.arrangement.get_points(sorted(unit.members))[:, :2]
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    reach = ((points - middle) @ _DIRECTIONS).max(axis=0)
+    return unit.stands and float(np.ptp(reach)) > ROUND * float(reach.max())
 
 
 def _may_scale(draft: Draft, unit: Unit) -> bool:

@@ -43,6 +43,7 @@ def derive_cousin(
         for change in recipe.changes:
             if change is not Change.MIRROR:
                 draft.make(change)
+        draft.fill()
     except InputError as error:
         return Dropped(error.reason, str(error))
     except GeometryError as error:
