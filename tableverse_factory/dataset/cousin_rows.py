@@ -25,17 +25,17 @@ from tableverse_factory.dataset.families import find_fold
 Row = Mapping[str, Any]
 
 MAX_PER_SCENE = 1000
-THEMES: Sequence[tuple[Change, ...]] = (  # each cousin of a scene takes the next one
+THEMES: Sequence[tuple[Change, ...]] = (  # each cousin of a scene takes the next one; things move in all of them
     (Change.MOVE, Change.TURN),
-    (Change.SWAP, Change.TURN),
-    (Change.SCALE, Change.MOVE),
-    (Change.REMOVE, Change.TURN),
-    (Change.MOVE, Change.MIRROR),
     (Change.SWAP, Change.MOVE),
-    (Change.SCALE, Change.TURN, Change.MIRROR),
+    (Change.SCALE, Change.MOVE),
+    (Change.REMOVE, Change.MOVE),
+    (Change.MOVE, Change.MIRROR),
+    (Change.SWAP, Change.MOVE, Change.TURN),
+    (Change.SCALE, Change.MOVE, Change.MIRROR),
     (Change.REMOVE, Change.SWAP, Change.MOVE),
     (Change.SCALE, Change.MOVE, Change.TURN),
-    (Change.SWAP, Change.MIRROR),
+    (Change.SWAP, Change.MOVE, Change.MIRROR),
 )
 DONORS_PER_OBJECT = 3
 LEAST_SHAPE_RATIO = 1.02  # between the ratios of two things' sides: below, they may be the same thing
