@@ -34,12 +34,16 @@ def bench_cousins(
     rows = [
         (
             *(its.parent, f"{its.done}/{its.of}", f"{100 * its.from_parent_m:.1f}", f"{100 * its.layout_m:.1f}"),
-            *(f"{100 * its.least_layout_m:.1f}", f"{its.relations:.2f}", f"{its.least_relations:.2f}"),
+            *(f"{100 * its.least_layout_m:.1f}", f"{its.relations:.2f}", its.alike),
         )
         for its in score.families
     ]
-    names = ("from parent cm", "apart cm", "least cm", "relations", "least")
-    print_figures(("family", "done", *names), rows, "medians over the family's cousins, and the least of two cousins")
+    names = ("from parent cm", "apart cm", "least cm", "relations", "alike")
+    print_figures(
+        ("family", "done", *names),
+        rows,
+        "medians over the cousins of a family; alike: pairs within 1 cm and 5 % of the relations",
+    )
     print(f"done: {score.done} of {score.of} ({score.done / score.of:.1%})")
     print(f"CPU s of a cousin: {score.cpu_median_s:.2f} median, {score.cpu_p95_s:.2f} p95, {score.cpu_max_s:.2f} most")
     print("changes: " + ", ".join(f"{count} {kind}" for kind, count in score.changes))

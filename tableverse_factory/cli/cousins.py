@@ -33,9 +33,10 @@ def cousins(
     max_calls: options.MaxCalls = None,
     metrics: options.Metrics = None,
 ) -> None:
-    """Make cousins of every finished scene: things swapped, rescaled, turned, moved, removed, scenes mirrored.
+    """Make new scenes of finished ones, by changing what stands where.
 
-    Each is separated, settled, judged and certified like any scene, or dropped with its reason; its row names its
+    Things are swapped for others of their kind, rescaled, turned, moved and removed, and whole scenes mirrored. Each
+    cousin is separated, settled, judged and certified like any scene, or dropped with its reason; its row names its
     parent, its family and what was changed. DEST.parquet keeps the manifest. The same command again goes on. Exit codes
     are those of `build`.
 
@@ -45,6 +46,7 @@ def cousins(
     from tableverse_factory.dataset.cousin_rows import list_cousins
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.sources.manifest import write_manifest
+    from tableverse_factory.stages.curate.lexicon import find_kind
     from workers.api import build
     from workers.driver.signals import StopSignals
 
@@ -52,7 +54,8 @@ def cousins(
     if place == source:
         raise InputError(f"{dest} is the dataset of the parents: give another folder for the cousins")
     manifest = place.parent / f"{place.name}.parquet"
-    write_manifest(manifest, list_cousins(open_dataset(str(source.absolute())), per_scene, seed))
+    rows = list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind)
+    write_manifest(manifest, rows)
     summary = build(
         str(manifest),
         dest,

@@ -7,7 +7,7 @@ Only tables are read. What becomes of the changes is decided where the scene's s
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +47,6 @@ _OBJECT_COLUMNS = (
     *("scene_id", "object_id", "label", "relabel_name", "contained_in", "n_pieces", "mass_kg"),
     *(*_SIDES, *_POSES),
 )
-_TAIL = re.compile(r"\s(with|without|of|in|on|for|from|containing|and)\s.*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +57,16 @@ class _Stock:
     sides: np.ndarray
 
 
-def list_cousins(dataset: Dataset, per_scene: int, seed: int) -> Iterator[ImageRow]:
-    """List the rows of `per_scene` cousins of each finished scene, in the dataset's order.
+def list_cousins(dataset: Dataset, per_scene: int, seed: int, classify: Callable[[str], str]) -> Iterator[ImageRow]:
+    """List the rows of cousins of each finished scene, in the dataset's order.
 
     The same dataset and seed give the same rows, and the cousins of a scene do not depend on how many there are.
+
+    Args:
+        dataset: The parents' dataset.
+        per_scene: Number of cousins of each scene.
+        seed: Of the choice of donors, and of all that is drawn later.
+        classify: Gives the kind of a thing by its name; only things of a kind are swapped.
 
     Raises:
         InputError: if the dataset is not finished, or no scene of it is done.
@@ -74,7 +79,7 @@ def list_cousins(dataset: Dataset, per_scene: int, seed: int) -> Iterator[ImageR
     family_of = {row["scene_id"]: row["family"] or row["scene_id"] for row in done}
     objects: dict[str, list[Row]] = defaultdict(list)
     for item in dataset.objects.to_table(columns=list(_OBJECT_COLUMNS)).to_pylist():
-        objects[item["scene_id"]].append(item)
+        objects[item["scene_id"]].append({**item, "kind": classify(item["relabel_name"] or item["label"])})
     stocks = _stock_objects(objects, family_of)
     for row in done:
         scene_id = row["scene_id"]
@@ -88,12 +93,6 @@ def digest_objects(rows: Iterable[Row]) -> str:
     """Hash what the tables say of objects: ids, labels, sizes and poses. A scene that was built anew differs."""
     values = [[row[name] for name in _OBJECT_COLUMNS] for row in rows]
     return content_hash(json.dumps(values, separators=(",", ":")).encode())
-
-
-def find_kind(name: str) -> str:
-    """Find the noun of a name: `cup` of `blue cup`, `spatula` of `spatula with purple head`."""
-    words = re.findall(r"[^\W\d_]+", _TAIL.sub("", name.lower()))
-    return words[-1] if words else ""
 
 
 def _check_finished(dataset: Dataset) -> None:
@@ -116,7 +115,7 @@ def _stock_objects(
     for scene_id, family in family_of.items():
         for item in objects[scene_id]:
             if item["contained_in"] is None:
-                found[find_fold(family), find_kind(item["relabel_name"] or item["label"])].append(item)
+                found[find_fold(family), item["kind"]].append(item)
     return {key: _Stock(rows, np.array([_sort_sides(row) for row in rows])) for key, rows in found.items()}
 
 
@@ -131,7 +130,7 @@ def _choose_donors(
     chosen: list[Donor] = []
     for place in rng.permutation(len(objects)).tolist():
         item = objects[place]
-        stock = stocks.get((fold, find_kind(item["relabel_name"] or item["label"])))
+        stock = stocks.get((fold, item["kind"]))
         if stock is None or item["contained_in"] is not None:
             continue
         ratio = stock.sides / np.array(_sort_sides(item))

@@ -22,6 +22,7 @@ from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.relations.relations import SIDES, compute_body_features, relation_holds
 from tableverse_factory.stages.cousins.parent import read_parent
 
+SAME_LAYOUT_M, SAME_RELATIONS = 0.01, 0.05
 COMPARED = (*SIDES, Relation.NEXT_TO, Relation.ON, Relation.IN)
 
 Fact = tuple[Relation, str, str]
@@ -46,7 +47,7 @@ class FamilyScore:
     layout_m: float  # median layout distance of two cousins [m]
     least_layout_m: float  # that of the nearest two
     relations: float  # median share of relations in which two cousins differ
-    least_relations: float
+    alike: int  # pairs of cousins that differ by less than `SAME_LAYOUT_M` and `SAME_RELATIONS`
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ def _compare_family(out: str, family: tuple[tuple[str, str], Sequence[Mapping[st
         layout_m=_reduce(np.median, apart),
         least_layout_m=_reduce(np.min, apart),
         relations=_reduce(np.median, other),
-        least_relations=_reduce(np.min, other),
+        alike=sum(a < SAME_LAYOUT_M and r < SAME_RELATIONS for a, r in zip(apart, other, strict=True)),
     )
 
 

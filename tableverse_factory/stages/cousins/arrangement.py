@@ -12,6 +12,7 @@ from schemas.geometry import ConvexPieces, Pose, Vector3
 from schemas.objects import PlacedObject, Table
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.geometry.collision.solids import Solids, find_near_pieces, place_pieces
+from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
     multiply_quaternions,
     normalize_quaternion,
@@ -101,6 +102,15 @@ class Arrangement:
         half = self.table.half_size_xy - margin_m
         region = Slab(self.table.center_xy, half, self.table.yaw, self.table.color)
         return all(bool(region.holds(place_object(item).points).all()) for item in changed)
+
+    def is_near(self, changed: Sequence[PlacedObject], reach_m: float) -> bool:
+        """Whether the box of changed things is within `reach_m` [m] of that of another, from above, if there is any."""
+        names = {item.object_id for item in changed}
+        points = np.concatenate([place_object(item).points for item in changed])
+        low, high = aabb(points)
+        others = [aabb(solids.points) for name, solids in self._solids.items() if name not in names]
+        gaps = (np.maximum(np.maximum(low - box[1], box[0] - high)[:2], 0.0) for box in others)
+        return not others or min(float(np.linalg.norm(gap)) for gap in gaps) <= reach_m
 
     def replace(self, changed: Iterable[PlacedObject], stands: bool = False) -> None:
         """Put things at their new poses; those that now stand on the table depend on no others."""

@@ -14,6 +14,7 @@ from tableverse_factory.stages.cousins.arrangement import Arrangement, Unit, mov
 
 MOVE_GAP_M, TURN_GAP_M = 0.005, 0.001  # least distance to other things, of what is put elsewhere, and of what stays
 LEAST_MOVE_M = 0.06
+NEAR_M = 0.09  # greatest distance of what is moved to another thing: scenes whose groups lie further apart are unusable
 LEAST_TURN_RAD = float(np.deg2rad(25.0))
 SCALES = ((0.8, 0.92), (1.09, 1.25))
 PLACES, HEADINGS = 60, 12  # that are tried for a thing
@@ -150,24 +151,25 @@ def _move(draft: Draft, unit: Unit) -> bool:
     """Put a unit elsewhere on the table, in any heading: also what stood on another thing."""
     members, pivot = draft.members(unit), _find_foot(draft, unit)
     down = np.array([0.0, 0.0, 0.0 if unit.stands else -pivot[2]])
-    for spot, margin in _list_places(draft, pivot):
+    for spot, margin in _list_places(draft, unit, pivot):
         angle = float(draft.rng.uniform(-np.pi, np.pi))
         moved = [move_object(item, pivot, spot + down, angle) for item in members]
-        if draft.arrangement.holds(moved, margin) and draft.arrangement.fits(moved, MOVE_GAP_M):
+        near = draft.arrangement.holds(moved, margin) and draft.arrangement.is_near(moved, NEAR_M)
+        if near and draft.arrangement.fits(moved, MOVE_GAP_M):
             draft.arrangement.replace(moved, stands=not unit.stands)
             draft.record(Change.MOVE, unit, f"{spot[0]:+.3f},{spot[1]:+.3f}")
             return True
     return False
 
 
-def _list_places(draft: Draft, pivot: Vector3) -> Iterator[tuple[Vector3, float]]:
-    """List offsets to random places over the table, with the margin to its edge that must be kept there [m]."""
-    table = draft.arrangement.table
-    c, s = np.cos(table.yaw), np.sin(table.yaw)
-    axes = np.array([[c, s], [-s, c]])
+def _list_places(draft: Draft, unit: Unit, pivot: Vector3) -> Iterator[tuple[Vector3, float]]:
+    """List offsets to random places around the other things, with the margin to keep from the table's edge [m]."""
+    others = [name for name in draft.arrangement.objects if name not in unit.members]
+    low, high = aabb(draft.arrangement.get_points(others or sorted(unit.members))[:, :2])
+    own_low, own_high = aabb(draft.arrangement.get_points(sorted(unit.members))[:, :2])
+    reach = NEAR_M + (own_high - own_low).max() / 2
     for number in range(2 * PLACES):
-        along = draft.rng.uniform(-1.0, 1.0, 2) * table.half_size_xy
-        offset = np.array([*(along @ axes + table.center_xy - pivot[:2]), 0.0])
+        offset = np.array([*(draft.rng.uniform(low - reach, high + reach) - pivot[:2]), 0.0])
         if np.linalg.norm(offset) >= LEAST_MOVE_M:
             yield offset, OBJECT_MARGIN_M if number < PLACES else EDGE_M
 

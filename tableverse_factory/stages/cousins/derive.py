@@ -32,10 +32,12 @@ def derive_cousin(
     """Change a scene of a dataset; the later stages separate, settle, judge and certify it like any other layout.
 
     Drops: `content_changed` if the dataset is not the one that the manifest saw, `no_room` if nothing could be changed,
-    and the reason why the parent cannot be read.
+    `bad_recipe` if the row has none, and the reason why the parent cannot be read.
     """
+    if item.rejected:
+        return Dropped(item.rejected, item.rejected_detail)
     try:
-        recipe = parse_recipe(item.recipe)
+        recipe = _read_recipe(item)
         dataset = _open(item.uri)
         _check_content(item, recipe, dataset)
         parent = read_parent(dataset.scene(item.parent), config.observe)
@@ -57,6 +59,15 @@ def derive_cousin(
     return Done(
         PlacedObjects(item.scene_id, parent.table, objects, perception=parent.perception, changes=tuple(draft.changes))
     )
+
+
+def _read_recipe(item: ImageRow) -> Recipe:
+    if not item.parent:
+        raise InputError("a cousin's row names its parent: `tableverse cousins` writes such rows", "bad_recipe")
+    try:
+        return parse_recipe(item.recipe)
+    except ValueError as error:
+        raise InputError(f"{error}: `tableverse cousins` writes recipes", "bad_recipe") from error
 
 
 def _check_content(item: ImageRow, recipe: Recipe, dataset: Dataset) -> None:

@@ -129,6 +129,12 @@ def classify_label(label: str) -> str:
     return "unknown"
 
 
+def find_kind(label: str) -> str:
+    """Find the kind of a thing: one of `KINDS`, or the head noun of a label that is in none."""
+    kind = classify_label(label)
+    return find_head_noun(label) if kind == "unknown" else kind
+
+
 def is_generic(label: str) -> bool:
     """Whether the label names nothing in particular."""
     return find_head_noun(label) in GENERIC
