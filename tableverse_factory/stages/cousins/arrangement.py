@@ -64,7 +64,7 @@ class Arrangement:
         for name in sorted(self._objects):
             members = self._collect_dependents(name)
             leaning = {of for of, on in self._depends if of in members and on not in members}
-            if leaning - {name} or (leaning and members != {name}):
+            if leaning - {name}:
                 continue  # they would lose what else carries them
             found.setdefault(members, Unit(name, members, stands=not leaning))
         for members in self._list_piles():
@@ -81,8 +81,7 @@ class Arrangement:
 
     def stands_alone(self, item: PlacedObject) -> bool:
         """Whether a thing would stand in its orientation on a table."""
-        assert item.pieces is not None  # noqa: S101 - of a parent
-        return _stands_alone(item.pieces, item, place_object(item))
+        return _stands_alone(item, place_object(item))
 
     def fits(self, changed: Sequence[PlacedObject], gap_m: float, carriers: Collection[str] = ()) -> bool:
         """Whether changed things keep `gap_m` [m] from all others; carriers may touch them."""
@@ -145,9 +144,13 @@ class Arrangement:
 
 def place_object(item: PlacedObject) -> Solids:
     """Place the pieces of an object in the table frame."""
+    return place_pieces(_get_pieces(item), item.pose, item.scale)
+
+
+def _get_pieces(item: PlacedObject) -> ConvexPieces:
     if item.pieces is None:
         raise InputError(f"{item.object_id} has no convex pieces", "bad_scene")
-    return place_pieces(item.pieces, item.pose, item.scale)
+    return item.pieces
 
 
 def move_object(item: PlacedObject, pivot: Vector3, offset: Vector3, angle: float = 0.0) -> PlacedObject:
@@ -168,15 +171,15 @@ def scale_object(item: PlacedObject, pivot: Vector3, factor: float) -> PlacedObj
 def _find_dependencies(objects: Mapping[str, PlacedObject], solids: Mapping[str, Solids]) -> Dependencies:
     """Find pairs (thing, other) such that the thing may fall without the other.
 
-    Those are what carries it, what it is in, and, for one that would not stand by itself, all that it touches.
+    Those are what carries it, what it is in, and, for one that would not stand there by itself, all that it touches.
     """
     names = list(objects)
     pairs = {(names[i], names[j]) for i, j in find_piece_support(list(solids.values()))}
     pairs |= {(name, item.contained_in) for name, item in objects.items() if item.contained_in is not None}
+    carried = {thing for thing, _ in pairs}
     alone = {
-        name: _is_on_table(solids[name]) and _stands_alone(item.pieces, item, solids[name])
+        name: _stands_alone(item, solids[name]) and (name in carried or solids[name].points[:, 2].min() < BASE_M)
         for name, item in objects.items()
-        if item.pieces is not None
     }
     for a, b in combinations(names, 2):
         if (alone[a] and alone[b]) or not any(find_near_pieces(solids[a], solids[b], TOUCH_M)):
@@ -185,13 +188,9 @@ def _find_dependencies(objects: Mapping[str, PlacedObject], solids: Mapping[str,
     return frozenset((thing, other) for thing, other in pairs if not (alone[thing] and (other, thing) in pairs))
 
 
-def _is_on_table(solids: Solids) -> bool:
-    return float(solids.points[:, 2].min()) < BASE_M
-
-
-def _stands_alone(pieces: ConvexPieces, item: PlacedObject, solids: Solids) -> bool:
+def _stands_alone(item: PlacedObject, solids: Solids) -> bool:
     """Whether the centre of mass is over what is lowest, as if it stood on a table."""
-    volumes, centers = compute_volumes_and_centers(pieces.hulls, _LEAST_PIECE_M3)
+    volumes, centers = compute_volumes_and_centers(_get_pieces(item).hulls, _LEAST_PIECE_M3)
     own = (volumes @ centers) / volumes.sum()
     middle = item.scale * rotation_matrix(item.pose.quaternion_wxyz) @ own + item.pose.position
     points = solids.points
