@@ -1,0 +1,194 @@
+"""Cousins: each accounted for, with its parent and changes in its row, and the same bytes however they are built."""
+
+import json
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from schemas.cousins import Change, parse_recipe
+from schemas.manifest import SceneKind
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.cousin_rows import THEMES, list_cousins
+from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.dataset.families import FOLDS, find_fold
+from tableverse_factory.dataset.shard_plan import read_plan
+from tableverse_factory.evaluation.bench.cousins import measure_cousins
+from tableverse_factory.evaluation.verify import verify_scenes
+from tableverse_factory.rebuild import manifest_from_dataset
+from tableverse_factory.run_record import read_run
+from tableverse_factory.sources.manifest import write_manifest
+from tableverse_factory.stages.curate.lexicon import find_kind
+from tests.helpers.builds import Silent, digests
+from tests.helpers.cousin_parents import SCENES, build_parents, make_request
+from workers.run import run_build
+
+pytestmark = pytest.mark.heavy
+PER_SCENE = 4
+
+
+def plan(parents: Path, per_scene: int = PER_SCENE, seed: int = 0) -> list:
+    return list(list_cousins(open_dataset(parents), per_scene, seed, find_kind))
+
+
+def build(folder: Path, name: str, **changes: object) -> Path:
+    run_build(make_request(folder / "cousins.parquet", folder / name, **changes), Silent())
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A folder with the dataset `out`, the manifest of its cousins, and `cousins` built from it."""
+    folder = tmp_path_factory.mktemp("made")
+    write_manifest(folder / "cousins.parquet", plan(build_parents(folder)))
+    build(folder, "cousins")
+    return folder
+
+
+def rows_of(out: Path) -> list[dict]:
+    return open_dataset(out).scenes.to_table().to_pylist()
+
+
+def test_every_scene_has_its_cousins_and_every_cousin_its_row(made):
+    parents, rows = rows_of(made / "out"), rows_of(made / "cousins")
+    assert len(parents) == len(SCENES)
+    assert len(rows) == PER_SCENE * len(parents)
+    assert {row["status"] for row in rows} <= {"done", "dropped"}
+    assert sum(row["status"] == "done" for row in rows) >= 0.9 * len(rows)
+    for row in rows:
+        (parent,) = (its for its in parents if its["scene_id"] == row["parent"])
+        assert row["kind"] == SceneKind.COUSIN.value
+        assert (row["licence"], row["source"]) == (parent["licence"], parent["source"])
+        assert parse_recipe(row["recipe"]).changes
+        assert bool(row["changes"]) == (row["status"] == "done")
+        assert row["reason"] or row["status"] == "done"
+
+
+def test_families_stay_together_in_every_split(made):
+    """A family is one fold, and things are borrowed within the fold."""
+    fold_of = {row["scene_id"]: row["fold"] for row in rows_of(made / "out")}
+    for row in rows_of(made / "out"):
+        assert (row["family"], row["parent"], row["changes"]) == (row["scene_id"], None, None)
+    for row in rows_of(made / "cousins"):
+        assert row["family"] == row["parent"]
+        assert row["fold"] == fold_of[row["parent"]] == find_fold(row["family"])
+        donors = parse_recipe(row["recipe"]).donors
+        assert {fold_of[donor.scene_id] for donor in donors} <= {row["fold"]}
+
+
+def test_folds_divide_families_evenly():
+    counts = np.bincount([find_fold(f"scene-{index}") for index in range(5000)], minlength=FOLDS)
+    assert len(counts) == FOLDS
+    assert counts.min() > 900
+
+
+def test_cousins_of_cousins_are_of_the_same_family(made):
+    done = {row["scene_id"]: row["family"] for row in rows_of(made / "cousins") if row["status"] == "done"}
+    grandchildren = plan(made / "cousins", 1)
+    assert {row.parent for row in grandchildren} == set(done)
+    assert all(row.family == done[row.parent] for row in grandchildren)
+
+
+def test_the_manifest_depends_on_dataset_and_seed_alone(made):
+    first = plan(made / "out")
+    assert first == plan(made / "out")
+    assert [row for row in plan(made / "out", 2 * PER_SCENE) if row in first] == first, "more cousins, the same first"
+    assert not {row.scene_id for row in first} & {row.scene_id for row in plan(made / "out", seed=1)}
+    asked = {parse_recipe(row.recipe).changes for row in first}
+    assert asked <= {*THEMES, (Change.TURN, Change.MOVE)}, "what has no donors is turned instead"
+    assert all(Change.MOVE in changes for changes in asked)
+
+
+def test_changes_are_what_differs_from_the_parent(made):
+    """Ids stay, so that what a row says can be read off the objects."""
+    parents, cousins = open_dataset(made / "out"), open_dataset(made / "cousins")
+    for row in rows_of(made / "cousins"):
+        if row["status"] != "done":
+            continue
+        before = {item["object_id"]: item for item in parents.scene(row["parent"]).object_rows()}
+        after = {item["object_id"]: item for item in cousins.scene(row["scene_id"]).object_rows()}
+        said = [line.partition("=")[0].partition(":") for line in row["changes"]]
+        assert set(before) - set(after) == {name for change, _, name in said if change == "remove"}
+        assert set(after) <= set(before)
+        if row["name"].startswith("snack") and "mirror" not in row["changes"]:  # where nothing carries another thing
+            for name in after.keys() - {name for *_, name in said}:
+                moved = np.hypot(*(after[name][key] - before[name][key] for key in ("x_m", "y_m")))
+                assert moved < 0.01, f"{row['scene_id']}: {name} moved, and the row says nothing of it"
+        scaled = {name for change, _, name in said if change == "scale"}
+        for name in scaled:
+            assert after[name]["size_z_m"] != pytest.approx(before[name]["size_z_m"], rel=0.05)
+
+
+def test_cousins_keep_the_colours_of_their_parents_and_load_in_plain_mujoco(made, tmp_path):
+    cousins = open_dataset(made / "cousins")
+    row = next(row for row in rows_of(made / "cousins") if row["status"] == "done" and not row["recipe"].count("swap"))
+    scene, parent = cousins.scene(row["scene_id"]), open_dataset(made / "out").scene(row["parent"])
+    names = {name for name in scene.files() if name.startswith("assets/obj_") and name.endswith(".png")}
+    assert names
+    assert all(scene.files()[name] == parent.files()[name] for name in names)
+    scene.extract(tmp_path / "scene")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene" / "scene.xml"))
+    assert model.nbody == row["n_objects"] + 2
+
+
+def test_the_certificates_hold(made):
+    audits = list(verify_scenes(str(made / "cousins"), 1))
+    assert audits
+    assert [audit.problems for audit in audits if audit.problems] == []
+
+
+def test_stopped_and_gone_on_with_gives_the_same_bytes(made):
+    for limit in (2, 5, None):
+        build(made, "in-steps", limit=limit)
+    assert digests(made / "in-steps") == digests(made / "cousins")
+    summary = run_build(make_request(made / "cousins.parquet", made / "in-steps"), Silent())
+    assert summary.tally.before == summary.tally.total
+
+
+def test_rows_are_restored_from_the_dataset(made):
+    """As `tableverse trajectories` does, which has no manifest."""
+    out = made / "cousins"
+    assert list(manifest_from_dataset(out, read_run(out / "run.json"), read_plan(out / "plan.parquet"))) == plan(
+        made / "out"
+    )
+
+
+def test_a_dataset_that_was_built_anew_is_noticed(made, tmp_path):
+    """The rows name what they were planned with."""
+    shutil.copytree(made / "out", tmp_path / "out")
+    rows = [row.model_copy(update={"uri": str(tmp_path / "out")}) for row in plan(made / "out", 1)]
+    wrong = [row.model_copy(update={"content_sha256": "0" * 64}) for row in rows]
+    write_manifest(tmp_path / "cousins.parquet", wrong)
+    assert {row["reason"] for row in rows_of(build(tmp_path, "dropped"))} == {"content_changed"}
+
+
+def test_unfinished_datasets_have_no_cousins(made, tmp_path):
+    shutil.copytree(made / "out", tmp_path / "out")
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    run["manifest"]["scenes"] += 1
+    (tmp_path / "out" / "run.json").write_text(json.dumps(run))
+    with pytest.raises(InputError, match="is not finished: 3 of 4 scenes"):
+        plan(tmp_path / "out")
+
+
+def test_cousins_of_a_family_differ_and_the_bench_says_so(made):
+    score = measure_cousins(str(made / "cousins"), None, 1)
+    assert score.of == PER_SCENE * len(SCENES)
+    assert {family.parent for family in score.families} == {row["scene_id"] for row in rows_of(made / "out")}
+    assert all(family.layout_m > 0.01 and family.from_parent_m > 0.01 for family in score.families)
+    assert sum(family.alike for family in score.families) == 0
+    assert {kind for kind, _ in score.changes} <= {change.value for change in Change}
+
+
+def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
+    code, text, errors = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 2, "--executor", "local")
+    assert code == 0, errors
+    assert "of 6 scenes" in text
+    assert (tmp_path / "dest.parquet").is_file()
+    code, text, _ = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 2, "--executor", "local")
+    assert "nothing was left to do" in text
+    code, _, errors = run("cousins", made / "out", made / "out", "--executor", "local")
+    assert code == 1
+    assert "is the dataset of the parents" in errors
