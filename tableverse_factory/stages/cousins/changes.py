@@ -1,6 +1,6 @@
 """Changes of an arrangement, drawn at random where there is room: nothing comes into another thing or off the table."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ EDGE_M = 0.03  # least distance of a moved thing from the table's edge, where th
 LIFT_M = 0.0005
 ROUND = 0.06  # greatest difference of the outline's reach in different directions, over the reach
 LEAST_CHANGES = 2
+LEAST_LEFT = 2  # things of a scene that none is taken from
 FILLING = (Change.MOVE, Change.SCALE, Change.TURN)
 LARGEST_ON_OTHERS = 1.15  # sides of a thing over those of the one whose place on another it takes
 _ANGLES = np.arange(16) * (2 * np.pi / 16)
@@ -41,20 +42,21 @@ class Draft:
     rng: np.random.Generator
     donors: Mapping[str, Sequence[tuple[str, Callable[[], PlacedObject]]]]
     changes: list[str] = field(default_factory=list)
+    _touched: dict[Change, set[str]] = field(default_factory=lambda: {change: set() for change in Change})
 
     def make(self, change: Change) -> None:
         """Make a change to some units: to at least one, if there is room for it anywhere."""
-        units = self._list_units(change, set())
+        units = self._list_units(change)
         wanted = 1 + int(self.rng.binomial(max(len(units) - 1, 0), _MORE[change]))
-        touched: set[str] = set()
         while wanted and (unit := self._make_one(change, units)):
-            touched |= unit.members
+            self._touched[change] |= unit.members
             wanted -= 1
-            units = self._list_units(change, touched)  # what lay under the unit may be free now
+            units = self._list_units(change)  # what lay under the unit may be free now
 
-    def _list_units(self, change: Change, touched: Collection[str]) -> list[Unit]:
-        units = self.arrangement.list_units()
-        return [unit for unit in units if unit.members.isdisjoint(touched) and _MAY[change](self, unit)]
+    def _list_units(self, change: Change) -> list[Unit]:
+        """List the units to which a change can be made, and was not made yet."""
+        units = [unit for unit in self.arrangement.list_units() if unit.members.isdisjoint(self._touched[change])]
+        return [unit for unit in units if _MAY[change](self, unit)]
 
     def _make_one(self, change: Change, units: Sequence[Unit]) -> Unit | None:
         """Make a change to the first unit, in random order, that has the room; None if there is none."""
@@ -72,17 +74,17 @@ class Draft:
         return [item for name, item in self.arrangement.objects.items() if name in unit.members]
 
     def record(self, change: Change, unit: Unit, value: str = "") -> None:
-        """Write a change down."""
-        self.changes.append(f"{change.value}:{unit.root}" + (f"={value}" if value else ""))
+        """Write a change down, with all things that it was made to."""
+        names = "+".join((unit.root, *sorted(unit.members - {unit.root})))
+        self.changes.append(f"{change.value}:{names}" + (f"={value}" if value else ""))
 
 
 def _may_remove(draft: Draft, unit: Unit) -> bool:
-    return len(unit.members) == 1 and len(draft.arrangement.objects) > 2
+    """Whether nothing depends on a thing, and enough others are left."""
+    return len(unit.members) == 1 and len(draft.arrangement.objects) > LEAST_LEFT
 
 
 def _remove(draft: Draft, unit: Unit) -> bool:
-    if len(draft.arrangement.objects) <= 2:
-        return False
     draft.arrangement.remove(unit.root)
     draft.record(Change.REMOVE, unit)
     return True

@@ -25,8 +25,10 @@ from tableverse_factory.viz.destination import (
 from tableverse_factory.viz.funnel import compute_funnel
 from tableverse_factory.viz.gallery.drawing import DrawingOptions, load_drawing, make_options
 from tableverse_factory.viz.gallery.pages import Site, make_lost_name, make_page_name
+from tableverse_factory.viz.gallery.pictures import name_pictures
 from tableverse_factory.viz.gallery.records import Records, SceneRecord, make_charts, read_records
 from tableverse_factory.viz.gallery.scene import (
+    Relative,
     SceneCard,
     SceneJob,
     close_datasets,
@@ -40,8 +42,14 @@ PAGE_SIZE = 24
 
 DRAW_ALL_LIMIT, FILMS_PER_SCENE = 60, 6  # all scenes up to this number are drawn, some 4 CPU s each, a film 3
 SAMPLE_SIZE = 6  # of more scenes
+MOST_RELATIVES = 24  # of a family on the page of each of its scenes
 
-STAGES = ("manifest", "read_layout", *(stage.name for stage in pipeline.STAGES))  # stages of the funnel, in order
+STAGES = (
+    "manifest",
+    "read_layout",
+    "derive_cousin",
+    *(stage.name for stage in pipeline.STAGES),
+)  # stages of the funnel, in order
 
 _STATIC = ("gallery.css", "gallery.js")
 _RENEWAL_S = 10.0  # least time between two indexes of what is drawn so far
@@ -97,10 +105,31 @@ def write_gallery(
 
 def _list_jobs(site: Site, done: Sequence[SceneRecord]) -> list[SceneJob]:
     ids = ["", *(scene.scene_id for scene in done), ""]
+    families = _list_families(site, done)
     return [
-        SceneJob(scene, position < site.n_rendered, ids[position], ids[position + 2], position // PAGE_SIZE + 1)
+        SceneJob(
+            scene,
+            position < site.n_rendered,
+            ids[position],
+            ids[position + 2],
+            position // PAGE_SIZE + 1,
+            families.get(scene.row["family"] or "", ()),
+        )
         for position, scene in enumerate(done)
     ]
+
+
+def _list_families(site: Site, done: Sequence[SceneRecord]) -> dict[str, tuple[Relative, ...]]:
+    """List the cousins of each family that has any, in the order of the dataset, at most `MOST_RELATIVES`."""
+    families: dict[str, tuple[Relative, ...]] = {}
+    for position, scene in enumerate(done):
+        known = families.get(scene.row["family"] or "", ())
+        if scene.row["parent"] is not None and len(known) < MOST_RELATIVES:
+            kind = "front" if position < site.n_rendered else "sketch"
+            picture = name_pictures(scene.scene_id, [kind])[kind]
+            its = Relative(scene.scene_id, scene.title, picture, tuple(scene.row["changes"] or ()))
+            families[scene.row["family"]] = (*known, its)
+    return families
 
 
 def _draw_scenes(

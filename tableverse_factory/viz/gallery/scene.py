@@ -15,6 +15,16 @@ from tableverse_factory.viz.gallery.records import SceneFacts, SceneRecord
 
 
 @dataclass(frozen=True, slots=True)
+class Relative:
+    """A scene of the same family, side by side with others on their pages."""
+
+    scene_id: str
+    title: str
+    picture: str  # name of its small picture, without suffix
+    changes: tuple[str, ...]  # of its parent
+
+
+@dataclass(frozen=True, slots=True)
 class SceneJob:
     """A scene to write."""
 
@@ -23,6 +33,7 @@ class SceneJob:
     before: str  # id of the previous scene; empty for the first
     after: str  # id of the next scene; empty for the last
     page: int
+    family: tuple[Relative, ...] = ()  # of a cousin, itself included
 
 
 @dataclass(frozen=True, slots=True)
