@@ -168,15 +168,35 @@ def test_the_same_seed_makes_the_same_changes_and_another_others():
     assert lines[0] == lines[1] != lines[2]
 
 
-def test_a_mirror_image_is_one():
-    """Every vertex lands on its image, faces look outwards, and twice gives the scene back."""
-    item = thing("can", SIDES["can"], PLACES["can"])
-    tilted = replace(item, scale=1.2, pose=Pose(item.pose.position, np.array([0.5, 0.5, -0.5, 0.5])))
-    image = mirror_object(tilted, TABLE)
+def image_of(points):
     axes = rotation_matrix(quaternion_about_z(TABLE.yaw))
     middle = np.array([*TABLE.center_xy, 0.0])
-    before, after = (place_object(its).points for its in (tilted, image))
-    assert after == pytest.approx((before - middle) @ (axes @ np.diag([-1.0, 1.0, 1.0]) @ axes.T) + middle, abs=1e-12)
-    assert compute_signed_volume(image.mesh) == pytest.approx(compute_signed_volume(tilted.mesh))
+    return (points - middle) @ (axes @ np.diag([-1.0, 1.0, 1.0]) @ axes.T) + middle
+
+
+def test_a_mirror_image_is_one():
+    """Every vertex lands on its image, faces look outwards, and twice gives the scene back."""
+    mesh = from_trimesh(trimesh.convex.convex_hull([[0, 0, 0], [0.1, 0, 0], [0, 0.06, 0], [0.02, 0.01, 0.08]]))
+    item = thing("wedge", (0.1, 0.1, 0.1), (0.2, 0.1, 0.0))
+    item = replace(item, mesh=mesh, scale=1.2, pieces=ConvexPieces((mesh,), 1.0, 0.0, "convex"))
+    image = mirror_object(item, TABLE)
+    assert place_object(image).points == pytest.approx(image_of(place_object(item).points), abs=1e-12)
+    assert compute_signed_volume(image.mesh) == pytest.approx(compute_signed_volume(mesh))
     again = mirror_object(image, TABLE)
-    assert place_object(again).points == pytest.approx(before, abs=1e-12)
+    assert place_object(again).points == pytest.approx(place_object(item).points, abs=1e-12)
+
+
+def test_what_is_symmetric_keeps_its_mesh_so_that_print_stays_legible():
+    mesh = box(0.2, 0.03, 0.28)
+    mesh = replace(mesh, vertices=mesh.vertices + np.array([0.02, 0.05, 0.01]))
+    item = thing("book", (0.1, 0.1, 0.1), (0.2, 0.1, 0.13))
+    item = replace(item, mesh=mesh, scale=0.9, pieces=ConvexPieces((mesh,), 1.0, 0.0, "convex"))
+    image = mirror_object(item, TABLE)
+    assert image.mesh is mesh
+    expected, found = (
+        np.unique(np.round(its, 9), axis=0) for its in (image_of(place_object(item).points), place_object(image).points)
+    )
+    assert found == pytest.approx(expected, abs=1e-9), "the same corners, others of its own"
+    before, after = (rotation_matrix(its.pose.quaternion_wxyz) for its in (item, image))
+    assert after[:, 2] == pytest.approx(before[:, 2]), "it stands upright"
+    assert after[:, 1] == pytest.approx(image_of(before[:, 1][None])[0] - image_of(np.zeros((1, 3)))[0])
