@@ -31,7 +31,7 @@ SCENES = pa.schema(
         ("recipe", pa.string()),  # what was planned to change, of the manifest
         ("changes", pa.list_(pa.string())),  # what was changed; null unless done
         ("family", pa.string()),  # the scene itself, or the first ancestor of a cousin
-        ("fold", pa.int32()),  # of the family: one of dataset.families.FOLDS
+        ("split", pa.string()),  # train | validation | test, of the family
         ("scale_source", pa.string()),  # sensor | estimated | measured | given
         ("scale_sigma", pa.float64()),  # relative standard deviation; null for layouts, and where nothing tells it
         ("scale_deviation", pa.float64()),  # of a known length from the estimate, in standard deviations; or null

@@ -9,8 +9,8 @@ if TYPE_CHECKING:
     from tableverse_factory.dataset.dataset import Dataset, open_dataset
     from tableverse_factory.dataset.scene import Scene
     from tableverse_factory.delivery.learning.attach import attach_scene, find_unfit_settings
-    from tableverse_factory.delivery.learning.dm_control import attach_to_dm_control
     from tableverse_factory.delivery.learning.dataset_environment import DatasetEnv
+    from tableverse_factory.delivery.learning.dm_control import attach_to_dm_control
     from tableverse_factory.delivery.learning.environment import TableEnv
     from tableverse_factory.delivery.learning.grid import SceneGrid, build_scene_grid
     from tableverse_factory.delivery.learning.loader import SceneDataset

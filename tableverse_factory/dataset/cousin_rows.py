@@ -20,7 +20,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.text import pluralize
 from tableverse_factory.dataset.dataset import Dataset
-from tableverse_factory.dataset.families import find_fold
+from tableverse_factory.dataset.splits import find_split
 
 Row = Mapping[str, Any]
 
@@ -51,7 +51,7 @@ _OBJECT_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class _Stock:
-    """Objects of a fold by kind, with their sides in ascending order [m]. Shape (n, 3)."""
+    """Objects of a split by kind, with their sides in ascending order [m]. Shape (n, 3)."""
 
     rows: Sequence[Row]
     sides: np.ndarray
@@ -85,7 +85,7 @@ def list_cousins(dataset: Dataset, per_scene: int, seed: int, classify: Callable
         scene_id = row["scene_id"]
         for index in range(per_scene):
             rng = make_rng(seed, scene_id, f"cousin {index}")
-            donors = _choose_donors(objects[scene_id], stocks, find_fold(family_of[scene_id]), rng)
+            donors = _choose_donors(objects[scene_id], stocks, find_split(family_of[scene_id]), rng)
             yield _make_row(dataset.path, row, family_of[scene_id], index, donors, objects, seed)
 
 
@@ -109,13 +109,13 @@ def _check_finished(dataset: Dataset) -> None:
 
 def _stock_objects(
     objects: Mapping[str, Sequence[Row]], family_of: Mapping[str, str]
-) -> Mapping[tuple[int, str], _Stock]:
-    """Sort what stands freely by fold and kind."""
-    found: dict[tuple[int, str], list[Row]] = defaultdict(list)
+) -> Mapping[tuple[str, str], _Stock]:
+    """Sort what stands freely by split and kind."""
+    found: dict[tuple[str, str], list[Row]] = defaultdict(list)
     for scene_id, family in family_of.items():
         for item in objects[scene_id]:
             if item["contained_in"] is None:
-                found[find_fold(family), item["kind"]].append(item)
+                found[find_split(family), item["kind"]].append(item)
     return {key: _Stock(rows, np.array([_sort_sides(row) for row in rows])) for key, rows in found.items()}
 
 
@@ -124,13 +124,13 @@ def _sort_sides(row: Row) -> list[float]:
 
 
 def _choose_donors(
-    objects: Sequence[Row], stocks: Mapping[tuple[int, str], _Stock], fold: int, rng: np.random.Generator
+    objects: Sequence[Row], stocks: Mapping[tuple[str, str], _Stock], split: str, rng: np.random.Generator
 ) -> tuple[Donor, ...]:
     """Choose donors at random for as many objects as a recipe holds, each of another shape than the object."""
     chosen: list[Donor] = []
     for place in rng.permutation(len(objects)).tolist():
         item = objects[place]
-        stock = stocks.get((fold, item["kind"]))
+        stock = stocks.get((split, item["kind"]))
         if stock is None or item["contained_in"] is not None:
             continue
         ratio = stock.sides / np.array(_sort_sides(item))

@@ -3,10 +3,10 @@
 from typing import Any
 
 from schemas.work import SceneResult
-from tableverse_factory.dataset.families import find_fold
 from tableverse_factory.dataset.licences import scene_license
 from tableverse_factory.dataset.model_costs import make_cost_columns
 from tableverse_factory.dataset.parts import SceneRows
+from tableverse_factory.dataset.splits import find_split
 
 _OF_MANIFEST = ("name", "url", "source", "licence", "content_sha256", "known_length", "parent", "recipe")
 
@@ -32,7 +32,7 @@ def complete_rows(result: SceneResult, own: SceneRows | None, shard: int, place:
         "kind": row.kind.value,
         "uri": row.uri,
         "family": family,
-        "fold": find_fold(family),
+        "split": find_split(family),
         "licence_verdict": scene_license({"licence": row.licence, "mesh_licences": scene.get("mesh_licences")}).value,
         **make_cost_columns(result.costs),
         "shard": shard,

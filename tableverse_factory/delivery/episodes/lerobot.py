@@ -18,7 +18,7 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
-from tableverse_factory.dataset.splits import SPLITS, find_split
+from tableverse_factory.dataset.splits import SPLITS, get_split
 from tableverse_factory.delivery.episodes.frames import compute_stride, list_features
 from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction, read_instruction
 from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
@@ -39,7 +39,7 @@ from tableverse_factory.delivery.episodes.selection import (
 )
 from tableverse_factory.delivery.episodes.video import import_av
 
-_SCENE_COLUMNS = ("scene_id", "content_sha256", "licence")
+_SCENE_COLUMNS = ("scene_id", "split", "licence")
 _CAMERAS = {"robot": ROBOT_CAMERA, "scene": SCENE_CAMERA}
 
 
@@ -104,13 +104,13 @@ def _build_setting(dataset: Dataset, first: Episode, options: LeRobotOptions) ->
 
 def _sort_by_split(rows: Sequence[dict[str, Any]], scenes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Sort rows by split, as LeRobot's splits are ranges of episodes; within a split the order stays."""
-    return sorted(rows, key=lambda row: list(SPLITS).index(find_split(scenes[row["scene_id"]])))
+    return sorted(rows, key=lambda row: list(SPLITS).index(get_split(scenes[row["scene_id"]])))
 
 
 def _build_origin(row: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
     """Build columns of meta/episodes beyond LeRobot's: split, words, origin and outcome of an episode."""
     return {
-        "split": find_split(scene),
+        "split": get_split(scene),
         "paraphrases": list(paraphrase_instruction(read_instruction(row))),
         "scene_id": row["scene_id"],
         "task_id": row["task_id"],

@@ -21,7 +21,7 @@ import numpy as np
 
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.dataset.dataset import Dataset
-from tableverse_factory.dataset.splits import find_split
+from tableverse_factory.dataset.splits import get_split
 from tableverse_factory.delivery.episodes.demonstration import Demonstration, build_demonstration, build_env_args
 from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction, read_instruction
 from tableverse_factory.delivery.episodes.observation import count_object_rows
@@ -67,7 +67,10 @@ def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: 
                 demo = build_demonstration(episode, arm, object_rows)
                 _write_demo(data.create_group(f"demo_{number}"), demo, episode.row)
                 _write_assets(file, episode.scene.scene_id, demo.assets)
-                for mask in (_MASKS[find_split(episode.scene.row)], "success" if episode.row["success"] else "failed"):
+                for mask in (
+                    _MASKS[get_split(episode.scene.row)],
+                    "success" if episode.row["success"] else "failed",
+                ):
                     masks.setdefault(mask, []).append(f"demo_{number}")
                 total += len(demo.actions)
                 data.attrs["env_args"] = json.dumps(build_env_args(episode.recording, arm, object_rows))

@@ -21,12 +21,12 @@ from tableverse_factory.core.storage.untrusted import parse_json
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.query_parser import parse_filter
-from tableverse_factory.dataset.splits import find_split
+from tableverse_factory.dataset.splits import get_split
 from tableverse_factory.delivery.formats.extract import MAIN_FILES, extract_scene
 from tableverse_factory.run_record import AFTERWARDS
 
 INDEX, RECORD, STAGING = "index.jsonl", "extract.json", ".partial"
-INDEXED = ("kind", "name", "url", "licence", "n_objects", "usable", "quality_score")
+INDEXED = ("parent", "kind", "name", "url", "licence", "n_objects", "usable", "quality_score")
 _DIFFERENCES = {"dataset": "of another dataset", "format": "in another format", "appearance": "that look otherwise"}
 _PLACE = ("shard", "tar_offset", "tar_size")
 
@@ -162,10 +162,14 @@ def _write_index(dataset: Dataset, dest: Path, file_format: str) -> None:
     for row in asked.to_pylist():
         tasks.setdefault(row.pop("scene_id"), []).append(row)
     lines = []
-    for batch in dataset.scenes.to_batches(columns=["scene_id", "content_sha256", *INDEXED]):
+    for batch in dataset.scenes.to_batches(columns=["scene_id", "split", *INDEXED]):
         for row in batch.to_pylist():
             if (name := row["scene_id"]) in there:
-                told = {"scene_id": name, "path": f"{name}/{MAIN_FILES[file_format]}", "split": find_split(row)}
+                told = {
+                    "scene_id": name,
+                    "path": f"{name}/{MAIN_FILES[file_format]}",
+                    "split": get_split(row),
+                }
                 told |= {key: row[key] for key in INDEXED} | {"tasks": tasks.get(name, [])}
                 lines.append(json.dumps(told, ensure_ascii=True, sort_keys=False))
     write_atomic(dest / INDEX, "".join(f"{line}\n" for line in lines).encode())

@@ -10,7 +10,7 @@ from schemas.geometry import Picture
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.dataset.splits import SPLITS, find_split
+from tableverse_factory.dataset.splits import SPLITS, get_split
 from tableverse_factory.delivery.episodes.observation import count_object_rows
 from tableverse_factory.delivery.learning.environment import TableEnv
 from tableverse_factory.robotics.robots.registry import load_arm
@@ -93,8 +93,8 @@ def list_solved_tasks(dataset: Dataset, split: str | None, robot: str) -> tuple[
     """List the tasks of a split that a recorded motion of `robot` solves, by scene and task."""
     if split is not None and split not in SPLITS:
         raise ConfigError(f"split {sanitize_line(repr(split), 60)}: give one of {', '.join(SPLITS)}, or None for all")
-    rows = dataset.scenes.to_table(columns=["scene_id", "content_sha256"]).to_pylist()
-    chosen = {row["scene_id"] for row in rows if split is None or find_split(row) == split}
+    rows = dataset.scenes.to_table(columns=["scene_id", "split"]).to_pylist()
+    chosen = {row["scene_id"] for row in rows if split is None or get_split(row) == split}
     solved = dataset.trajectories.to_table(
         columns=["scene_id", "task_id"], filter=(pc.field("success")) & (pc.field("robot") == robot)
     ).to_pylist()

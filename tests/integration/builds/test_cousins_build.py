@@ -13,8 +13,8 @@ from schemas.manifest import SceneKind
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.cousin_rows import THEMES, list_cousins
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.dataset.families import FOLDS, find_fold
 from tableverse_factory.dataset.shard_plan import read_plan
+from tableverse_factory.dataset.splits import find_split
 from tableverse_factory.evaluation.bench.cousins import measure_cousins
 from tableverse_factory.evaluation.verify import verify_scenes
 from tableverse_factory.rebuild import manifest_from_dataset
@@ -67,21 +67,15 @@ def test_every_scene_has_its_cousins_and_every_cousin_its_row(made):
 
 
 def test_families_stay_together_in_every_split(made):
-    """A family is one fold, and things are borrowed within the fold."""
-    fold_of = {row["scene_id"]: row["fold"] for row in rows_of(made / "out")}
+    """Things are borrowed within the split, too."""
+    split_of = {row["scene_id"]: row["split"] for row in rows_of(made / "out")}
     for row in rows_of(made / "out"):
         assert (row["family"], row["parent"], row["changes"]) == (row["scene_id"], None, None)
     for row in rows_of(made / "cousins"):
         assert row["family"] == row["parent"]
-        assert row["fold"] == fold_of[row["parent"]] == find_fold(row["family"])
+        assert row["split"] == split_of[row["parent"]] == find_split(row["family"])
         donors = parse_recipe(row["recipe"]).donors
-        assert {fold_of[donor.scene_id] for donor in donors} <= {row["fold"]}
-
-
-def test_folds_divide_families_evenly():
-    counts = np.bincount([find_fold(f"scene-{index}") for index in range(5000)], minlength=FOLDS)
-    assert len(counts) == FOLDS
-    assert counts.min() > 900
+        assert {split_of[donor.scene_id] for donor in donors} <= {row["split"]}
 
 
 def test_cousins_of_cousins_are_of_the_same_family(made):
