@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from tableverse_factory.cli.bench_cameras import bench_cameras
 from tableverse_factory.cli.bench_cousins import bench_cousins
 from tableverse_factory.cli.bench_cpu_time import bench_stages, bench_trajectories
 from tableverse_factory.cli.bench_perception import bench_completion, bench_perception, bench_placement
@@ -30,6 +31,7 @@ bench.command("picture")(bench_picture)
 bench.command("placement")(bench_placement)
 bench.command("completion")(bench_completion)
 bench.command("twin")(bench_twin)
+bench.command("cameras")(bench_cameras)
 bench.command("cousins")(bench_cousins)
 
 

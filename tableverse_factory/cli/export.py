@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 
 _DEFAULT = "dataset"
-_Camera = StrEnum("_Camera", ["ROBOT", "SCENE"])  # Typer takes no list of literals
+_Picture = StrEnum(  # Typer takes no list of literals
+    "_Picture",
+    """FRONT FRONT_DEPTH FRONT_INSTANCES WRIST WRIST_DEPTH WRIST_INSTANCES
+    SCENE SCENE_DEPTH SCENE_INSTANCES""",
+)
 
 
 class _DefaultCommandGroup(TyperGroup):
@@ -42,6 +46,10 @@ export = typer.Typer(
     help="Write a dataset to pass on, or trajectories for learners.\n\n`export OUT DEST` means `export dataset`.",
 )
 
+Pictures = Annotated[
+    list[_Picture] | None,
+    typer.Option(help="May be repeated; LeRobot has front and wrist by default. scene: the photograph's camera."),
+]
 Failed = Annotated[bool, typer.Option("--failed", help="Failures too; they are marked.")]
 
 
@@ -90,6 +98,10 @@ def _remove_if_unused(dest: "StoragePath") -> Iterator[None]:
             dest.rmdir()
 
 
+def _list_pictures(given: list[_Picture] | None) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(picture.value for picture in given or ()))
+
+
 @export.command("lerobot")
 def export_lerobot(
     out: FinishedOut,
@@ -105,10 +117,7 @@ def export_lerobot(
             min=1, metavar="N", help="Frames per second, a divisor of the recorded ones, which are the default."
         ),
     ] = None,
-    camera: Annotated[
-        list[_Camera] | None,
-        typer.Option(help="robot: stands with it, and the default; scene: the photograph's. May be repeated."),
-    ] = None,
+    picture: Pictures = None,
     jobs: Annotated[int, typer.Option(min=1, metavar="N", help="Processes that draw.")] = 1,
     robot: Robot = None,
 ) -> None:
@@ -122,11 +131,11 @@ def export_lerobot(
     from tableverse_factory.delivery.episodes.lerobot import export_lerobot as write
 
     check_robot_option(out, robot, needed=True)
-    cameras = tuple(dict.fromkeys(view.value for view in camera or (_Camera.ROBOT,)))
-    options = LeRobotOptions(failed, width, height, fps, cameras, jobs, robot)
+    pictures = _list_pictures(picture) or ("front", "wrist")
+    options = LeRobotOptions(failed, width, height, fps, pictures, jobs, robot)
     with count_progress("episodes") as count:
         written = write(open_dataset(out), dest, options, count.update)
-    seen = " and ".join(written.cameras)
+    seen = ", ".join(written.pictures)
     print(f"{pluralize(written.episodes, 'episode')}, {written.frames} frames of {seen}, in {dest}")
 
 
@@ -138,6 +147,10 @@ def export_robomimic(
         typer.Argument(metavar="DEST", callback=require_local_path, help="A new file of any name, e.g. `out.hdf5`."),
     ],
     failed: Failed = False,
+    picture: Pictures = None,
+    width: Annotated[int, typer.Option(min=16, max=4096, metavar="PX", help="Of the pictures.")] = 128,
+    height: Annotated[int, typer.Option(min=16, max=4096, metavar="PX", help="Of the pictures.")] = 96,
+    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="Processes.")] = 1,
     robot: Robot = None,
 ) -> None:
     """Write the trajectories as one HDF5 file of robomimic: states, actions, observations, and the models to replay.
@@ -145,8 +158,10 @@ def export_robomimic(
     Example: `tableverse export robomimic out out.hdf5 --failed`
     """
     from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.delivery.episodes.robomimic import RobomimicOptions
     from tableverse_factory.delivery.episodes.robomimic import export_robomimic as write
 
     check_robot_option(out, robot, needed=True)
-    written = write(open_dataset(out), dest, failed, robot)
+    options = RobomimicOptions(failed, _list_pictures(picture), width, height, jobs, robot)
+    written = write(open_dataset(out), dest, options)
     print(f"{pluralize(written.demos, 'demonstration')}, {written.samples} samples, in {dest}")

@@ -36,6 +36,7 @@ class RenderScene(Frozen):
     still: PaintedMeshes  # in the table frame
     moving: PaintedMeshes  # each in its own frame: objects first, then the arm's
     names: tuple[str, ...]  # object id of each of the first of `moving`
+    still_names: tuple[str, ...]  # of each of `still` but the last two, which are the table and the pedestal
 
 
 class ArmMeshes:
@@ -98,6 +99,7 @@ def build_render_scene(scene: Scene, moved: AbstractSet[str], figure: ArmMeshes,
         ),
         PaintedMeshes((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),
         tuple(names[k] for k in taken),
+        tuple(names[k] for k in still if names[k]),
     )
 
 

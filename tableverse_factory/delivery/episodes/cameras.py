@@ -12,8 +12,11 @@ from tableverse_factory.geometry.math.transforms import compose_poses, normalize
 from tableverse_factory.physics.render.render import look_at
 from tableverse_factory.physics.render.views import frame_points
 from tableverse_factory.robotics.execution.arrays import Recording
+from tableverse_factory.robotics.robots.arm import Arm
 
 FIELD_OF_VIEW = float(np.deg2rad(44.0))  # vertical, of the robot camera
+WRIST_FIELD_OF_VIEW = float(np.deg2rad(75.0))  # vertical
+_WRIST_GAP_M, _WRIST_TARGET_M = 0.05, (0.02, 0.0, 0.04)  # before the hand; in the gripper frame, beyond the fingertips
 _EYE_M = (1.2, 0.85, 1.0)  # in the robot's base frame: across the table and to its left, with table and arm in view
 _TARGET_M = (0.37, 0.02, 0.26)
 _ELEVATION = float(np.deg2rad(30.0))
@@ -26,9 +29,28 @@ _FRAMING_SAMPLES = 40  # arm configurations considered for framing
 
 def place_robot_camera(base: Pose, width: int, height: int) -> PosedCamera:
     """Place a camera across the table from the robot and to its left, the same in every scene."""
-    focal = height / (2 * np.tan(FIELD_OF_VIEW / 2))
-    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    return PosedCamera(camera, compose_poses(base, look_at(np.array(_EYE_M), np.array(_TARGET_M))))
+    pose = compose_poses(base, look_at(np.array(_EYE_M), np.array(_TARGET_M)))
+    return PosedCamera(_make_camera(FIELD_OF_VIEW, width, height), pose)
+
+
+def mount_wrist_camera(arm: Arm) -> Pose:
+    """Place a camera on the hand, beside the fingers, in the gripper frame; it looks between the fingertips."""
+    shape = arm.shape
+    before = float((shape.hand_centers + shape.hand_half_sizes)[:, 0].max()) + _WRIST_GAP_M
+    eye = np.array([before, 0.0, float(shape.hand_centers[:, 2].mean())])
+    return look_at(eye, np.array(_WRIST_TARGET_M), np.array([1.0, 0.0, 0.0]))
+
+
+def place_wrist_camera(arm: Arm, tcp: Pose, width: int, height: int) -> PosedCamera:
+    """Place the camera of a hand whose gripper frame is at `tcp` in the table frame."""
+    pose = compose_poses(tcp, mount_wrist_camera(arm))
+    return PosedCamera(_make_camera(WRIST_FIELD_OF_VIEW, width, height), pose)
+
+
+def _make_camera(field_of_view: float, width: int, height: int) -> Camera:
+    """Make a camera of square pixels from its vertical field of view [rad]."""
+    focal = height / (2 * np.tan(field_of_view / 2))
+    return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 def place_film_camera(recording: Recording, figure: ArmMeshes, width: int, height: int) -> PosedCamera:

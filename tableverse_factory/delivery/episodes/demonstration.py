@@ -12,6 +12,7 @@ from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.version import __version__
 from tableverse_factory.delivery.episodes.observation import pad_objects, read_object_poses
+from tableverse_factory.delivery.episodes.pictures import take_recorded_pictures
 from tableverse_factory.delivery.episodes.selection import Episode
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.arm import Arm
@@ -19,6 +20,8 @@ from tableverse_factory.robotics.robots.station import PREFIX, build_station_spe
 
 ENVIRONMENT = "tableverse_factory.gym:TableVerse/PickPlace-v0"
 _GYM_TYPE = 2
+_CAMERAS = {"front": "agentview", "wrist": "robot0_eye_in_hand", "scene": "scene"}
+_CHANNELS = {"": "_image", "depth": "_depth", "instances": "_segmentation_instance"}
 _XYZW = [0, 1, 2, 4, 5, 6, 3]
 
 
@@ -36,8 +39,17 @@ class Demonstration(Frozen):
     assets: Mapping[str, bytes]  # files that the model references
 
 
-def build_demonstration(episode: Episode, arm: Arm, object_rows: int) -> Demonstration:
-    """Build the episode's samples; states of objects have `object_rows` rows, zeros behind those of the scene."""
+@dataclass(frozen=True, slots=True)
+class DemonstrationSetting:
+    """Setting shared by all demonstrations of an export."""
+
+    object_rows: int  # of states of objects, zeros behind those of the scene
+    pictures: tuple[str, ...]  # names of `pictures.PICTURES`
+    size: tuple[int, int]  # of pictures, height and width [px]
+
+
+def build_demonstration(episode: Episode, arm: Arm, setting: DemonstrationSetting) -> Demonstration:
+    """Build the episode's samples."""
     recording, count = episode.recording, len(episode.recording)
     files = episode.scene.files()
     spec = build_station_spec(files, arm)
@@ -56,7 +68,10 @@ def build_demonstration(episode: Episode, arm: Arm, object_rows: int) -> Demonst
         dones=last.astype(np.int64),
         states=_build_states(model, episode, arm),
         phases=recording.phase.astype(np.int64),
-        observations=_build_observations(model, episode, len(arm.joint_names), object_rows),
+        observations={
+            **_build_observations(model, episode, len(arm.joint_names), setting.object_rows),
+            **_take_pictures(episode, arm, setting),
+        },
         model=spec.to_xml(),
         assets={name: known[name] for name in sorted(used) if name in known},
     )
@@ -67,14 +82,15 @@ def compute_action_limits(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     return np.array([*arm.lower, 0.0]), np.array([*arm.upper, arm.max_opening_m])
 
 
-def build_env_args(recording: Recording, arm: Arm, object_rows: int) -> dict[str, Any]:
+def build_env_args(recording: Recording, arm: Arm, setting: DemonstrationSetting) -> dict[str, Any]:
     """Build robomimic's `env_args`: what `gymnasium.make` needs beside a dataset, and the meaning of the actions."""
     low, high = compute_action_limits(arm)
+    shown = {"pictures": setting.pictures, "picture_size": setting.size} if setting.pictures else {}
     return {
         "env_name": ENVIRONMENT,
         "type": _GYM_TYPE,
         "env_version": __version__,
-        "env_kwargs": {"robot": recording.robot, "max_objects": object_rows},
+        "env_kwargs": {"robot": recording.robot, "max_objects": setting.object_rows, **shown},
         "control_freq": 1.0 / recording.step_s,
         "action_low": low.tolist(),
         "action_high": high.tolist(),
@@ -119,6 +135,20 @@ def _build_observations(
         "robot0_joint_pos": recording.qpos[:, :n_joints],
         "robot0_joint_vel": recording.qvel[:, :n_joints],
     }
+
+
+def _take_pictures(episode: Episode, arm: Arm, setting: DemonstrationSetting) -> dict[str, np.ndarray]:
+    """Take the pictures of every sample, under robosuite's names."""
+    if not setting.pictures:
+        return {}
+    taken = take_recorded_pictures(setting.pictures, episode, arm, setting.size, range(len(episode.recording)))
+    return {name_picture(name): np.stack(pictures) for name, pictures in taken.items()}
+
+
+def name_picture(name: str) -> str:
+    """Name a picture as robosuite does."""
+    camera, _, channel = name.partition("_")
+    return _CAMERAS[camera] + _CHANNELS[channel]
 
 
 def _find_free_joint(model: mujoco.MjModel, episode: Episode, name: str) -> int:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from schemas.trajectories import Phase
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.delivery.episodes.observation import (
     build_state,
@@ -17,11 +16,11 @@ from tableverse_factory.delivery.episodes.observation import (
     read_object_poses,
 )
 from tableverse_factory.delivery.episodes.selection import Episode
+from tableverse_factory.delivery.episodes.subtasks import SUBTASKS
 from tableverse_factory.robotics.execution.arrays import Recording
 from tableverse_factory.robotics.robots.arm import Arm
 
 STATE, OBJECTS, ACTION = "observation.state", "observation.environment_state", "action"
-SUBTASKS = tuple(phase.value.replace("_", "-") for phase in Phase)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +86,7 @@ def build_columns(
         OBJECTS: objects.reshape(count, -1),
         ACTION: recording.command[following].astype(np.float32),
         "phase": phase,
-        "subtask": np.array(SUBTASKS)[phase],
+        "subtask": np.array(list(SUBTASKS.values()))[phase],
         "next.done": last,
         "next.success": last & bool(episode.row["success"]),
         "timestamp": (np.arange(count) / fps).astype(np.float32),

@@ -24,8 +24,8 @@ from tableverse_factory.physics.render.render import (
 )
 from tableverse_factory.physics.render.views import resize_camera
 
-_SUPERSAMPLING = 2  # samples per pixel, along each side
-_SKY_RAYS = 6
+SAMPLES = 2  # per pixel, along each side
+SKY_RAYS = 6
 _LEVELS = 1 << 14
 _NEAR_PLANE_M = 0.02  # a part nearer to the camera's plane than this is searched in the whole picture
 _SHADOW_MARGIN_M = 1e-3
@@ -39,65 +39,105 @@ class PaintedMeshes(Frozen):
     paints: tuple[Paint, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class View(Frozen):
+    """Picture with its geometry. Where subpixels see several parts, the nearest tells depth and part."""
+
+    color: Picture  # shape (h, w, 3), sRGB
+    depth: np.ndarray  # along the optical axis [m], 0 where nothing is; shape (h, w), float32
+    parts: np.ndarray  # index of the still mesh, or behind those of the moving one; -1 where nothing is; shape (h, w)
+
+
 class IncrementalRenderer:
     """Scene as one camera sees it, ready to be rendered with its moving parts anywhere."""
 
     def __init__(
-        self, still: PaintedMeshes, moving: PaintedMeshes, eye: PosedCamera, lighting: Lighting | None = None
+        self,
+        still: PaintedMeshes,
+        moving: PaintedMeshes,
+        eye: PosedCamera,
+        lighting: Lighting | None = None,
+        samples: int = SAMPLES,
+        sky_rays: int = SKY_RAYS,
     ) -> None:
-        """Render still meshes in the table frame; moving ones are in their own frames. Soft daylight by default."""
+        """Render still meshes in the table frame; moving ones are in their own frames. Soft daylight by default.
+
+        `samples` along each side of a pixel smooth edges, `sky_rays` darken corners of still surfaces; 1 and 0 are
+        faster, for an eye that moves.
+        """
         self._eye = eye
-        self._lighting = lighting or Lighting()
-        self._fine = resize_camera(eye.camera, _SUPERSAMPLING * eye.camera.width)
+        self._lighting, self._samples, self._sky_rays = lighting or Lighting(), samples, sky_rays
+        self._fine = resize_camera(eye.camera, samples * eye.camera.width)
         self._moving = [_MovingPart(mesh, paint) for mesh, paint in zip(moving.meshes, moving.paints, strict=True)]
         self._levels = np.rint(255.0 * np.linspace(0.0, 1.0, _LEVELS) ** (1 / GAMMA)).astype(np.uint8)
-        self._draw_still(still)
+        self._caster, self._surfaces = Raycaster(still.meshes), Surfaces(still.meshes, still.paints)
+        self._n_still = len(still.meshes)
+        self._draw_still()
 
-    def _draw_still(self, still: PaintedMeshes) -> None:
-        caster, surfaces = Raycaster(still.meshes), Surfaces(still.meshes, still.paints)
+    def move_eye(self, camera_to_table: Pose) -> None:
+        """Move the camera; still surfaces are rendered anew."""
+        self._eye = replace(self._eye, camera_to_table=camera_to_table)
+        self._draw_still()
+
+    def _draw_still(self) -> None:
         pose, shape = self._eye.camera_to_table, (self._fine.height, self._fine.width)
-        hits = caster.cast(self._fine, pose)
-        normals, albedo = surfaces.at(hits)
+        hits = self._caster.cast(self._fine, pose)
+        normals, albedo = self._surfaces.at(hits)
         ambient, direct = compute_light(hits.points, normals, albedo, pose.position, self._lighting)
-        key, sky = compute_light_maps(caster, hits, shape, self._lighting, True, _SKY_RAYS)
+        key, sky = compute_light_maps(self._caster, hits, shape, self._lighting, True, self._sky_rays)
         images = np.zeros((2, shape[0] * shape[1], 3), dtype=np.float32)
         images[0] = srgb_to_linear(np.array(self._lighting.background))
         images[0, hits.pixels] = ambient * sky[hits.pixels, None]
         images[1, hits.pixels] = direct * key[hits.pixels, None]
-        self._ambient, self._direct = (_downsample(image.reshape(*shape, 3)) for image in images)
+        self._ambient, self._direct = (_downsample(image.reshape(*shape, 3), self._samples) for image in images)
         self._depth = np.full(shape[0] * shape[1], np.inf, dtype=np.float32)
         self._depth[hits.pixels] = hits.depth
-        self._ground = _ShadowReceiver(hits, self._fine, np.array(self._lighting.key_direction))
+        self._still = np.full(len(self._depth), -1, dtype=np.int32)
+        self._still[hits.pixels] = hits.part
+        self._ground = _ShadowReceiver(hits, self._fine, np.array(self._lighting.key_direction), self._samples)
 
     def render(self, poses: Sequence[Pose]) -> Picture:
         """Render the picture with each moving part at its pose in the table frame. Shape (h, w, 3) sRGB."""
+        looks, _, owner = self._find_nearest(poses)
+        return self._color(poses, looks, owner)
+
+    def render_view(self, poses: Sequence[Pose]) -> View:
+        """Render picture, depth and parts with each moving part at its pose in the table frame."""
+        looks, depth, owner = self._find_nearest(poses)
+        color = self._color(poses, looks, owner)
+        return View(color, *_reduce_to_pixels(depth, owner, color.shape[:2], self._samples))
+
+    def _color(self, poses: Sequence[Pose], looks: Sequence[Hits], owner: np.ndarray) -> Picture:
         height, width = self._eye.camera.height, self._eye.camera.width
         open_share = self._ground.open_share(self._moving, poses).reshape(height, width, 1)
         picture = (self._ambient + self._direct * open_share).reshape(-1, 3)
-        pixels, colors = self._seen(poses)
+        pixels, colors = self._seen(poses, looks, owner)
         if len(pixels):
-            rows, columns = pixels // self._fine.width // _SUPERSAMPLING, pixels % self._fine.width // _SUPERSAMPLING
+            rows, columns = pixels // self._fine.width // self._samples, pixels % self._fine.width // self._samples
             coarse = rows * width + columns
             covered = np.bincount(coarse, minlength=len(picture))
             total = np.stack([np.bincount(coarse, colors[:, k], len(picture)) for k in range(3)], axis=1)
             touched = np.flatnonzero(covered)
-            share = (covered[touched] / _SUPERSAMPLING**2)[:, None]
-            picture[touched] = picture[touched] * (1.0 - share) + total[touched] / _SUPERSAMPLING**2
+            share = (covered[touched] / self._samples**2)[:, None]
+            picture[touched] = picture[touched] * (1.0 - share) + total[touched] / self._samples**2
         indices = (np.clip(picture, 0.0, 1.0) * (_LEVELS - 1)).astype(np.int32)
         return self._levels[indices].reshape(height, width, 3)
 
-    def _seen(self, poses: Sequence[Pose]) -> tuple[np.ndarray, np.ndarray]:
-        """Find subpixels in which a moving part is nearest, and their linear colors."""
-        depth = self._depth.copy()
-        owner = np.full(len(depth), -1, dtype=np.int32)
-        eye = self._eye.camera_to_table
+    def _find_nearest(self, poses: Sequence[Pose]) -> tuple[list[Hits], np.ndarray, np.ndarray]:
+        """Find each moving part's hits, and per subpixel the least depth and the part that has it."""
+        depth, owner, eye = self._depth.copy(), self._still.copy(), self._eye.camera_to_table
         looks = [part.look(self._fine, eye, pose) for part, pose in zip(self._moving, poses, strict=True)]
-        for number, hits in enumerate(looks):
+        for number, hits in enumerate(looks, self._n_still):
             nearer = hits.depth < depth[hits.pixels]
             depth[hits.pixels[nearer]] = hits.depth[nearer]
             owner[hits.pixels[nearer]] = number
+        return looks, depth, owner
+
+    def _seen(self, poses: Sequence[Pose], looks: Sequence[Hits], owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find subpixels in which a moving part is nearest, and their linear colors."""
+        eye = self._eye.camera_to_table
         pixels, colors = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
-        for number, (part, hits, pose) in enumerate(zip(self._moving, looks, poses, strict=True)):
+        for number, (part, hits, pose) in enumerate(zip(self._moving, looks, poses, strict=True), self._n_still):
             won = np.flatnonzero(owner[hits.pixels] == number)
             pixels.append(hits.pixels[won])
             colors.append(part.colors(_select_hits(hits, won), pose, eye, self._lighting))
@@ -149,9 +189,9 @@ class _MovingPart:
 class _ShadowReceiver:
     """Still surfaces that moving parts may shadow, one point per pixel."""
 
-    def __init__(self, hits: Hits, fine: Camera, to_light: np.ndarray) -> None:
+    def __init__(self, hits: Hits, fine: Camera, to_light: np.ndarray, samples: int) -> None:
         rows, columns = np.divmod(hits.pixels, fine.width)
-        here = np.flatnonzero((rows % _SUPERSAMPLING == 0) & (columns % _SUPERSAMPLING == 0))
+        here = np.flatnonzero((rows % samples == 0) & (columns % samples == 0))
         self._to_light = to_light / np.linalg.norm(to_light)
         side = np.cross(self._to_light, [0.0, 1.0, 0.0])
         side /= np.linalg.norm(side)
@@ -161,8 +201,8 @@ class _ShadowReceiver:
         here, flat = here[order], flat[order]
         self._hits = _select_hits(hits, here)
         self._across, self._along = np.ascontiguousarray(flat[:, 0]), np.ascontiguousarray(flat[:, 1])
-        self._shape = fine.height // _SUPERSAMPLING, fine.width // _SUPERSAMPLING
-        self._pixels = rows[here] // _SUPERSAMPLING * self._shape[1] + columns[here] // _SUPERSAMPLING
+        self._shape = fine.height // samples, fine.width // samples
+        self._pixels = rows[here] // samples * self._shape[1] + columns[here] // samples
 
     def open_share(self, parts: Sequence[_MovingPart], poses: Sequence[Pose]) -> np.ndarray:
         """Compute the share of the key light that moving parts let through, per pixel. Shape (h * w,)."""
@@ -197,9 +237,22 @@ def _blur(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def _downsample(image: np.ndarray) -> np.ndarray:
-    height, width = (side // _SUPERSAMPLING for side in image.shape[:2])
-    return image.reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, -1).mean(axis=(1, 3))
+def _reduce_to_pixels(
+    depth: np.ndarray, owner: np.ndarray, shape: tuple[int, ...], samples: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce subpixels to the nearest part of each pixel, and its mean depth there. Both of shape (h, w)."""
+    height, width = shape
+    split = height, samples, width, samples
+    near, parts = (values.reshape(split).transpose(0, 2, 1, 3).reshape(height, width, -1) for values in (depth, owner))
+    part = np.take_along_axis(parts, near.argmin(axis=2)[..., None], axis=2)
+    mine = (parts == part) & np.isfinite(near)
+    total = np.where(mine, near, 0.0).sum(axis=2)
+    return (total / np.maximum(mine.sum(axis=2), 1)).astype(np.float32), part[..., 0]
+
+
+def _downsample(image: np.ndarray, samples: int) -> np.ndarray:
+    height, width = (side // samples for side in image.shape[:2])
+    return image.reshape(height, samples, width, samples, -1).mean(axis=(1, 3))
 
 
 def _select_hits(hits: Hits, indices: np.ndarray) -> Hits:

@@ -4,7 +4,7 @@
     DEST/meta/info.json, stats.json, tasks.parquet
     DEST/meta/episodes/chunk-000/file-000.parquet     a row per episode: where its frames lie, and its statistics
     DEST/data/chunk-000/file-000.parquet              a row per frame, many episodes in a file
-    DEST/videos/KEY/chunk-000/file-000.mp4            the same frames as one camera sees them
+    DEST/videos/KEY/chunk-000/file-000.mp4            the same frames as pictures
 
 The layout is that of the public documentation.
 """
@@ -23,12 +23,8 @@ from tableverse_factory.delivery.episodes.frames import compute_stride, list_fea
 from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction, read_instruction
 from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
 from tableverse_factory.delivery.episodes.observation import count_object_rows
-from tableverse_factory.delivery.episodes.render_workers import (
-    ROBOT_CAMERA,
-    SCENE_CAMERA,
-    RenderSetting,
-    render_episodes,
-)
+from tableverse_factory.delivery.episodes.pictures import check_pictures
+from tableverse_factory.delivery.episodes.render_workers import RenderSetting, render_episodes
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
     Episode,
@@ -40,7 +36,6 @@ from tableverse_factory.delivery.episodes.selection import (
 from tableverse_factory.delivery.episodes.video import import_av
 
 _SCENE_COLUMNS = ("scene_id", "split", "licence")
-_CAMERAS = {"robot": ROBOT_CAMERA, "scene": SCENE_CAMERA}
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +46,7 @@ class LeRobotOptions:
     width: int = 320  # [px], even
     height: int = 240  # [px], even
     fps: int | None = None  # None for all recorded frames
-    cameras: tuple[str, ...] = ("robot",)  # `robot`, `scene` (the photograph's, which the arm may hide), or both
+    pictures: tuple[str, ...] = ("front", "wrist")  # names of `pictures.PICTURES`
     jobs: int = 1  # rendering processes
     robot: str | None = None  # arm of recordings whose robot is not built in: a file, or `menagerie:NAME`
 
@@ -62,7 +57,7 @@ class LeRobotResult:
 
     episodes: int
     frames: int
-    cameras: tuple[str, ...]
+    pictures: tuple[str, ...]
 
 
 def export_lerobot(
@@ -89,7 +84,7 @@ def export_lerobot(
                 if progress is not None:
                     progress(files.n_episodes, len(rows))
             files.finish().rename(dest)
-    return LeRobotResult(files.n_episodes, files.n_frames, setting.cameras)
+    return LeRobotResult(files.n_episodes, files.n_frames, setting.pictures)
 
 
 def _build_setting(dataset: Dataset, first: Episode, options: LeRobotOptions) -> RenderSetting:
@@ -97,9 +92,8 @@ def _build_setting(dataset: Dataset, first: Episode, options: LeRobotOptions) ->
     if options.width % 2 or options.height % 2:
         raise InputError(f"{options.width} × {options.height}: the sides of a video are even", "bad_size")
     every, fps = compute_stride(first.recording, options.fps)
-    cameras = tuple(_CAMERAS[name] for name in options.cameras)
     size, rows = (options.width, options.height), count_object_rows(dataset)
-    return RenderSetting(get_kind(first), cameras, *size, every, fps, rows, options.robot)
+    return RenderSetting(get_kind(first), check_pictures(options.pictures), *size, every, fps, rows, options.robot)
 
 
 def _sort_by_split(rows: Sequence[dict[str, Any]], scenes: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:

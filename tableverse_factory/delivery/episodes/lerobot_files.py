@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 
 from tableverse_factory.delivery.episodes.frames import Feature, build_frame_table, number_columns
 from tableverse_factory.delivery.episodes.lerobot_card import make_lerobot_card
-from tableverse_factory.delivery.episodes.render_workers import RenderedEpisode, RenderSetting
+from tableverse_factory.delivery.episodes.render_workers import IMAGES, RenderedEpisode, RenderSetting
 from tableverse_factory.delivery.episodes.statistics import FeatureStats, compute_vector_stats, merge_stats
-from tableverse_factory.delivery.episodes.video import PIXELS, VideoFile
+from tableverse_factory.delivery.episodes.video import VideoFile, VideoKind, find_kind
 
 VERSION = "v3.0"
 CHUNK_FILES = 1000
@@ -143,7 +143,7 @@ class LeRobotFiles:
             "data_path": DATA_PATH,
             "video_path": VIDEO_PATH,
             "features": {
-                **{key: self._video_feature() for key in self._setting.cameras},
+                **{IMAGES + name: self._video_feature(find_kind(name)) for name in self._setting.pictures},
                 **{name: feature.as_json() for name, feature in self._features.items()},
             },
         }
@@ -154,19 +154,20 @@ class LeRobotFiles:
         starts = {name: splits.index(name) for name in dict.fromkeys(splits)}
         return {name: f"{start}:{start + splits.count(name)}" for name, start in starts.items()}
 
-    def _video_feature(self) -> dict[str, Any]:
+    def _video_feature(self, kind: VideoKind) -> dict[str, Any]:
         height, width = self._setting.height, self._setting.width
         info = {
             "video.height": height,
             "video.width": width,
-            "video.codec": "h264",
-            "video.pix_fmt": PIXELS,
-            "video.is_depth_map": False,
+            "video.codec": kind.codec,
+            "video.pix_fmt": kind.pixels,
             "video.fps": self._setting.fps,
-            "video.channels": 3,
+            "video.channels": kind.channels,
             "has_audio": False,
+            **kind.info,
         }
-        return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
+        shape = [height, width, kind.channels]
+        return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": info}
 
     def _write_json(self, name: str, content: Mapping[str, Any]) -> None:
         text = json.dumps(content, indent=4, ensure_ascii=False) + "\n"

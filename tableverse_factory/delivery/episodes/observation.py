@@ -61,19 +61,24 @@ def pad_objects(poses: Float[np.ndarray, "*t n 7"], rows: int) -> Float32[np.nda
     return padded
 
 
+def list_objects(model: mujoco.MjModel, episode: Episode) -> tuple[str, ...]:
+    """List the objects of an episode's scene, whose model this is, as `order_objects`; InputError if one is absent."""
+    names = [model.body(body).name for body in find_free_bodies(model)]
+    x_id, y_id = str(episode.row["x_id"]), str(episode.row["y_id"])
+    if absent := [name for name in (x_id, y_id, *episode.recording.moved_ids) if name not in names]:
+        name = sanitize_line(absent[0], 80)
+        raise InputError(f"{episode.name}: {name!r} is no object that can move", "no_such_object")
+    return order_objects(names, x_id, y_id)
+
+
 def read_object_poses(model: mujoco.MjModel, episode: Episode) -> Float32[np.ndarray, "t n 7"]:
     """Read the pose of every object at every sample: position [m] and quaternion wxyz in the table frame.
 
     They stand in the order of `order_objects`; `model` is of the scene. What did not move stands as exported.
     """
-    recording, x_id, y_id = episode.recording, str(episode.row["x_id"]), str(episode.row["y_id"])
-    bodies = {model.body(body).name: body for body in find_free_bodies(model)}
-    if absent := [name for name in (x_id, y_id, *recording.moved_ids) if name not in bodies]:
-        name = sanitize_line(absent[0], 80)
-        raise InputError(f"{episode.name}: {name!r} is no object that can move", "no_such_object")
-    found = []
-    for name in order_objects(list(bodies), x_id, y_id):
-        poses = recording.object_pose if name == x_id else recording.poses_of(name)
-        at = int(model.jnt_qposadr[model.body_jntadr[bodies[name]]])
+    recording, found = episode.recording, []
+    for name in list_objects(model, episode):
+        poses = recording.object_pose if name == episode.row["x_id"] else recording.poses_of(name)
+        at = int(model.jnt_qposadr[model.body(name).jntadr[0]])
         found.append(np.tile(model.qpos0[at : at + 7], (len(recording), 1)) if poses is None else poses)
     return np.stack(found, axis=1).astype(np.float32)

@@ -7,6 +7,7 @@ every second phase, `.axis`, `.grid`, `.open` (the gripper), `.told` (its comman
 import numpy as np
 
 from schemas.trajectories import JointVector, Phase
+from tableverse_factory.delivery.episodes.subtasks import SUBTASKS
 from tableverse_factory.robotics.execution.arrays import Recording
 
 WIDTH, HEIGHT = 640, 260
@@ -14,7 +15,6 @@ COLORS = 7
 _LEFT, _RIGHT, _TOP = 38.0, 8.0, 27.0
 _JOINTS, _GAP, _GRIPPER = 130.0, 14.0, 44.0
 _POINTS = 100
-_WORDS = {phase: phase.value.replace("_", "-") for phase in Phase}
 _CHARACTER = 5.0  # width of a letter
 _ROWS = (_TOP - 5.0, _TOP - 15.0)  # heights of phase names, which are often wider than their phase
 _SWATCH, _SPACE = 12.0, 5.0  # length of a legend line, and the gap behind it (twice that behind a word)
@@ -64,12 +64,12 @@ def _draw_bands(recording: Recording, end_s: float) -> list[str]:
             continue
         if number % 2 == 0 and width > 0.0:
             parts.append(f'<rect class="band" x="{x:.1f}" y="{_TOP}" width="{width:.1f}" height="{height}"/>')
-        half = _CHARACTER * len(_WORDS[phase]) / 2
+        half = _CHARACTER * len(SUBTASKS[phase]) / 2
         middle = min(x + width / 2, WIDTH - half)
         row = next((row for row in range(len(_ROWS)) if taken[row] <= middle - half), int(np.argmin(taken)))
         middle = min(max(middle, taken[row] + half), WIDTH - half)
         taken[row] = middle + half + _SPACE
-        parts.append(f'<text x="{middle:.1f}" y="{_ROWS[row]}" text-anchor="middle">{_WORDS[phase]}</text>')
+        parts.append(f'<text x="{middle:.1f}" y="{_ROWS[row]}" text-anchor="middle">{SUBTASKS[phase]}</text>')
     return parts
 
 

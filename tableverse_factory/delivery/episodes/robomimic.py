@@ -14,27 +14,48 @@ import json
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tableverse_factory.core.optional_imports import import_extra
-from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.core.process_pool import parallel_map
+from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.splits import get_split
-from tableverse_factory.delivery.episodes.demonstration import Demonstration, build_demonstration, build_env_args
+from tableverse_factory.delivery.episodes.demonstration import (
+    Demonstration,
+    DemonstrationSetting,
+    build_demonstration,
+    build_env_args,
+)
 from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction, read_instruction
 from tableverse_factory.delivery.episodes.observation import count_object_rows
+from tableverse_factory.delivery.episodes.pictures import check_pictures
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.delivery.episodes.selection import (
+    EpisodeKind,
     check_kind,
     check_new_path,
     get_kind,
-    open_episodes,
+    open_episode,
     select_rows,
 )
 
 _MASKS = {"train": "train", "validation": "valid", "test": "test"}  # robomimic's names of splits
+
+
+@dataclass(frozen=True, slots=True)
+class RobomimicOptions:
+    """Export options."""
+
+    failed: bool = False  # include failed trajectories
+    pictures: tuple[str, ...] = ()  # names of `pictures.PICTURES`, drawn for every sample
+    width: int = 128  # [px]
+    height: int = 96  # [px]
+    jobs: int = 1  # processes
+    robot: str | None = None  # arm of recordings whose robot is not built in: a file, or `menagerie:NAME`
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,40 +66,57 @@ class RobomimicResult:
     samples: int
 
 
-def export_robomimic(dataset: Dataset, dest: Path, failed: bool = False, robot: str | None = None) -> RobomimicResult:
-    """Write the trajectories of a dataset to a new file, which appears when it is complete. Same input, same bytes.
+@dataclass(frozen=True, slots=True)
+class _Built:
+    """Demonstration with what the file says about it."""
 
-    `robot` is the arm of recordings whose robot is not built in: a file, or `menagerie:NAME`.
+    demo: Demonstration
+    split: str
+    env_args: dict[str, Any]
+
+
+def export_robomimic(dataset: Dataset, dest: Path, options: RobomimicOptions) -> RobomimicResult:
+    """Write the trajectories of a dataset to a new file, which appears when it is complete.
+
+    The same dataset and options give the same bytes for any number of processes.
     """
     h5py = import_extra("h5py", "HDF5", "episodes")
     check_new_path(dest)
-    rows = select_rows(dataset, failed)
+    rows = select_rows(dataset, options.failed)
+    size = (options.height, options.width)
+    setting = DemonstrationSetting(count_object_rows(dataset), check_pictures(options.pictures), size)
+    build = partial(_build, dataset.path, get_kind(open_episode(dataset, rows[0])), setting, options.robot)
     dest = dest.absolute()
     dest.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{dest.name}-", dir=dest.parent) as scratch:
-        partial, total, first, object_rows = Path(scratch) / "demos.hdf5", 0, None, count_object_rows(dataset)
+        partial_file, total = Path(scratch) / "demos.hdf5", 0
         masks: dict[str, list[str]] = {}
-        with h5py.File(partial, "w") as file:
+        with h5py.File(partial_file, "w") as file:
             data = file.create_group("data")
-            for number, episode in enumerate(open_episodes(dataset, rows)):
-                first = first or get_kind(episode)
-                check_kind(first, episode)
-                arm = load_recorded_arm(episode.recording, robot)
-                demo = build_demonstration(episode, arm, object_rows)
-                _write_demo(data.create_group(f"demo_{number}"), demo, episode.row)
-                _write_assets(file, episode.scene.scene_id, demo.assets)
-                for mask in (
-                    _MASKS[get_split(episode.scene.row)],
-                    "success" if episode.row["success"] else "failed",
-                ):
+            built = parallel_map(build, rows, options.jobs, "builds demonstrations")
+            for number, (row, its) in enumerate(zip(rows, built, strict=True)):
+                _write_demo(data.create_group(f"demo_{number}"), its.demo, row)
+                _write_assets(file, str(row["scene_id"]), its.demo.assets)
+                for mask in (_MASKS[its.split], "success" if row["success"] else "failed"):
                     masks.setdefault(mask, []).append(f"demo_{number}")
-                total += len(demo.actions)
-                data.attrs["env_args"] = json.dumps(build_env_args(episode.recording, arm, object_rows))
+                total += len(its.demo.actions)
+                data.attrs["env_args"] = json.dumps(its.env_args)
             data.attrs["total"] = total
             for mask, names in sorted(masks.items()):
                 _write_array(file.require_group("mask"), mask, np.array(names, dtype="S"))
-        partial.rename(dest)
+        partial_file.rename(dest)
     return RobomimicResult(len(rows), total)
+
+
+def _build(
+    path: str, kind: EpisodeKind, setting: DemonstrationSetting, robot: str | None, row: Mapping[str, Any]
+) -> _Built:
+    """Build the demonstration of a row of trajectories/."""
+    episode = open_episode(open_dataset(path), row)
+    check_kind(kind, episode)
+    arm = load_recorded_arm(episode.recording, robot)
+    env_args = build_env_args(episode.recording, arm, setting)
+    return _Built(build_demonstration(episode, arm, setting), get_split(episode.scene.row), env_args)
 
 
 def _write_demo(group: Any, demo: Demonstration, row: Mapping[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """Selection of trajectories for export, and checks of what they must share."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,8 @@ def select_rows(dataset: Dataset, failed: bool) -> list[dict[str, Any]]:
 
 def open_episode(dataset: Dataset, row: Mapping[str, Any]) -> Episode:
     """Open the episode of a row."""
-    return next(open_episodes(dataset, [row]))
+    scene = dataset.scene(row["scene_id"])
+    return Episode(row, scene, load_recording(scene, row))
 
 
 def load_recording(scene: Scene, row: Mapping[str, Any]) -> Recording:
@@ -51,15 +52,6 @@ def load_recording(scene: Scene, row: Mapping[str, Any]) -> Recording:
         return decode_recording(check_digest(data, row), sanitize_line(name, 100))
     except InputError as error:
         raise InputError(f"scene {scene.scene_id}, {error}", "bad_arrays") from None
-
-
-def open_episodes(dataset: Dataset, rows: Sequence[Mapping[str, Any]]) -> Iterator[Episode]:
-    """Open the episodes of sorted rows, one at a time, reading every scene once."""
-    scene: Scene | None = None
-    for row in rows:
-        if scene is None or scene.scene_id != row["scene_id"]:
-            scene = dataset.scene(row["scene_id"])
-        yield Episode(row, scene, load_recording(scene, row))
 
 
 @dataclass(frozen=True, slots=True)

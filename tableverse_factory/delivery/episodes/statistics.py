@@ -4,8 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from schemas.geometry import Picture
-
 FeatureStats = dict[str, np.ndarray]  # `min`, `max`, `mean`, `std` and quantiles of each component, and `count`
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _MAX_PICTURES = 100  # pictures used per episode, spread over it; every second pixel of every second row of each
@@ -16,12 +14,16 @@ def compute_vector_stats(values: np.ndarray) -> FeatureStats:
     return _compute_stats(values.reshape(len(values), -1).astype(np.float64), len(values))
 
 
-def compute_picture_stats(pictures: Sequence[Picture]) -> FeatureStats:
-    """Compute statistics of pictures, each of shape (3, 1, 1) as a share of 255; `count` is the pictures used."""
+def compute_picture_stats(pictures: Sequence[np.ndarray]) -> FeatureStats:
+    """Compute statistics of pictures, each of shape (c, 1, 1); `count` is the pictures used.
+
+    Those of bytes are shares of 255, as LeRobot has colours; depth stays in meters.
+    """
     chosen = np.unique(np.rint(np.linspace(0, len(pictures) - 1, min(len(pictures), _MAX_PICTURES))).astype(int))
-    pixels = np.concatenate([pictures[k][::2, ::2].reshape(-1, 3) for k in chosen])
-    figures = _compute_stats(pixels.astype(np.float64) / 255.0, len(chosen))
-    return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in figures.items()}
+    channels, full = pictures[0].shape[2], 255.0 if pictures[0].dtype == np.uint8 else 1.0
+    pixels = np.concatenate([pictures[k][::2, ::2].reshape(-1, channels) for k in chosen])
+    figures = _compute_stats(pixels.astype(np.float64) / full, len(chosen))
+    return {name: value if name == "count" else value.reshape(channels, 1, 1) for name, value in figures.items()}
 
 
 def _compute_stats(values: np.ndarray, count: int) -> FeatureStats:

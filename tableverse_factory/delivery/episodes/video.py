@@ -1,7 +1,8 @@
-"""H.264 in MP4 by PyAV: encoded per episode, then concatenated without encoding again."""
+"""Videos in MP4 by PyAV: encoded per episode, then concatenated without encoding again."""
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
@@ -9,17 +10,55 @@ from typing import Any
 
 import numpy as np
 
-from schemas.geometry import Picture
 from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.delivery.episodes.pictures import DEPTH, INSTANCES, MAX_DEPTH_M
 
-CODEC, PIXELS = "libx264", "yuv420p"
 _OPTIONS = {
-    "crf": "20",
     "preset": "medium",
     "g": "2",  # a frame is found without decoding a hundred others
     "bf": "0",  # frames in the order in which they are shown: episodes can be put one after the other
     "threads": "1",  # more would make the bytes depend on the machine
 }
+_DEPTH_STEP_M = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class VideoKind:
+    """Encoding of a kind of pictures; `info` is what LeRobot is told beyond size, codec and pixels."""
+
+    encoder: str
+    codec: str  # as players call it
+    source: str  # layout of the arrays
+    pixels: str  # in the file
+    options: Mapping[str, str]
+    channels: int = 3
+    info: Mapping[str, Any] = field(default_factory=lambda: {"video.is_depth_map": False})
+
+    def encode(self, picture: np.ndarray) -> np.ndarray:
+        """Convert a picture of shape (h, w, c) to the layout of `source`."""
+        if self.source == "gray12le":
+            return np.rint(picture[..., 0] / _DEPTH_STEP_M).astype(np.uint16)
+        return np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], self.channels)))
+
+
+COLOR = VideoKind("libx264", "h264", "rgb24", "yuv420p", {**_OPTIONS, "crf": "20"})
+LABELS = VideoKind("libx264rgb", "h264", "rgb24", "rgb24", {**_OPTIONS, "qp": "0"})  # exact, in every channel
+METERS = VideoKind(  # exact to half a millimetre
+    "libx265",
+    "hevc",
+    "gray12le",
+    "gray12le",
+    {"x265-params": "lossless=1:keyint=2:bframes=0:pools=none:frame-threads=1:log-level=error"},
+    1,
+    {
+        "video.is_depth_map": True,
+        "depth_unit": "m",
+        "video.depth_min": 0.0,
+        "video.depth_max": MAX_DEPTH_M,
+        "video.shift": 0.0,
+        "video.use_log": False,
+    },
+)
 _TICKS = 1000  # clock ticks per frame
 
 
@@ -28,17 +67,22 @@ def import_av() -> ModuleType:
     return import_extra("av", "a video", "episodes")
 
 
-def encode_mp4(pictures: Iterable[Picture], fps: int) -> bytes:
+def find_kind(name: str) -> VideoKind:
+    """Find the encoding of pictures by their name (`pictures.PICTURES`)."""
+    return METERS if name.endswith(DEPTH) else LABELS if name.endswith(INSTANCES) else COLOR
+
+
+def encode_mp4(pictures: Iterable[np.ndarray], fps: int, kind: VideoKind) -> bytes:
     """Encode pictures with even sides as a video; equal pictures give equal bytes."""
     av, file = import_av(), io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
         stream = None
         for number, picture in enumerate(pictures):
             if stream is None:
-                stream = container.add_stream(CODEC, fps, options=_OPTIONS)
-                stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], PIXELS
+                stream = container.add_stream(kind.encoder, fps, options=dict(kind.options))
+                stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], kind.pixels
                 stream.thread_count = 1
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(kind.encode(picture), format=kind.source)
             frame.pts, frame.time_base = number, Fraction(1, fps)
             container.mux(stream.encode(frame))
         if stream is not None:
@@ -60,7 +104,7 @@ class VideoFile:
         with self._av.open(io.BytesIO(video)) as source:
             stream = source.streams.video[0]
             if self._stream is None:
-                self._stream = self._container.add_stream_from_template(stream)
+                self._stream = self._container.add_stream_from_template(stream, opaque=True)
                 self._stream.time_base = Fraction(1, self._fps * _TICKS)
             count = 0
             for packet in source.demux(stream):

@@ -1,52 +1,52 @@
 """Camera pictures of a running simulation, ray-cast on the CPU: no GL, no display, deterministic."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from schemas.geometry import Picture, Pose, Texture, TriangleMesh
+from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.episodes.actors import ArmMeshes, build_render_scene
-from tableverse_factory.delivery.episodes.cameras import place_robot_camera
-from tableverse_factory.delivery.episodes.incremental_renderer import IncrementalRenderer, PaintedMeshes
+from tableverse_factory.delivery.episodes.incremental_renderer import PaintedMeshes
+from tableverse_factory.delivery.episodes.pictures import CameraRig, join_poses
 from tableverse_factory.physics.mjcf.scene_objects import read_slab
 from tableverse_factory.physics.render.render import Lighting
-from tableverse_factory.robotics.execution.poses import pose_from_row
-from tableverse_factory.robotics.robots.arm import Arm
+from tableverse_factory.robotics.robots.station import Station
 from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture
 
 _TEXTURE_PX = 512
 
 
-class RobotCamera:
-    """Camera across the table from the robot, as in the episode exports."""
+class SceneCameras:
+    """Cameras of a running simulation: those of the episode exports, with every object free to move."""
 
     def __init__(
         self,
         scene: Scene,
-        arm: Arm,
-        base: Pose,
+        station: Station,
+        object_ids: Sequence[str],
+        pictures: Sequence[str],
         size: tuple[int, int],
         table: int | None = None,
         lighting: Lighting | None = None,
     ) -> None:
-        """Render the still parts; every object of the scene may move.
+        """Render the still parts.
 
-        `base` is the arm's, in the table frame, `size` height and width [px], and `table` the seed of a texture for the
-        table; None keeps its own.
+        `object_ids` are in the order of the states of objects, `pictures` as in `episodes.pictures.PICTURES`, `size` is
+        height and width [px], and `table` the seed of a texture for the table; None keeps its own.
         """
-        self._figure, self._base = ArmMeshes(arm), base
-        objects = {str(item["object_id"]) for item in scene.meta["objects"]}
-        cast = build_render_scene(scene, objects, self._figure, base)
-        still = cast.still if table is None else _retexture_table(cast.still, scene, table)
-        self._names = cast.names
-        self._renderer = IncrementalRenderer(still, cast.moving, place_robot_camera(base, size[1], size[0]), lighting)
+        self._figure, self._base = ArmMeshes(station.arm), station.base
+        cast = build_render_scene(scene, set(object_ids), self._figure, self._base)
+        self._cast = cast if table is None else replace(cast, still=_retexture_table(cast.still, scene, table))
+        self._rig = CameraRig(pictures, scene, self._cast, station.arm, self._base, object_ids, size, lighting)
 
-    def picture(self, poses: Mapping[str, np.ndarray], positions: np.ndarray) -> Picture:
-        """Render the picture at object poses (position [m], quaternion wxyz) and positions of joints and fingers."""
-        objects = [pose_from_row(poses[name]) for name in self._names]
-        return self._renderer.render([*objects, *self._figure.poses(positions, self._base)])
+    def take(self, poses: Mapping[str, np.ndarray], positions: np.ndarray, tcp: np.ndarray) -> dict[str, np.ndarray]:
+        """Take the pictures at poses of the objects and the gripper, and positions of joints and fingers.
+
+        Poses are position [m] and quaternion wxyz in the table frame.
+        """
+        return self._rig.take(join_poses(poses, self._cast, self._figure.poses(positions, self._base)), tcp)
 
 
 def _retexture_table(still: PaintedMeshes, scene: Scene, seed: int) -> PaintedMeshes:

@@ -13,7 +13,8 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction
 from tableverse_factory.delivery.episodes.observation import build_state, pad_objects
-from tableverse_factory.delivery.learning.camera import RobotCamera
+from tableverse_factory.delivery.episodes.pictures import DEPTH, INSTANCES, MAX_DEPTH_M, check_pictures
+from tableverse_factory.delivery.learning.camera import SceneCameras
 from tableverse_factory.delivery.learning.pick_place_sim import PickPlaceSim, SimState
 from tableverse_factory.delivery.learning.variation import Variation, draw_lighting, draw_table_seed
 from tableverse_factory.physics.render.render import Lighting
@@ -22,6 +23,7 @@ ENVIRONMENT_ID = "TableVerse/PickPlace-v0"
 FPS = 50
 MAX_STEPS = 1000
 _MAX_PX = 4096
+_TOLD = ("success", "failure", "subtask", "lifted", "at_rest", "disturbed_m")
 _MAX_POSITION_M, _MAX_JOINT_SPEED = 3.0, 20.0  # bounds of observations: positions [m], and speeds of joints [rad/s]
 
 
@@ -35,7 +37,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
 
     Observations, all in the table frame: `state` (joints [rad], their speeds [rad/s], opening [m], gripper's position
     and quaternion wxyz), `objects` (position and quaternion wxyz of X, of Y and of all others, then zeros up to
-    `max_objects`), and optionally `camera`.
+    `max_objects`), and the pictures that are asked for, by name (`episodes.pictures.PICTURES`).
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 - as Gymnasium has it
@@ -52,7 +54,8 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         max_objects: int | None = None,
         max_disturbed_m: float = 0.02,
         variation: Variation | None = None,
-        camera: tuple[int, int] | None = None,
+        pictures: Sequence[str] = (),
+        picture_size: tuple[int, int] = (96, 128),
         render_mode: str | None = None,
         render_size: tuple[int, int] = (480, 640),
     ) -> None:
@@ -69,7 +72,9 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             max_objects: Rows of `objects`, for equal spaces over several scenes.
             max_disturbed_m: Allowed displacement of any other object [m].
             variation: What resets change; nothing by default. `reset(options={"variation": …})` replaces it once.
-            camera: Height and width of the picture in each observation [px]; none by default.
+            pictures: Pictures in each observation: `front`, `wrist` and `scene`, each also with `_depth` and
+                `_instances` (`episodes.pictures.PICTURES`).
+            picture_size: Their height and width [px].
             render_mode: `rgb_array` or None.
             render_size: Height and width of the pictures of `render` [px].
         """
@@ -84,11 +89,12 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         self._scene, self._reward = scene, reward
         self._max_steps = None if max_steps is None else _check_count("max_steps", max_steps, 1)
         self._variation = _check_variation(Variation() if variation is None else variation)
-        self._camera = None if camera is None else _check_size("camera", camera)
+        self._pictures = check_pictures(pictures)
+        self._picture_size = _check_size("picture_size", picture_size)
         self._render_size = _check_size("render_size", render_size)
         objects = len(self.sim.object_ids)
         self._rows = objects if max_objects is None else _check_count("max_objects", max_objects, objects)
-        self._cameras: dict[tuple[int, int], RobotCamera] = {}
+        self._cameras: dict[str, SceneCameras] = {}
         self._look: tuple[int | None, Lighting | None] = (None, None)
         self._steps = 0
         self._state: SimState | None = None
@@ -140,7 +146,9 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
 
     def render(self) -> Picture | None:
         """Render the robot camera's picture, of shape (h, w, 3); None without a render mode."""
-        return None if self.render_mode is None else self._picture(self._render_size)
+        if self.render_mode is None:
+            return None
+        return self._take("render", ("front",), self._render_size)["front"]
 
     def _ends(self, state: SimState) -> tuple[bool, bool]:
         """Return whether the episode is terminated, or else truncated."""
@@ -163,9 +171,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             "state": spaces.Box(np.array(low, dtype=np.float32), np.array(high, dtype=np.float32), dtype=np.float32),
             "objects": spaces.Box(-rows, rows, dtype=np.float32),
         }
-        if self._camera is not None:
-            seen["camera"] = spaces.Box(0, 255, (*self._camera, 3), np.uint8)
-        return spaces.Dict(seen)
+        return spaces.Dict(seen | {name: _make_picture_space(name, self._picture_size) for name in self._pictures})
 
     def _observation(self, state: SimState) -> dict[str, np.ndarray]:
         sample, arm = state.sample, self.sim.station.arm
@@ -174,14 +180,14 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         for name, values in seen.items():
             space = self.observation_space[name]
             np.clip(values, space.low, space.high, out=values)
-        return seen if self._camera is None else {**seen, "camera": self._picture(self._camera)}
+        return {**seen, **self._take("observation", self._pictures, self._picture_size)} if self._pictures else seen
 
-    def _picture(self, size: tuple[int, int]) -> Picture:
-        if size not in self._cameras:
-            station = self.sim.station
-            self._cameras[size] = RobotCamera(self._scene, station.arm, station.base, size, *self._look)
-        poses = dict(zip(self.sim.object_ids, self.sim.poses(), strict=True))
-        return self._cameras[size].picture(poses, self._now.sample.qpos)
+    def _take(self, use: str, pictures: Sequence[str], size: tuple[int, int]) -> dict[str, np.ndarray]:
+        """Take pictures of the present state; cameras are kept by their use."""
+        names, sample = self.sim.object_ids, self._now.sample
+        if use not in self._cameras:
+            self._cameras[use] = SceneCameras(self._scene, self.sim.station, names, pictures, size, *self._look)
+        return self._cameras[use].take(dict(zip(names, self.sim.poses(), strict=True)), sample.qpos, sample.tcp)
 
     @property
     def _now(self) -> SimState:
@@ -190,8 +196,14 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         return self._state
 
     def _info(self, state: SimState) -> dict[str, Any]:
-        told = {name: getattr(state, name) for name in ("success", "failure", "lifted", "at_rest", "disturbed_m")}
+        told = {name: getattr(state, name) for name in _TOLD}
         return {**told, "fingers": int(state.sample.pads).bit_count()}
+
+
+def _make_picture_space(name: str, size: tuple[int, int]) -> spaces.Box:
+    if name.endswith(DEPTH):
+        return spaces.Box(0.0, MAX_DEPTH_M, (*size, 1), np.float32)
+    return spaces.Box(0, 255, (*size, 1 if name.endswith(INSTANCES) else 3), np.uint8)
 
 
 def _check_count(name: str, value: object, least: int) -> int:

@@ -18,6 +18,7 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.episodes.instructions import read_instruction
 from tableverse_factory.delivery.episodes.observation import order_objects
+from tableverse_factory.delivery.episodes.subtasks import SUBTASKS, estimate_phase
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
 from tableverse_factory.delivery.learning.variation import Variation, displace_objects
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
@@ -46,6 +47,7 @@ class SimState(Frozen):
     success: bool
     failure: str  # `disturbed`, `fell` or `simulation_unstable` once it cannot succeed any more; else empty
     progress: float  # from 0 to 1 (`learning.reward`)
+    subtask: str  # estimated from the state; named as the phases of recordings
     disturbed_m: float  # largest displacement of any other object so far [m]
 
 
@@ -115,7 +117,7 @@ class PickPlaceSim:
             _compute_box(place_mesh(mesh, pose_from_row(row)))
             for mesh, row in zip((self.goal.x, self.goal.y), self.poses()[:2], strict=True)
         ]
-        self._stood_m = float(sample.center[2])
+        self._stood = sample.center.copy()
         return self._update_state(sample)
 
     def step(self, command: Numbers) -> SimState:
@@ -134,7 +136,8 @@ class PickPlaceSim:
         return self._update_state(sample)
 
     def _update_state(self, sample: StateSample) -> SimState:
-        rise = float(sample.center[2]) - self._stood_m
+        moved = sample.center - self._stood
+        rise = float(moved[2])
         self._lifted = self._lifted or (rise >= MIN_LIFT_M and sample.pads > 0)
         self._disturbed_m = max(self._disturbed_m, float(sample.moved_m.max(initial=0.0)))
         slow = bool(np.abs(sample.velocity).max() < SPEED_LIMIT)
@@ -142,13 +145,16 @@ class PickPlaceSim:
         self._failure = self._failure or self._check_simulation(sample)
         at_rest = self._still_s >= HOLD_S - 1e-9
         done = self._lifted and at_rest and not sample.pads and not self._failure and self._holds(sample)
-        return SimState(sample, self._lifted, at_rest, done, self._failure, self._progress(sample), self._disturbed_m)
+        fingers, ways = sample.pads.bit_count(), self._measure_ways(sample)
+        progress = compute_progress(self._lifted, fingers, *ways)
+        subtask = SUBTASKS[estimate_phase(self._lifted, fingers, *ways, rise, float(np.hypot(*moved[:2])))]
+        return SimState(sample, self._lifted, at_rest, done, self._failure, progress, subtask, self._disturbed_m)
 
-    def _progress(self, sample: StateSample) -> float:
+    def _measure_ways(self, sample: StateSample) -> tuple[float, float]:
+        """Measure how far the gripper is from the object, and that from its goal [m]."""
         (_, x_half), (y, y_half) = self._boxes
         way_m = compute_goal_distance(self.goal.relation, sample.center, y, x_half, y_half)
-        reach_m = float(np.linalg.norm(sample.tcp[:3] - sample.center))
-        return compute_progress(self._lifted, sample.pads.bit_count(), reach_m, way_m)
+        return float(np.linalg.norm(sample.tcp[:3] - sample.center)), way_m
 
     def _check_simulation(self, sample: StateSample) -> str:
         if sample.warnings:

@@ -14,9 +14,9 @@ def test_without_a_command_a_dataset_is_passed_on(run, tmp_path, words):
 
 @pytest.mark.heavy
 def test_both_formats_are_written_and_counted(run, out, tmp_path):
-    small = ("--width", "32", "--height", "24", "--fps", "4", "--camera", "robot")
+    small = ("--width", "32", "--height", "24", "--fps", "4", "--picture", "front")
     code, said, _ = run("export", "lerobot", out, tmp_path / "made", *small)
-    assert (code, said) == (0, f"2 episodes, 16 frames of observation.images.robot, in {tmp_path / 'made'}\n")
+    assert (code, said) == (0, f"2 episodes, 16 frames of front, in {tmp_path / 'made'}\n")
     code, said, _ = run("export", "robomimic", out, tmp_path / "made.hdf5", "--failed")
     assert (code, said) == (0, f"3 demonstrations, 103 samples, in {tmp_path / 'made.hdf5'}\n")
 

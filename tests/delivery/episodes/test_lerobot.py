@@ -33,7 +33,7 @@ from tests.helpers.recorded_dataset import (
 pytestmark = pytest.mark.heavy
 
 SMALL = {"width": 64, "height": 48}
-CAMERAS = ["observation.images.robot", "observation.images.scene"]
+CAMERAS = ["observation.images.front", "observation.images.scene"]
 LENGTHS = [41, 31, 31]
 DTYPES = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string()}
 ORIGIN = {"split": "train", "paraphrases": [], "scene_id": "a-1", "success": True, "licence": ""}
@@ -43,8 +43,8 @@ FIGURES = ("min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q9
 @pytest.fixture(scope="module")
 def made(out, tmp_path_factory) -> Path:
     dest = tmp_path_factory.mktemp("lerobot") / "made"
-    written = export_lerobot(open_dataset(out), dest, LeRobotOptions(failed=True, cameras=("robot", "scene"), **SMALL))
-    assert (written.episodes, written.frames, list(written.cameras)) == (3, sum(LENGTHS), CAMERAS)
+    written = export_lerobot(open_dataset(out), dest, LeRobotOptions(failed=True, pictures=("front", "scene"), **SMALL))
+    assert (written.episodes, written.frames, written.pictures) == (3, sum(LENGTHS), ("front", "scene"))
     return dest
 
 
@@ -280,20 +280,20 @@ def test_files_are_closed_at_their_bounds(out, tmp_path):
     """Episodes stay whole; a new file begins before the bound is passed, and its clock at zero."""
     from tableverse_factory.delivery.episodes.frames import list_features
     from tableverse_factory.delivery.episodes.lerobot_files import LeRobotFiles
-    from tableverse_factory.delivery.episodes.render_workers import ROBOT_CAMERA, RenderSetting, render_episode
+    from tableverse_factory.delivery.episodes.render_workers import RenderSetting, render_episode
     from tableverse_factory.delivery.episodes.selection import get_kind, open_episode, select_rows
 
     row = select_rows(open_dataset(out), failed=False)[0]
-    setting = RenderSetting(get_kind(open_episode(open_dataset(out), row)), (ROBOT_CAMERA,), 32, 24, 5, 4, 2)
+    setting = RenderSetting(get_kind(open_episode(open_dataset(out), row)), ("front",), 32, 24, 5, 4, 2)
     shot = render_episode(str(out), setting, row)
-    megabytes = 2.5 * len(shot.videos[ROBOT_CAMERA]) / 1024**2
+    megabytes = 2.5 * len(shot.videos[CAMERAS[0]]) / 1024**2
     files = LeRobotFiles(tmp_path / "made", setting, list_features(load_arm("panda"), 2), 0.002, megabytes)
     for _ in range(5):
         files.add("Do it.", shot, ORIGIN)
     files.finish()
     rows = pq.read_table(tmp_path / "made/meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    assert [row[f"videos/{ROBOT_CAMERA}/file_index"] for row in rows] == [0, 0, 1, 1, 2]
-    starts = [row[f"videos/{ROBOT_CAMERA}/from_timestamp"] for row in rows]
+    assert [row[f"videos/{CAMERAS[0]}/file_index"] for row in rows] == [0, 0, 1, 1, 2]
+    starts = [row[f"videos/{CAMERAS[0]}/from_timestamp"] for row in rows]
     assert starts == [0.0, 2.25, 0.0, 2.25, 0.0]
     assert [row["data/file_index"] for row in rows] == [0, 1, 2, 3, 4]
     for index, row in enumerate(rows):
@@ -346,7 +346,9 @@ def test_robots_and_rhythms_are_not_mixed(tmp_path):
 def test_the_camera_of_a_scene_that_has_none_is_said(tmp_path):
     source = two_scenes(tmp_path / "out", photographed=False)
     with pytest.raises(InputError) as refused:
-        export_lerobot(open_dataset(source), tmp_path / "made", LeRobotOptions(width=32, height=24, cameras=("scene",)))
+        export_lerobot(
+            open_dataset(source), tmp_path / "made", LeRobotOptions(width=32, height=24, pictures=("scene",))
+        )
     assert refused.value.reason == "no_camera"
 
 

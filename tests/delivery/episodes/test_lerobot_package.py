@@ -50,7 +50,7 @@ def test_the_numbers_are_those_that_the_environment_shows(out, made):
 @pytest.mark.filterwarnings("ignore")
 def test_lerobot_reads_frames_statistics_and_delta_timestamps(made):
     lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
-    deltas = {"observation.state": [-0.04, 0.0], "action": [0.0, 0.04, 0.08], "observation.images.robot": [-0.04, 0.0]}
+    deltas = {"observation.state": [-0.04, 0.0], "action": [0.0, 0.04, 0.08], "observation.images.front": [-0.04, 0.0]}
     dataset = lerobot.LeRobotDataset("tableverse", root=made, delta_timestamps=deltas, video_backend="pyav")
     info = json.loads((made / "meta/info.json").read_text())
     assert (
@@ -59,7 +59,7 @@ def test_lerobot_reads_frames_statistics_and_delta_timestamps(made):
         == (len(dataset), 4)
     )
     first, last = dataset[0], dataset[len(dataset) - 1]
-    assert first["observation.images.robot"].shape == (2, 3, 48, 64)
+    assert first["observation.images.front"].shape == (2, 3, 48, 64)
     assert first["observation.environment_state"].shape == (21,)
     assert first["observation.state_is_pad"].tolist() == [True, False]
     assert last["action_is_pad"].tolist() == [False, True, True]

@@ -11,14 +11,15 @@ import pytest
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
-from tableverse_factory.delivery.episodes.demonstration import build_demonstration
-from tableverse_factory.delivery.episodes.robomimic import export_robomimic
+from tableverse_factory.delivery.episodes.demonstration import DemonstrationSetting, build_demonstration
+from tableverse_factory.delivery.episodes.robomimic import RobomimicOptions, export_robomimic
 from tableverse_factory.delivery.episodes.selection import Episode
 from tableverse_factory.robotics.robots.registry import load_arm
 from tests.helpers.recorded_dataset import STEP_S, X_ID, Y_ID, recording
 
 pytestmark = pytest.mark.heavy
 
+SETTING = DemonstrationSetting(3, (), (24, 32))
 LENGTHS = {"demo_0": 41, "demo_1": 31, "demo_2": 31}
 OBSERVATIONS = {
     "object": 14,
@@ -34,7 +35,7 @@ OBSERVATIONS = {
 @pytest.fixture(scope="module")
 def made(out, tmp_path_factory) -> Path:
     dest = tmp_path_factory.mktemp("robomimic") / "made.hdf5"
-    written = export_robomimic(open_dataset(out), dest, failed=True)
+    written = export_robomimic(open_dataset(out), dest, RobomimicOptions(failed=True))
     assert (written.demos, written.samples) == (3, sum(LENGTHS.values()))
     return dest
 
@@ -125,12 +126,12 @@ def test_speeds_of_the_object_are_those_of_its_way(file):
 
 
 def test_the_same_bytes_again(out, made, tmp_path):
-    export_robomimic(open_dataset(out), tmp_path / "again.hdf5", failed=True)
+    export_robomimic(open_dataset(out), tmp_path / "again.hdf5", RobomimicOptions(failed=True))
     assert (tmp_path / "again.hdf5").read_bytes() == made.read_bytes()
 
 
 def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
-    assert export_robomimic(open_dataset(out), tmp_path / "made.hdf5").demos == 2
+    assert export_robomimic(open_dataset(out), tmp_path / "made.hdf5", RobomimicOptions()).demos == 2
     with h5py.File(tmp_path / "made.hdf5") as file:
         assert sorted(file["mask"]) == ["success", "train"]
 
@@ -138,7 +139,7 @@ def test_only_successes_are_taken_unless_failures_are_wanted(out, tmp_path):
 def test_nothing_is_overwritten(out, tmp_path):
     (tmp_path / "made.hdf5").write_text("mine")
     with pytest.raises(InputError, match="already there"):
-        export_robomimic(open_dataset(out), tmp_path / "made.hdf5")
+        export_robomimic(open_dataset(out), tmp_path / "made.hdf5", RobomimicOptions())
     assert (tmp_path / "made.hdf5").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["made.hdf5"]
 
@@ -146,7 +147,7 @@ def test_nothing_is_overwritten(out, tmp_path):
 def test_what_was_pushed_is_in_states_and_observations(out):
     taken = recording(pushed=True)
     row = {"x_id": X_ID, "y_id": Y_ID, "success": True, "scene_id": "a-1", "task_id": "task_000"}
-    made = build_demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), load_arm("panda"), 3)
+    made = build_demonstration(Episode(row, open_dataset(out).scene("a-1"), taken), load_arm("panda"), SETTING)
     model = mujoco.MjModel.from_xml_string(made.model, dict(made.assets))
     at = int(model.joint(int(model.body(Y_ID).jntadr[0])).qposadr[0])
     pushed = taken.moved_poses[:, 0]
@@ -155,7 +156,6 @@ def test_what_was_pushed_is_in_states_and_observations(out):
     assert (made.observations["object"][:, 14:] == 0).all(), "of a third object, which other scenes may have"
     speed = made.states[1:, 1 + model.nq + int(model.body(Y_ID).dofadr[0])]
     assert speed == pytest.approx(np.full(40, -0.06 / 40 / STEP_S), abs=1e-4)
+    strange = Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",)))
     with pytest.raises(InputError, match="'table' is no object that can move"):
-        build_demonstration(
-            Episode(row, open_dataset(out).scene("a-1"), replace(taken, moved_ids=("table",))), load_arm("panda"), 3
-        )
+        build_demonstration(strange, load_arm("panda"), SETTING)

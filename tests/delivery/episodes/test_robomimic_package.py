@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from tableverse_factory import open_dataset
-from tableverse_factory.delivery.episodes.robomimic import export_robomimic
+from tableverse_factory.delivery.episodes.demonstration import name_picture
+from tableverse_factory.delivery.episodes.robomimic import RobomimicOptions, export_robomimic
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
 pytestmark = pytest.mark.slow
+
+OPTIONS = RobomimicOptions(pictures=("front", "wrist", "front_depth", "front_instances"), width=64, height=48)
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +25,7 @@ def out(tmp_path_factory):
 @pytest.fixture(scope="module")
 def made(out, tmp_path_factory):
     dest = tmp_path_factory.mktemp("exported") / "made.hdf5"
-    export_robomimic(open_dataset(out), dest)
+    export_robomimic(open_dataset(out), dest, OPTIONS)
     return dest
 
 
@@ -34,6 +37,9 @@ def test_the_environment_of_env_args_exists_and_the_actions_succeed_in_it(out, m
             where = {"dataset": str(out), "scene": meta["scene_id"], "task": meta["task_id"]}
             env = gymnasium.make(arguments["env_name"], **where, **arguments["env_kwargs"])
             observation, info = env.reset(seed=0)
+            for name in OPTIONS.pictures:
+                away = np.abs(observation[name].astype(float) - demo["obs"][name_picture(name)][0])
+                assert (away > 2).mean() < 0.03, "the gripper may open elsewhere before the recording"
             assert info["instruction"] == meta["lang"]
             seen = demo["obs/object"][0].reshape(-1, 7)[:, [0, 1, 2, 6, 3, 4, 5]]
             assert np.allclose(observation["objects"], seen, atol=1e-6)
@@ -47,7 +53,7 @@ def test_the_environment_of_env_args_exists_and_the_actions_succeed_in_it(out, m
 
 @pytest.mark.filterwarnings("ignore")
 def test_robomimic_trains_and_validates_on_it(made, tmp_path):
-    """Two epochs of behaviour cloning by its own script, on states, with the masks `train` and `valid`."""
+    """Two epochs of behaviour cloning by its own script, on states and pictures, with the masks `train` and `valid`."""
     pytest.importorskip("robomimic", reason="robomimic is not installed")
     import robomimic.utils.torch_utils
     from robomimic.config import config_factory
@@ -63,7 +69,8 @@ def test_robomimic_trains_and_validates_on_it(made, tmp_path):
         config.experiment.epoch_every_n_steps = config.experiment.validation_epoch_every_n_steps = 10
         config.experiment.logging.log_tb = config.experiment.logging.terminal_output_to_txt = False
         config.observation.modalities.obs.low_dim = ["robot0_joint_pos", "robot0_gripper_qpos", "object"]
-        config.observation.modalities.obs.rgb = []
+        config.observation.modalities.obs.rgb = ["agentview_image", "robot0_eye_in_hand_image"]
+        config.observation.encoder.rgb.core_kwargs.pool_kwargs.num_kp = 4
         config.lock()
     train(config, robomimic.utils.torch_utils.get_torch_device(try_to_use_cuda=False))
     assert list(tmp_path.glob("runs/**/*.pth"))

@@ -10,7 +10,7 @@ import pytest
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions, export_lerobot
-from tableverse_factory.delivery.episodes.robomimic import export_robomimic
+from tableverse_factory.delivery.episodes.robomimic import RobomimicOptions, export_robomimic
 from tableverse_factory.delivery.episodes.robot import load_recorded_arm
 from tableverse_factory.robotics.execution.arrays import Recording, encode_recording
 from tableverse_factory.robotics.robots.registry import load_arm
@@ -71,7 +71,7 @@ def test_no_export_and_no_gallery_opens_the_file_that_arrays_name(tmp_path, fifo
     with pytest.raises(InputError, match="has to be given"):
         export_lerobot(dataset, tmp_path / "made", LeRobotOptions(width=32, height=24))
     with pytest.raises(InputError, match="has to be given"):
-        export_robomimic(dataset, tmp_path / "made.hdf5")
+        export_robomimic(dataset, tmp_path / "made.hdf5", RobomimicOptions())
     (motion,) = write_motions(dataset.scene("a-1"), tmp_path, films=9)
     assert "has to be given" in motion.problem
     assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.xml", "out"]

@@ -18,6 +18,7 @@ from tests.helpers.learnable_dataset import write_learnable_dataset
 pytestmark = pytest.mark.heavy
 
 ID = "tableverse_factory.gym:TableVerse/PickPlace-v0"
+PICTURES = {"pictures": ("front", "wrist"), "picture_size": (48, 64)}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def test_scenes_of_one_picture_share_a_split_and_the_shares_are_kept():
 
 
 def test_both_checkers_of_gymnasium_are_content(out):
-    env = gymnasium.make(ID, dataset=str(out), camera=(48, 64), render_mode="rgb_array", render_size=(48, 64))
+    env = gymnasium.make(ID, dataset=str(out), **PICTURES, render_mode="rgb_array", render_size=(48, 64))
     check_env(env.unwrapped)
     observation, info = env.reset(seed=0)
     assert env.observation_space.contains(observation)
@@ -122,7 +123,7 @@ def test_stable_baselines3_is_content_and_learns(out):
     from stable_baselines3.common.env_util import make_vec_env
 
     for names in ({}, {"scene": "s-0", "task": "task_000", "reward": "dense"}):
-        checker.check_env(gymnasium.make(ID, dataset=str(out), camera=(48, 64), **names))
+        checker.check_env(gymnasium.make(ID, dataset=str(out), **PICTURES, **names))
     envs = make_vec_env(ID, n_envs=2, env_kwargs={"dataset": str(out)})
     model = PPO("MultiInputPolicy", envs, n_steps=32, batch_size=32, n_epochs=1, device="cpu").learn(64)
     assert model.num_timesteps == 64

@@ -15,6 +15,7 @@ import tableverse_factory
 from schemas.curation import Relation
 from tableverse_factory import TableEnv, Variation, open_dataset
 from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.delivery.episodes.pictures import PICTURES
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
 from tableverse_factory.delivery.learning.variation import displace_objects
 
@@ -42,7 +43,9 @@ def replayed(env, recording, seed=0):
 
 def test_gymnasium_finds_nothing_to_complain_about(out):
     """Its checker warns where it is not content, and warnings are errors here."""
-    env = gymnasium.make(ID, dataset=str(out), scene="s-0", task="task_000", camera=(48, 64), render_size=(48, 64))
+    env = gymnasium.make(
+        ID, dataset=str(out), scene="s-0", task="task_000", pictures=PICTURES[:6], picture_size=(48, 64)
+    )
     check_env(env.unwrapped)
     assert env.unwrapped.sim.instruction == "Pick up the wooden block and place it next to the bowl"
 
@@ -165,14 +168,14 @@ def test_places_that_were_tried_leave_no_trace(scene):
 
 
 def test_looks_change_pictures_and_nothing_else(scene):
-    env = TableEnv(scene, "task_000", camera=(60, 80))
+    env = TableEnv(scene, "task_000", pictures=("front",), picture_size=(60, 80))
     plain, _ = env.reset(seed=1)
     seen = [env.reset(seed=s, options={"variation": Variation(table=True, lights=True)})[0] for s in (1, 1, 2)]
-    assert np.array_equal(seen[0]["camera"], seen[1]["camera"])
+    assert np.array_equal(seen[0]["front"], seen[1]["front"])
     for one, other in ((plain, seen[0]), (seen[0], seen[2])):
-        assert np.abs(one["camera"].astype(int) - other["camera"]).mean() > 2
+        assert np.abs(one["front"].astype(int) - other["front"]).mean() > 2
         assert np.array_equal(one["objects"], other["objects"])
-    assert np.array_equal(env.reset(seed=1)[0]["camera"], plain["camera"])
+    assert np.array_equal(env.reset(seed=1)[0]["front"], plain["front"])
 
 
 def test_pictures_follow_what_happens(scene):
@@ -258,8 +261,9 @@ def test_gymnasium_knows_how_long_an_episode_may_be(out):
         ({"max_objects": 0}, "max_objects 0: give a whole number from 3 on"),
         ({"max_disturbed_m": -1.0}, "max_disturbed_m -1.0: give a length"),
         ({"max_disturbed_m": float("nan")}, "max_disturbed_m nan: give a length"),
-        ({"camera": (0, 0)}, r"camera \(0, 0\): give height and width, each from 1 to 4096 px"),
-        ({"camera": (48,)}, r"camera \(48,\): give height and width"),
+        ({"picture_size": (0, 0)}, r"picture_size \(0, 0\): give height and width, each from 1 to 4096 px"),
+        ({"picture_size": (48,)}, r"picture_size \(48,\): give height and width"),
+        ({"pictures": ("front", "side")}, "no picture 'side'; there are front, front_depth, front_instances, wrist"),
         ({"render_size": 48}, "render_size 48: give height and width"),
         ({"variation": {"position_m": 0.1}}, "variation {'position_m': 0.1}: give a Variation"),
     ],
