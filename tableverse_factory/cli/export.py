@@ -102,6 +102,26 @@ def _list_pictures(given: list[_Picture] | None) -> tuple[str, ...]:
     return tuple(dict.fromkeys(picture.value for picture in given or ()))
 
 
+@export.command("pictures")
+def export_pictures(
+    out: FinishedOut,
+    dest: Annotated[
+        Path, typer.Argument(metavar="DEST", callback=require_local_path, help="A folder that does not exist yet.")
+    ],
+) -> None:
+    """Write photographs, masks, labels and instructions as a table with image columns, for `datasets.load_dataset`.
+
+    Example: `tableverse export pictures out out-pictures`
+    """
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.delivery.formats.picture_table import export_pictures as write
+
+    with count_progress("scenes") as count:
+        counts = write(open_dataset(out), dest, count.update)
+    print(f"{', '.join(f'{split} {rows}' for split, rows in counts.items())}, in {dest}")
+
+
 @export.command("lerobot")
 def export_lerobot(
     out: FinishedOut,
