@@ -1,7 +1,6 @@
 """Photographs, masks and words of all scenes as one table with image columns, for the package `datasets` and the Hub.
 
-DEST/README.md                             the card, by which `load_dataset` finds the splits
-DEST/data/SPLIT-00000.parquet              a row per scene that was made from a picture
+Its card leads `load_dataset` to data/SPLIT-00000.parquet and further files, with a row per scene made from a picture.
 """
 
 import json
@@ -164,8 +163,8 @@ def _make_card(counts: dict[str, int], licences: Counter[str]) -> str:
     parts = [
         f"---\n{yaml.safe_dump(head, sort_keys=False)}---",
         "# Photographs of table-tops with masks and instructions",
-        f"{pluralize(sum(counts.values()), 'scene')} of TableVerse Factory. `mask_values` are the pixels of `masks` that show "
-        "each of `labels`; the certified scenes themselves are found by `scene_id`.",
+        f"{pluralize(sum(counts.values()), 'scene')} of TableVerse Factory. `mask_values` are the pixels of `masks` "
+        "that show each of `labels`; the certified scenes themselves are found by `scene_id`.",
         f"Licences: {named}.",
     ]
     return "\n\n".join(parts) + "\n"

@@ -7,6 +7,9 @@ import pytest
 
 from tableverse_factory import TableEnv, open_dataset
 from tableverse_factory.delivery.episodes.lerobot import LeRobotOptions, export_lerobot
+from tableverse_factory.delivery.episodes.pictures import take_recorded_pictures
+from tableverse_factory.delivery.episodes.selection import open_episode, select_rows
+from tableverse_factory.robotics.robots.registry import load_arm
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
 pytestmark = pytest.mark.slow
@@ -109,6 +112,29 @@ def test_act_takes_a_step_on_it(made, pictures):
         optimizer.step()
         losses.append(float(loss))
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_lerobot_reads_depth_in_metres_and_instances_exactly(out, tmp_path):
+    """From its version 0.6 on, which knows videos of depth."""
+    pytest.importorskip("lerobot.datasets.depth_utils", reason="LeRobot 0.6 is not installed")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    pictures = ("front", "front_depth", "wrist_instances")
+    dataset = open_dataset(out)
+    export_lerobot(dataset, tmp_path / "made", LeRobotOptions(fps=5, width=64, height=48, pictures=pictures))
+    episode = open_episode(dataset, select_rows(dataset, failed=False)[0])
+    samples = list(range(0, len(episode.recording), 10))
+    truth = take_recorded_pictures(pictures, episode, load_arm("panda"), (48, 64), samples)
+    read = LeRobotDataset("tableverse", root=tmp_path / "made", video_backend="pyav", depth_output_unit="m")
+    first = [e["scene_id"] for e in read.meta.episodes].index(episode.scene.scene_id)
+    start = read.meta.episodes[first]["dataset_from_index"]
+    for number in (0, 12, len(samples) - 1):
+        item = read[start + number]
+        depth = item["observation.images.front_depth"][0].numpy()
+        assert np.abs(depth - truth["front_depth"][number][..., 0]).max() < 0.00051
+        labels = np.rint(item["observation.images.wrist_instances"][0].numpy() * 255)
+        assert np.array_equal(labels, truth["wrist_instances"][number][..., 0])
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -125,6 +125,27 @@ def test_speeds_of_the_object_are_those_of_its_way(file):
     assert speeds[1:] == pytest.approx(np.diff(way, axis=0) / STEP_S, abs=1e-3)
 
 
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_pictures_are_observations_and_do_not_depend_on_the_number_of_processes(out, made, tmp_path, jobs):
+    options = RobomimicOptions(pictures=("front", "wrist_depth", "front_instances"), width=16, height=12, jobs=jobs)
+    export_robomimic(open_dataset(out), tmp_path / "seen.hdf5", options)
+    with h5py.File(tmp_path / "seen.hdf5") as file:
+        seen = file["data/demo_0/obs"]
+        shapes = {name: (values.shape, values.dtype.name) for name, values in seen.items() if name not in OBSERVATIONS}
+        arguments = json.loads(file["data"].attrs["env_args"])
+        assert np.unique(seen["agentview_segmentation_instance"]).max() == 255
+        assert not np.array_equal(seen["agentview_image"][0], seen["agentview_image"][40])
+    assert shapes == {
+        "agentview_image": ((41, 12, 16, 3), "uint8"),
+        "agentview_segmentation_instance": ((41, 12, 16, 1), "uint8"),
+        "robot0_eye_in_hand_depth": ((41, 12, 16, 1), "float32"),
+    }
+    assert arguments["env_kwargs"]["picture_size"] == [12, 16]
+    if jobs > 1:
+        export_robomimic(open_dataset(out), tmp_path / "alone.hdf5", replace(options, jobs=1))
+        assert (tmp_path / "alone.hdf5").read_bytes() == (tmp_path / "seen.hdf5").read_bytes()
+
+
 def test_the_same_bytes_again(out, made, tmp_path):
     export_robomimic(open_dataset(out), tmp_path / "again.hdf5", RobomimicOptions(failed=True))
     assert (tmp_path / "again.hdf5").read_bytes() == made.read_bytes()
