@@ -147,7 +147,8 @@ class PickPlaceSim:
         done = self._lifted and at_rest and not sample.pads and not self._failure and self._holds(sample)
         fingers, ways = sample.pads.bit_count(), self._measure_ways(sample)
         progress = compute_progress(self._lifted, fingers, *ways)
-        subtask = SUBTASKS[estimate_phase(self._lifted, fingers, *ways, rise, float(np.hypot(*moved[:2])))]
+        way_m, speed = (float(np.hypot(*vector[:2])) for vector in (moved, sample.velocity))
+        subtask = SUBTASKS[estimate_phase(self._lifted, fingers, ways[0], rise, way_m, speed)]
         return SimState(sample, self._lifted, at_rest, done, self._failure, progress, subtask, self._disturbed_m)
 
     def _measure_ways(self, sample: StateSample) -> tuple[float, float]:
