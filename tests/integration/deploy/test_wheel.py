@@ -21,6 +21,14 @@ from tests.helpers.paths import ROOT
 PACKAGES = ("schemas", "tableverse_factory", "workers")
 BUILD = "import sys, hatchling.build; hatchling.build.build_wheel(sys.argv[1])"
 """What `make build` has pip do, without pip's own environment, for which an index would be asked."""
+MAKE = """
+import gymnasium
+try:
+    gymnasium.make("tableverse_factory.gym:TableVerse/PickPlace-v0", dataset="out")
+except Exception as error:
+    print(error)
+"""
+"""Asks for a dataset's environment by its name alone; this dataset has no motions."""
 SUFFIXES = (".py", ".typed", ".html", ".css", ".js", ".svg", ".json", ".yaml", ".onnx", ".sha256", ".cu")
 ELSEWHERE = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
 
@@ -119,6 +127,7 @@ def test_it_runs_where_the_checkout_is_out_of_reach(tableverse, tmp_path):
     build = ("build", "images.parquet", "out", "--config", "config.yaml", "--executor", "local")
     run(tableverse, *build, folder=tmp_path)
     assert json.loads(run(tableverse, "status", "out", "--json", folder=tmp_path))["remaining"] == 0
+    assert "no motion of panda" in run(tableverse.with_name("python"), "-c", MAKE, folder=tmp_path)
     run(tableverse, "report", "out", "--jobs", 1, folder=tmp_path)
     assert (tmp_path / "out-gallery" / "index.html").is_file()
 
