@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from schemas.identity import SafeId
 
-MAX_DONORS = 12
+MAX_DONORS = 9
 
 
 class Change(StrEnum):
@@ -29,6 +29,8 @@ class Donor(BaseModel):
     replaces: SafeId
     scene_id: SafeId
     object_id: SafeId
+    digest: Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
+    """Of what the tables say of it (`dataset.cousin_rows.digest_objects`)."""
 
 
 class Recipe(BaseModel):

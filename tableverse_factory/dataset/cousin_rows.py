@@ -38,6 +38,7 @@ THEMES: Sequence[tuple[Change, ...]] = (  # each cousin of a scene takes the nex
     (Change.SWAP, Change.MOVE, Change.MIRROR),
 )
 DONORS_PER_OBJECT = 3
+DIGEST_CHARS = 12
 LEAST_SHAPE_RATIO = 1.02  # between the ratios of two things' sides: below, they may be the same thing
 MAX_SIZE_RATIO = 1.6  # of each side, sorted, of things that may take each other's place
 _SCENE_COLUMNS = ("scene_id", "name", "url", "source", "licence", "family", "status", "shard", "mesh_licences")
@@ -81,12 +82,14 @@ def list_cousins(dataset: Dataset, per_scene: int, seed: int, classify: Callable
     for item in dataset.objects.to_table(columns=list(_OBJECT_COLUMNS)).to_pylist():
         objects[item["scene_id"]].append({**item, "kind": classify(item["relabel_name"] or item["label"])})
     stocks = _stock_objects(objects, family_of)
+    digests = {scene_id: digest_objects(objects[scene_id]) for scene_id in family_of}
     for row in done:
         scene_id = row["scene_id"]
         for index in range(per_scene):
             rng = make_rng(seed, scene_id, f"cousin {index}")
             donors = _choose_donors(objects[scene_id], stocks, find_split(family_of[scene_id]), rng)
-            yield _make_row(dataset.path, row, family_of[scene_id], index, donors, objects, seed)
+            identity = f"{scene_id} {index} {seed}"
+            yield _make_row(dataset.path, row, family_of[scene_id], index, donors, digests[scene_id], identity)
 
 
 def digest_objects(rows: Iterable[Row]) -> str:
@@ -138,7 +141,8 @@ def _choose_donors(
         other = ratio.max(axis=1) / ratio.min(axis=1) >= LEAST_SHAPE_RATIO
         for number in rng.permutation(np.flatnonzero(like & other))[:DONORS_PER_OBJECT].tolist():
             donor = stock.rows[number]
-            chosen.append(Donor(replaces=item["object_id"], scene_id=donor["scene_id"], object_id=donor["object_id"]))
+            where = {"scene_id": donor["scene_id"], "object_id": donor["object_id"]}
+            chosen.append(Donor(replaces=item["object_id"], digest=digest_objects([donor])[:DIGEST_CHARS], **where))
         if len(chosen) + DONORS_PER_OBJECT > MAX_DONORS:
             break
     return tuple(chosen)
@@ -150,35 +154,29 @@ def _make_row(
     family: str,
     index: int,
     donors: tuple[Donor, ...],
-    objects: Mapping[str, Sequence[Row]],
-    seed: int,
+    digest: str,
+    identity: str,
 ) -> ImageRow:
     theme = THEMES[index % len(THEMES)]
     if not donors:
         theme = tuple(dict.fromkeys(Change.TURN if change is Change.SWAP else change for change in theme))
     recipe = Recipe(changes=theme, donors=donors if Change.SWAP in theme else ())
-    content = digest_inputs(parent["scene_id"], recipe, objects)
-    identity = content_hash(content.encode(), f"{parent['scene_id']} {index} {seed}".encode())
+    text = recipe.model_dump_json(exclude_defaults=True)
+    own = content_hash(digest.encode(), text.encode(), identity.encode())
     name = f"{_name_parent(parent)}-c{index:02d}"
     return ImageRow(
-        scene_id=f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[-60:].strip('-_')}-{identity[:12]}",
+        scene_id=f"{re.sub(r'[^A-Za-z0-9_]+', '-', name)[-60:].strip('-_')}-{own[:12]}",
         kind=SceneKind.COUSIN,
         uri=path,
         name=name,
-        content_sha256=content,
+        content_sha256=digest,
         url=parent["url"] or "",
         source=parent["source"] or "",
         licence=parent["licence"] or "",
         parent=parent["scene_id"],
         family=family,
-        recipe=recipe.model_dump_json(exclude_defaults=True),
+        recipe=text,
     )
-
-
-def digest_inputs(parent: str, recipe: Recipe, objects: Mapping[str, Sequence[Row]]) -> str:
-    """Hash what the tables say of a cousin's parent and of the objects that may come into it; `objects` by scene."""
-    lent = [row for donor in recipe.donors for row in objects[donor.scene_id] if row["object_id"] == donor.object_id]
-    return content_hash(digest_objects(objects[parent]).encode(), digest_objects(lent).encode())
 
 
 def _name_parent(parent: Row) -> str:

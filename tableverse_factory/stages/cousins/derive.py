@@ -1,24 +1,27 @@
 """First stage of cousins: a finished scene of a dataset, changed as the recipe says where there is room."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
 from schemas.config import Config, ObserveConfig
-from schemas.cousins import Change, Recipe, parse_recipe
+from schemas.cousins import Change, Donor, Recipe, parse_recipe
 from schemas.manifest import ImageRow
 from schemas.objects import PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import GeometryError, InputError
-from tableverse_factory.dataset.cousin_rows import digest_inputs
-from tableverse_factory.dataset.dataset import Dataset, Scene, open_dataset
+from tableverse_factory.dataset.cousin_rows import DIGEST_CHARS, digest_objects
+from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.cousins.arrangement import Arrangement
 from tableverse_factory.stages.cousins.changes import Draft
 from tableverse_factory.stages.cousins.parent import read_parent, read_scene_object
 from tableverse_factory.stages.cousins.reflection import mirror_object
+
+Row = Mapping[str, Any]
 
 _open = lru_cache(2)(open_dataset)  # its index of scenes is read once in a process
 
@@ -39,8 +42,9 @@ def derive_cousin(
     try:
         recipe = _read_recipe(item)
         dataset = _open(item.uri)
-        _check_content(item, recipe, dataset)
-        parent = read_parent(dataset.scene(item.parent), config.observe)
+        scene = dataset.scene(item.parent)
+        _check_content(item.uri, item.content_sha256, scene.object_rows())
+        parent = read_parent(scene, config.observe)
         draft = Draft(Arrangement(parent.objects, parent.table), rng, _list_donors(dataset, recipe, config.observe))
         for change in recipe.changes:
             if change is not Change.MIRROR:
@@ -70,14 +74,12 @@ def _read_recipe(item: ImageRow) -> Recipe:
         raise InputError(f"{error}: `tableverse cousins` writes recipes", "bad_recipe") from error
 
 
-def _check_content(item: ImageRow, recipe: Recipe, dataset: Dataset) -> None:
-    scenes = {item.parent, *(donor.scene_id for donor in recipe.donors)}
-    found = digest_inputs(item.parent, recipe, {name: dataset.scene(name).object_rows() for name in sorted(scenes)})
-    if item.content_sha256 and found != item.content_sha256:
-        change = f"sha256 {found[:12]}, not {item.content_sha256[:12]}"
-        raise InputError(
-            f"the dataset is not the one that was planned with ({change}): run it again", "content_changed"
-        )
+def _check_content(uri: str, digest: str, rows: Sequence[Row]) -> None:
+    """Compare what the tables say of objects with what they said when the cousin was planned."""
+    if not (found := digest_objects(rows)).startswith(digest):
+        change = f"sha256 {found[:DIGEST_CHARS]}, not {digest[:DIGEST_CHARS]}"
+        problem = f"{uri} is not the dataset that was planned with ({change}): run tableverse cousins again"
+        raise InputError(problem, "content_changed")
 
 
 def _list_donors(
@@ -86,16 +88,15 @@ def _list_donors(
     """List the readers of things that may replace an object, by its id; they are read when they are tried."""
     found: dict[str, list[tuple[str, Callable[[], PlacedObject]]]] = {}
     for donor in recipe.donors:
-        read = partial(_read_donor, dataset, donor.scene_id, donor.object_id, bounds)
+        read = partial(_read_donor, dataset, donor, bounds)
         found.setdefault(donor.replaces, []).append((f"{donor.scene_id}/{donor.object_id}", read))
     return found
 
 
-def _read_donor(dataset: Dataset, scene_id: str, object_id: str, bounds: ObserveConfig) -> PlacedObject:
+def _read_donor(dataset: Dataset, donor: Donor, bounds: ObserveConfig) -> PlacedObject:
     """Read an object of another scene; without a licence of its own, its mesh has that of its scene."""
-    scene: Scene = dataset.scene(scene_id)
-    rows = [row for row in scene.object_rows() if row["object_id"] == object_id]
-    if not rows:
-        raise InputError(f"scene {scene_id} has no object {object_id}", "bad_scene")
+    scene = dataset.scene(donor.scene_id)
+    rows = [row for row in scene.object_rows() if row["object_id"] == donor.object_id]
+    _check_content(dataset.path, donor.digest, rows)
     thing = read_scene_object(scene, rows[0], bounds)
     return replace(thing, mesh_licence=thing.mesh_licence or scene.row["licence"] or "unknown", contained_in=None)
