@@ -33,7 +33,7 @@ def cousins(
     max_calls: options.MaxCalls = None,
     metrics: options.Metrics = None,
 ) -> None:
-    """Make new scenes of finished ones, by changing what stands where.
+    """Make new scenes of finished ones: other things, elsewhere.
 
     Things are swapped for others of their kind, rescaled, turned, moved and removed, and whole scenes mirrored. Each
     cousin is separated, settled, judged and certified like any scene, or dropped with its reason; its row names its
