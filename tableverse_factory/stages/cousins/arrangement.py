@@ -59,17 +59,20 @@ class Arrangement:
         return self._objects
 
     def list_units(self) -> list[Unit]:
-        """List what can be taken up as one, whole piles included; each set of things once, by the first of its ids."""
+        """List what can be taken up as one, whole piles included; each set of things once, by its lowest thing."""
         found: dict[frozenset[str], Unit] = {}
-        for name in sorted(self._objects):
+        for name in sorted(self._objects, key=self._get_height):
             members = self._collect_dependents(name)
             leaning = {of for of, on in self._depends if of in members and on not in members}
             if leaning - {name}:
                 continue  # they would lose what else carries them
             found.setdefault(members, Unit(name, members, stands=not leaning))
         for members in self._list_piles():
-            found.setdefault(members, Unit(min(members), members, stands=True))
+            found.setdefault(members, Unit(min(members, key=self._get_height), members, stands=True))
         return list(found.values())
+
+    def _get_height(self, name: str) -> tuple[float, str]:
+        return round(float(self._solids[name].points[:, 2].min()), 3), name
 
     def find_supports(self, names: Collection[str]) -> frozenset[str]:
         """Find the other things that these depend on."""
@@ -185,7 +188,7 @@ def _find_dependencies(objects: Mapping[str, PlacedObject], solids: Mapping[str,
         if (alone[a] and alone[b]) or not any(find_near_pieces(solids[a], solids[b], TOUCH_M)):
             continue
         pairs |= {(thing, other) for thing, other in ((a, b), (b, a)) if not alone[thing]}
-    return frozenset((thing, other) for thing, other in pairs if not (alone[thing] and (other, thing) in pairs))
+    return frozenset(pairs)
 
 
 def _stands_alone(item: PlacedObject, solids: Solids) -> bool:

@@ -65,6 +65,28 @@ def test_two_things_that_lean_on_each_other_move_as_one():
     assert {frozenset(unit.members) for unit in units} == {frozenset({"left", "right"}), frozenset({"can"})}
 
 
+def test_what_hangs_in_a_rim_falls_without_it_and_so_does_what_stands_on_it():
+    """A wedge between two blocks touches them by steep faces only; a can stands on it."""
+    wedge = from_trimesh(trimesh.convex.convex_hull([[x, y, z] for y in (-0.02, 0.02) for x, z in (
+        (-0.05, 0.1), (0.05, 0.1), (-0.01, 0.0), (0.01, 0.0))]))  # fmt: skip
+    hanging = replace(thing("wedge", (0.1, 0.1, 0.1), (0.0, 0.0, 0.05)), mesh=wedge)
+    hanging = replace(hanging, pieces=ConvexPieces((wedge,), 1.0, 0.0, "convex"))
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    things = [
+        replace(item, pose=Pose(item.pose.position, level))
+        for item in (
+            thing("can", (0.04, 0.03, 0.1), (0.0, 0.0, 0.2)),
+            thing("left", (0.1, 0.1, 0.1), (-0.08, 0.0, 0.05)),
+            thing("right", (0.1, 0.1, 0.1), (0.08, 0.0, 0.05)),
+            hanging,
+        )
+    ]
+    units = Arrangement(things, TABLE).list_units()
+    for unit in units:
+        assert "wedge" not in unit.members or "can" in unit.members
+        assert not unit.members & {"left", "right"} or {"wedge", "can"} <= unit.members
+
+
 @pytest.mark.parametrize("change", [Change.MOVE, Change.TURN, Change.SCALE])
 def test_changes_keep_support_clearance_and_the_table(change):
     moved_off = 0
