@@ -21,6 +21,7 @@ from tableverse_factory.rebuild import manifest_from_dataset
 from tableverse_factory.run_record import read_run
 from tableverse_factory.sources.manifest import write_manifest
 from tableverse_factory.stages.curate.lexicon import find_kind
+from tableverse_factory.viz.gallery.gallery import write_gallery
 from tests.helpers.builds import Silent, digests
 from tests.helpers.cousin_parents import SCENES, build_parents, make_request
 from workers.run import run_build
@@ -189,3 +190,15 @@ def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
     code, _, errors = run("cousins", made / "out", made / "out", "--executor", "local")
     assert code == 1
     assert "is the dataset of the parents" in errors
+
+
+def test_the_gallery_shows_a_family_side_by_side(made, tmp_path):
+    write_gallery(open_dataset(made / "cousins"), tmp_path / "gallery", renders=0)
+    done = [row for row in rows_of(made / "cousins") if row["status"] == "done"]
+    for row in done:
+        page = (tmp_path / "gallery" / "scenes" / f"{row['scene_id']}.html").read_text()
+        for other in done:
+            shown = f'src="../pictures/{other["scene_id"]}-sketch-s.jpg"' in page
+            assert shown == (other["family"] == row["family"])
+        assert (tmp_path / "gallery" / "pictures" / f"{row['scene_id']}-sketch-s.jpg").is_file()
+        assert all(line in page for line in row["changes"])
