@@ -44,10 +44,10 @@ class FilterResult:
 def write_filtered_dataset(out: StoragePath, dest: StoragePath, profile: str, unfinished: bool = False) -> FilterResult:
     """Write the scenes of a dataset that a profile allows to another folder; may be repeated after a kill.
 
-    Scenes that are left out leave no trace: no row, no address, no `detail` that could name them. Private parts of
-    `uri` (see `redact_uri`) and of the configuration (see `redact_config`) are removed. The caller holds the lock of
-    `dest`: a new or empty folder, or one where the same export was begun. `profile` is one of `licences.PROFILES`. Of a
-    dataset that is not finished, the finished shards are written if it may be `unfinished`.
+    Scenes that are left out leave no trace: no row, no address, no `detail` or `recipe` that could name them. Private
+    parts of `uri` (see `redact_uri`) and of the configuration (see `redact_config`) are removed. The caller holds the
+    lock of `dest`: a new or empty folder, or one where the same export was begun. `profile` is one of
+    `licences.PROFILES`. Of a dataset that is not finished, the finished shards are written if it may be `unfinished`.
     """
     run, plan = read_run(out / "run.json"), read_plan(out / "plan.parquet")
     finished = sorted(committed_shards(out).intersection(range(plan.n_shards)))
@@ -86,7 +86,8 @@ def _select_rows(
             verdict = scene_license(row)
             if verdict in allowed:
                 places = {"uri": redact_uri(row["uri"] or ""), "url": redact_uri(row["url"] or "") or None}
-                rows.append({**row, **places, "detail": None, "licence_verdict": verdict.value})
+                silenced = {"detail": None, "recipe": None}  # either may name a scene that is left out
+                rows.append({**row, **places, **silenced, "licence_verdict": verdict.value})
             else:
                 left_out[verdict] += 1
         if rows:

@@ -61,6 +61,7 @@ def _write_shard(out, number, licences, meshes=None):
             row = {"scene_id": name, "kind": "capture", "licence": licence, "shard": number, "status": "dropped"}
             row |= {"mesh_licences": (meshes or {}).get(name)}
             row |= {"reason": "duplicate", "detail": "same content as s-0-1 at /home/me/secret/s-0-1"}
+            row |= {"recipe": '{"changes":["swap"],"donors":[{"scene_id":"s-0-1"}]}'}
             if name != LOST:
                 files = (("meta.json", name.encode() * 900), ("scene.xml", b"<mujoco/>"))
                 offset, size = tar.add(ExportedScene(name, files, certificate, {}, (), ()))
