@@ -85,6 +85,9 @@ SCENES = pa.schema(
         ("at_rest", pa.bool_()),
         ("colliding", pa.bool_()),
         ("settle_time_s", pa.float64()),  # simulated
+        ("nv", pa.int32()),  # this and the next two: sizes for simulators that allot memory first
+        ("nconmax", pa.int32()),
+        ("njmax", pa.int32()),
         ("n_trajectories", pa.int32()),  # tasks that were tried; null where no trajectories were asked for
         ("n_successes", pa.int32()),  # those of them that succeeded
         ("shard", pa.int32()),

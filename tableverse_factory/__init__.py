@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tableverse_factory.delivery.learning.stream import SceneStream
     from tableverse_factory.delivery.learning.variation import Variation
     from tableverse_factory.delivery.learning.vector_sim import VectorSim
+    from tableverse_factory.delivery.learning.warp import WarpBatch
 
 __all__ = [
     "Dataset",
@@ -28,6 +29,7 @@ __all__ = [
     "TableEnv",
     "Variation",
     "VectorSim",
+    "WarpBatch",
     "__version__",
     "attach_scene",
     "attach_to_dm_control",
@@ -46,6 +48,7 @@ _MODULES = {
     "TableEnv": "delivery.learning.environment",
     "Variation": "delivery.learning.variation",
     "VectorSim": "delivery.learning.vector_sim",
+    "WarpBatch": "delivery.learning.warp",
     "attach_scene": "delivery.learning.attach",
     "attach_to_dm_control": "delivery.learning.dm_control",
     "build_scene_grid": "delivery.learning.grid",

@@ -13,6 +13,7 @@ from tableverse_factory.cli.bench_picture import bench_picture
 from tableverse_factory.cli.bench_scale import bench_factory, bench_query
 from tableverse_factory.cli.bench_soak import bench_soak
 from tableverse_factory.cli.bench_twin import bench_twin
+from tableverse_factory.cli.bench_warp import bench_warp
 from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.cache_dir import get_cache_dir
@@ -33,6 +34,7 @@ bench.command("completion")(bench_completion)
 bench.command("twin")(bench_twin)
 bench.command("cameras")(bench_cameras)
 bench.command("cousins")(bench_cousins)
+bench.command("warp")(bench_warp)
 
 
 Truth = Annotated[

@@ -27,6 +27,7 @@ from tableverse_factory.physics.mjcf.spec import (
 )
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, increase_rolling_friction, move_bodies
+from tableverse_factory.physics.simulate.sizes import SimulationSizes, measure_sizes
 from tableverse_factory.sources.textures.catalogue import TILE_M
 from tableverse_factory.stages.export.fidelity import describe_fidelity
 from tableverse_factory.stages.export.meta import build_meta_json
@@ -89,6 +90,7 @@ class _CertifiedFiles:
     files: SceneFiles
     certificate: Certificate
     measured: Measurement
+    sizes: SimulationSizes
 
 
 def _build_bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
@@ -128,11 +130,12 @@ def _settle_and_certify(
             tabletop=scenery.tabletop,
             backdrop=scenery.backdrop,
         )
-        certificate, measured = certify(files.model(), history, config.export.epsilon_m)
+        model = files.model()
+        certificate, measured = certify(model, history, config.export.epsilon_m)
         if certificate.at_rest or certificate.fell or measured.warnings:
             break
         bodies, rests = increase_rolling_friction(move_bodies(bodies, measured.end_poses), set(measured.moved)), False
-    return _CertifiedFiles(tuple(bodies), files, certificate, measured)
+    return _CertifiedFiles(tuple(bodies), files, certificate, measured, measure_sizes(model))
 
 
 def _has_settled_mass(item: PlacedObject, body: SceneBody) -> bool:
@@ -178,7 +181,7 @@ def _assemble(scene: CuratedScene, written: _CertifiedFiles) -> ExportedScene:
         scene.scene_id,
         tuple(sorted(members.items())),
         written.certificate,
-        {**build_scene_row(scene, written.certificate), **fidelity.scene},
+        {**build_scene_row(scene, written.certificate, written.sizes), **fidelity.scene},
         tuple({**row, **columns} for row, columns in zip(rows, fidelity.objects, strict=True)),
         build_task_rows(scene),
     )

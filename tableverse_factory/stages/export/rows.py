@@ -1,6 +1,7 @@
 """Rows of one scene for the tables of `schemas.tables`."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from schemas.objects import Evidence, PlacedObject
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.physics.mjcf.spec import SceneBody
+from tableverse_factory.physics.simulate.sizes import SimulationSizes
 
 _CERTIFICATE_COLUMNS = (
     *("epsilon_m", "piece_penetration_before_m", "mesh_penetration_before_m", "piece_penetration_m"),
@@ -27,7 +29,7 @@ def _pick(record: object, *names: str) -> dict[str, Any]:
     return {name: getattr(record, name) for name in names}
 
 
-def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, Any]:
+def build_scene_row(scene: CuratedScene, certificate: Certificate, sizes: SimulationSizes) -> dict[str, Any]:
     """Build the columns of scenes/ that the scene itself knows; source, status and offsets are the executor's."""
     shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
     placed = scene.settled.rectified.placed
@@ -49,6 +51,7 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate) -> dict[str, 
         "n_fell": len(certificate.fell),
         "n_left_container": len(certificate.left_container),
         "settle_time_s": scene.settled.settle_time_s,
+        **asdict(sizes),
     }
 
 

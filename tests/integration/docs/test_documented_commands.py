@@ -38,6 +38,7 @@ CANNOT = (
 
 PYTHON_CANNOT = (
     (r"from lerobot\.", "lerobot brings a gigabyte"),
+    (r"mujoco_warp|WarpBatch", "mujoco-warp compiles for minutes; tests/delivery/learning has a test for it"),
     (r"from dm_control", "dm_control wants a MuJoCo of its own; tests/delivery/learning has a test for it"),
     (r"import pybullet", "pybullet compiles for minutes; tests/delivery/formats has a test for it"),
     (r"serve_forever", "serves until it is stopped"),

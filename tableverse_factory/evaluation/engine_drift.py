@@ -1,0 +1,88 @@
+"""Rest of scenes in MuJoCo Warp, measured as the certificate measures it in MuJoCo."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.geometry import Pose
+from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.learning.warp import WarpBatch
+from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_angle, transform_points
+from tableverse_factory.physics.simulate.at_rest import NUDGE_INTERVAL_S, NUDGES
+from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD, FALL_M
+
+
+@dataclass(frozen=True, slots=True)
+class EngineDrift:
+    """Largest motion of a scene's objects in an engine, and its contacts before the first step.
+
+    `overflowed` says that the engine lacked room for contacts or constraints, so that the rest is meaningless.
+    """
+
+    scene_id: str
+    drift_m: float
+    drift_rad: float
+    sunk_m: float
+    contacts: int
+    penetration_m: float
+    overflowed: bool
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moved beyond the certificate's limits, or fell."""
+        near = self.drift_m <= DRIFT_LIMIT_M and self.drift_rad <= DRIFT_LIMIT_RAD and self.sunk_m <= FALL_M
+        return near and not self.overflowed
+
+
+def measure_warp_drift(
+    scenes: Sequence[Scene], duration_s: float, device: str | None = None, cheap: bool = False
+) -> list[EngineDrift]:
+    """Step scenes in one batch of MuJoCo Warp for `duration_s`, with the certificate's nudges, and measure each.
+
+    `cheap` takes the cheapest settings with which scenes still rest (`use_cheap_settings`).
+    """
+    batch = WarpBatch(scenes, device=device)
+    if cheap:
+        use_cheap_settings(batch)
+    touching = _read_contacts(batch)
+    start = batch.poses()
+    steps, awake = (
+        round(seconds / batch.template.opt.timestep) for seconds in (duration_s, min(NUDGE_INTERVAL_S, duration_s))
+    )
+    for nudge, count in ((NUDGES[0], awake), (NUDGES[1], steps - awake)):
+        velocity = batch.data.qvel.numpy()
+        velocity += np.tile(nudge, velocity.shape[1] // 6)
+        batch.data.qvel.assign(velocity)
+        batch.step(count)
+    end, full = batch.poses(), batch.overflowed()
+    return [
+        EngineDrift(scene_id, *_measure_motion(batch, world, start, end), *touching[world], bool(full[world]))
+        for world, scene_id in enumerate(batch.scene_ids)
+    ]
+
+
+def use_cheap_settings(batch: WarpBatch) -> None:
+    """Set the cheapest settings with which scenes still rest: without no-slip iterations, explicit integration."""
+    batch.model.opt.noslip_iterations = 0
+    batch.model.opt.integrator = 0
+
+
+def _read_contacts(batch: WarpBatch) -> list[tuple[int, float]]:
+    """Read number and greatest depth [m] of each world's contacts."""
+    count = int(batch.data.nacon.numpy()[0])
+    world, depth = batch.data.contact.worldid.numpy()[:count], -batch.data.contact.dist.numpy()[:count]
+    found = (depth[world == index] for index in range(len(batch.scene_ids)))
+    return [(len(its), float(its.max(initial=0.0))) for its in found]
+
+
+def _measure_motion(batch: WarpBatch, world: int, start: np.ndarray, end: np.ndarray) -> tuple[float, float, float]:
+    """Measure the largest displacement of a centre of mass, rotation, and way down of a world's objects."""
+    model, found = batch.models[world], []
+    for slot, name in enumerate(batch.object_ids[world]):
+        a, b = (Pose(row[:3], normalize_quaternion(row[3:])) for row in (start[world, slot], end[world, slot]))
+        center = model.body(name).ipos[None]
+        way = (transform_points(b, center) - transform_points(a, center))[0]
+        turn = rotation_angle(a.quaternion_wxyz, b.quaternion_wxyz)
+        found.append((float(np.linalg.norm(way)), turn, float(-way[2])))
+    return tuple(max(values) for values in zip(*found, strict=True))
