@@ -37,15 +37,16 @@ def test_the_environment_of_env_args_exists_and_the_actions_succeed_in_it(out, m
             where = {"dataset": str(out), "scene": meta["scene_id"], "task": meta["task_id"]}
             env = gymnasium.make(arguments["env_name"], **where, **arguments["env_kwargs"])
             observation, info = env.reset(seed=0)
-            for name in OPTIONS.pictures:
-                away = np.abs(observation[name].astype(float) - demo["obs"][name_picture(name)][0])
-                assert (away > 2).mean() < 0.03, "the gripper may open elsewhere before the recording"
             assert info["instruction"] == meta["lang"]
             seen = demo["obs/object"][0].reshape(-1, 7)[:, [0, 1, 2, 6, 3, 4, 5]]
             assert np.allclose(observation["objects"], seen, atol=1e-6)
             actions = demo["actions"][()]
-            for action in [*actions, *[actions[-1]] * 100]:
-                _, _, terminated, _, info = env.step(action)
+            for sample, action in enumerate([*actions, *[actions[-1]] * 100], 1):
+                observation, _, terminated, _, info = env.step(action)
+                if sample == 60:
+                    for name in OPTIONS.pictures:
+                        away = np.abs(observation[name].astype(float) - demo["obs"][name_picture(name)][60])
+                        assert (away > 1e-4 + (name in ("front", "wrist"))).mean() < 0.002, name
                 if terminated:
                     break
             assert info["success"]
