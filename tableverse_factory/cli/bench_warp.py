@@ -19,9 +19,8 @@ def bench_warp(
     ] = "1,16,256,4096",
     scenes: Annotated[int, typer.Option(min=1, max=100_000, help="Different scenes, spread evenly over OUT.")] = 16,
     seconds: Annotated[float, typer.Option(min=0.002, max=60.0, help="Simulated time of the agreement [s].")] = 5.0,
-    cheap: Annotated[
-        bool,
-        typer.Option("--cheap", help="No no-slip iterations, explicit integration: the cheapest that still rests."),
+    exported: Annotated[
+        bool, typer.Option("--exported", help="The scenes' own no-slip iterations and integrator, which cost more.")
     ] = False,
     device: Annotated[str | None, typer.Option(metavar="NAME", help="Of Warp: cuda:0, cpu, …")] = None,
     as_json: AsJson = False,
@@ -37,9 +36,11 @@ def bench_warp(
 
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.delivery.learning.warp import silence_warp
     from tableverse_factory.evaluation.bench.measurement import sample_evenly
     from tableverse_factory.evaluation.bench.warp import measure_agreement, measure_speed
 
+    silence_warp()
     counts = [int(word) for word in worlds.split(",") if word.strip().isdigit() and int(word) > 0]
     if len(counts) != len([word for word in worlds.split(",") if word.strip()]):
         raise typer.BadParameter(f"--worlds {worlds!r:.60}: give numbers from 1 on, separated by commas")
@@ -48,8 +49,8 @@ def bench_warp(
     if not done:
         raise InputError(f"{out}: no finished scene to step")
     chosen = [dataset.scene(scene_id) for scene_id in sample_evenly(done, scenes)]
-    agreement = measure_agreement(chosen, seconds, device, cheap)
-    speeds = list(measure_speed(chosen, counts, device, cheap))
+    agreement = measure_agreement(chosen, seconds, device, exported)
+    speeds = list(measure_speed(chosen, counts, device, exported))
     if as_json:
         print_json({"agreement": asdict(agreement), "agreeing": agreement.agreeing, "speed": [*map(asdict, speeds)]})
     else:

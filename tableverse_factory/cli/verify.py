@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -43,6 +43,9 @@ def verify(
         bool, typer.Option("--trajectories", help="Of a dataset: also replay every trajectory from its arrays.")
     ] = False,
     robot: Robot = None,
+    engine: Annotated[
+        Literal["mujoco", "warp"], typer.Option(help="Of a dataset: measure rest and contacts in MuJoCo Warp instead.")
+    ] = "mujoco",
     jobs: Jobs = None,
     as_json: AsJson = False,
 ) -> None:
@@ -51,6 +54,9 @@ def verify(
     Files, penetrations, drift and falls are compared with the certificate. With --trajectories each trajectory is
     executed again in physics from its saved arrays: successes must succeed, all must move as recorded, and rows must
     match tasks and configuration.
+
+    With --engine warp scenes are stepped in MuJoCo Warp, on a GPU where there is one; files and meshes are not
+    measured then.
 
     Exit code 0 only if every scene is whole, at rest, free of collisions and as certified, and every trajectory as
     recorded.
@@ -63,11 +69,14 @@ def verify(
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
     if epsilon_m is not None and _is_dataset(path):
         raise typer.BadParameter("--epsilon is for MJCF files: the certificates of a dataset state theirs")
+    if engine == "warp" and (trajectories or not _is_dataset(path)):
+        raise typer.BadParameter("--engine warp is for the scenes of a dataset, without --trajectories")
     if trajectories and _is_dataset(path):
         check_robot_option(path, robot, needed=True)
     audits = []
     depth_m, processes = 0.001 if epsilon_m is None else epsilon_m, jobs or count_available_cpus()
-    for audit in _run_audits(path, depth_m, root, processes, trajectories, robot):
+    run = _run_in_warp(path) if engine == "warp" else _run_audits(path, depth_m, root, processes, trajectories, robot)
+    for audit in run:
         audits.append(audit)
         if not as_json:
             _print_audit(audit, first=len(audits) == 1)
@@ -96,6 +105,14 @@ def _count_not_built(path: str) -> int:
     manifest = {} if "published" in run else run.get("manifest")
     planned = manifest.get("scenes") if isinstance(manifest, dict) else None
     return max(0, planned - dataset.scenes.count_rows()) if isinstance(planned, int) else 0
+
+
+def _run_in_warp(path: str) -> Iterator["SceneAudit"]:
+    from tableverse_factory.delivery.learning.warp import silence_warp
+    from tableverse_factory.evaluation.verify_engine import verify_in_warp
+
+    silence_warp()
+    return verify_in_warp(path)
 
 
 def _run_audits(
@@ -154,8 +171,9 @@ def _print_audit(audit: "SceneAudit", first: bool) -> None:
     verdict = "ok" if audit.ok else "BAD"
     cells = ""
     if "drift_m" in m:
-        lengths = (m["piece_penetration_m"], m["mesh_penetration_m"], m["drift_m"])
-        cells = "".join(f" {1e3 * value:8.3f}" for value in lengths) + f" {57.29578 * m['drift_rad']:8.3f}"
+        lengths = (m["piece_penetration_m"], m.get("mesh_penetration_m"), m["drift_m"])
+        cells = "".join(f" {'–':>8}" if value is None else f" {1e3 * value:8.3f}" for value in lengths)
+        cells += f" {57.29578 * m['drift_rad']:8.3f}"
     print(f"{sanitize_line(audit.scene_id, 40):40} {verdict:8}{cells}")
     if replayed := m.get("trajectories", ()):
         print(f"    {sum(it['reproduced'] for it in replayed)} of {len(replayed)} trajectories reproduced")

@@ -36,15 +36,13 @@ class EngineDrift:
 
 
 def measure_warp_drift(
-    scenes: Sequence[Scene], duration_s: float, device: str | None = None, cheap: bool = False
+    scenes: Sequence[Scene], duration_s: float, device: str | None = None, exported_settings: bool = False
 ) -> list[EngineDrift]:
     """Step scenes in one batch of MuJoCo Warp for `duration_s`, with the certificate's nudges, and measure each.
 
-    `cheap` takes the cheapest settings with which scenes still rest (`use_cheap_settings`).
+    `exported_settings` are those of `WarpBatch`.
     """
-    batch = WarpBatch(scenes, device=device)
-    if cheap:
-        use_cheap_settings(batch)
+    batch = WarpBatch(scenes, device=device, exported_settings=exported_settings)
     touching = _read_contacts(batch)
     start = batch.poses()
     steps, awake = (
@@ -60,12 +58,6 @@ def measure_warp_drift(
         EngineDrift(scene_id, *_measure_motion(batch, world, start, end), *touching[world], bool(full[world]))
         for world, scene_id in enumerate(batch.scene_ids)
     ]
-
-
-def use_cheap_settings(batch: WarpBatch) -> None:
-    """Set the cheapest settings with which scenes still rest: without no-slip iterations, explicit integration."""
-    batch.model.opt.noslip_iterations = 0
-    batch.model.opt.integrator = 0
 
 
 def _read_contacts(batch: WarpBatch) -> list[tuple[int, float]]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
+import mujoco
 import numpy as np
 from jaxtyping import Bool, Float64
 
@@ -25,7 +26,12 @@ class WarpBatch:
     """
 
     def __init__(
-        self, scenes: Sequence[Scene], nconmax: int | None = None, njmax: int | None = None, device: str | None = None
+        self,
+        scenes: Sequence[Scene],
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        device: str | None = None,
+        exported_settings: bool = False,
     ) -> None:
         """Load the scenes on a device.
 
@@ -34,6 +40,8 @@ class WarpBatch:
             nconmax: Contacts per world; by default what the greediest scene needs (`physics.simulate.sizes`).
             njmax: Constraints per world; likewise.
             device: Of Warp, as `cuda:1`, or `cpu`; by default Warp's own choice.
+            exported_settings: Keep no-slip iterations and integrator of the scenes. Without, there are no no-slip
+                iterations, with which things creep in Warp's single precision, and explicit integration.
 
         Raises:
             InputError: `bad_scene` for scenes that do not fit into one batch, `no_extra` without mujoco-warp.
@@ -59,6 +67,8 @@ class WarpBatch:
             )
         self._start = self._stack("qpos0")
         self._graph: Any = None
+        if not exported_settings:
+            self.model.opt.noslip_iterations, self.model.opt.integrator = 0, int(mujoco.mjtIntegrator.mjINT_EULER)
         self.reset()
 
     def reset(self, worlds: Bool[np.ndarray, " n"] | None = None) -> None:
@@ -118,3 +128,9 @@ def import_warp() -> tuple[ModuleType, ModuleType]:
     engine = import_extra("mujoco_warp", "WarpBatch", "warp")
     warp = import_extra("warp", "WarpBatch", "warp")
     return warp, engine
+
+
+def silence_warp() -> None:
+    """Keep Warp's news from standard output, for commands whose output programs read."""
+    warp = import_extra("warp", "WarpBatch", "warp")
+    warp.config.log_level = warp.LOG_WARNING

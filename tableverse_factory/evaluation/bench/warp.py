@@ -10,7 +10,7 @@ import numpy as np
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.vector_sim import compile_scene
 from tableverse_factory.delivery.learning.warp import WarpBatch, import_warp
-from tableverse_factory.evaluation.engine_drift import EngineDrift, measure_warp_drift, use_cheap_settings
+from tableverse_factory.evaluation.engine_drift import EngineDrift, measure_warp_drift
 from tableverse_factory.physics.simulate.at_rest import measure_drift
 from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD
 
@@ -46,14 +46,12 @@ class WarpAgreement:
 
 
 def measure_speed(
-    scenes: Sequence[Scene], worlds: Sequence[int], device: str | None, cheap: bool
+    scenes: Sequence[Scene], worlds: Sequence[int], device: str | None, exported: bool
 ) -> Iterator[WarpSpeed]:
     """Measure batches of so many worlds, the scenes repeated in turn."""
     warp, _ = import_warp()
     for count in worlds:
-        batch = WarpBatch([scenes[k % len(scenes)] for k in range(count)], device=device)
-        if cheap:
-            use_cheap_settings(batch)
+        batch = WarpBatch([scenes[k % len(scenes)] for k in range(count)], device=device, exported_settings=exported)
         batch.step(2)
         warp.synchronize()
         done, started = 0, time.perf_counter()
@@ -65,9 +63,9 @@ def measure_speed(
         yield WarpSpeed(count, min(count, len(scenes)), place, count * done / passed, batch.nconmax, batch.njmax)
 
 
-def measure_agreement(scenes: Sequence[Scene], duration_s: float, device: str | None, cheap: bool) -> WarpAgreement:
+def measure_agreement(scenes: Sequence[Scene], duration_s: float, device: str | None, exported: bool) -> WarpAgreement:
     """Step each scene in both engines and compare; MuJoCo always has the scene's own settings."""
-    warp = measure_warp_drift(scenes, duration_s, device, cheap)
+    warp = measure_warp_drift(scenes, duration_s, device, exported)
     drifts, rests, contacts, depths = [], [], [], []
     for scene in scenes:
         model = compile_scene(scene, visuals=False)
