@@ -52,9 +52,10 @@ _OBJECT_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class _Stock:
-    """Objects of a split by kind, with their sides in ascending order [m]. Shape (n, 3)."""
+    """Objects of a split and kind, with their scenes (n,), and their sides in ascending order (n, 3) [m]."""
 
     rows: Sequence[Row]
+    scenes: np.ndarray
     sides: np.ndarray
 
 
@@ -85,9 +86,10 @@ def list_cousins(dataset: Dataset, per_scene: int, seed: int, classify: Callable
     digests = {scene_id: digest_objects(objects[scene_id]) for scene_id in family_of}
     for row in done:
         scene_id = row["scene_id"]
+        candidates = _find_candidates(objects[scene_id], stocks, find_split(family_of[scene_id]))
         for index in range(per_scene):
             rng = make_rng(seed, scene_id, f"cousin {index}")
-            donors = _choose_donors(objects[scene_id], stocks, find_split(family_of[scene_id]), rng)
+            donors = _choose_donors(candidates, rng)
             identity = f"{scene_id} {index} {seed}"
             yield _make_row(dataset.path, row, family_of[scene_id], index, donors, digests[scene_id], identity)
 
@@ -119,33 +121,47 @@ def _stock_objects(
         for item in objects[scene_id]:
             if item["contained_in"] is None:
                 found[find_split(family), item["kind"]].append(item)
-    return {key: _Stock(rows, np.array([_sort_sides(row) for row in rows])) for key, rows in found.items()}
+    return {
+        key: _Stock(rows, np.array([row["scene_id"] for row in rows]), np.array([_sort_sides(row) for row in rows]))
+        for key, rows in found.items()
+    }
 
 
 def _sort_sides(row: Row) -> list[float]:
     return sorted(float(row[name]) for name in _SIDES)
 
 
-def _choose_donors(
-    objects: Sequence[Row], stocks: Mapping[tuple[str, str], _Stock], split: str, rng: np.random.Generator
-) -> tuple[Donor, ...]:
-    """Choose donors at random for as many objects as a recipe holds, each of another shape than the object."""
-    chosen: list[Donor] = []
-    for place in rng.permutation(len(objects)).tolist():
-        item = objects[place]
+def _find_candidates(
+    objects: Sequence[Row], stocks: Mapping[tuple[str, str], _Stock], split: str
+) -> list[tuple[Row, _Stock, np.ndarray]]:
+    """Find what may replace each object: of its kind, about as large, of another shape, from another scene."""
+    found = []
+    for item in objects:
         stock = stocks.get((split, item["kind"]))
         if stock is None or item["contained_in"] is not None:
             continue
         ratio = stock.sides / np.array(_sort_sides(item))
         like = np.maximum(ratio, 1 / ratio).max(axis=1) <= MAX_SIZE_RATIO
         other = ratio.max(axis=1) / ratio.min(axis=1) >= LEAST_SHAPE_RATIO
-        for number in rng.permutation(np.flatnonzero(like & other))[:DONORS_PER_OBJECT].tolist():
-            donor = stock.rows[number]
-            where = {"scene_id": donor["scene_id"], "object_id": donor["object_id"]}
-            chosen.append(Donor(replaces=item["object_id"], digest=digest_objects([donor])[:DIGEST_CHARS], **where))
+        places = np.flatnonzero(like & other & (stock.scenes != item["scene_id"]))
+        if len(places):
+            found.append((item, stock, places))
+    return found
+
+
+def _choose_donors(candidates: Sequence[tuple[Row, _Stock, np.ndarray]], rng: np.random.Generator) -> tuple[Donor, ...]:
+    """Choose donors at random for as many objects as a recipe holds, each donor for one of them."""
+    chosen: dict[tuple[str, str], Donor] = {}
+    for number in rng.permutation(len(candidates)).tolist():
+        item, stock, places = candidates[number]
+        for place in rng.choice(places, min(DONORS_PER_OBJECT, len(places)), replace=False).tolist():
+            row = stock.rows[place]
+            where = {"scene_id": row["scene_id"], "object_id": row["object_id"]}
+            donor = Donor(replaces=item["object_id"], digest=digest_objects([row])[:DIGEST_CHARS], **where)
+            chosen.setdefault((donor.scene_id, donor.object_id), donor)
         if len(chosen) + DONORS_PER_OBJECT > MAX_DONORS:
             break
-    return tuple(chosen)
+    return tuple(chosen.values())
 
 
 def _make_row(

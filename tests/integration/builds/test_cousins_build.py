@@ -8,18 +8,22 @@ import mujoco
 import numpy as np
 import pytest
 
-from schemas.cousins import Change, parse_recipe
+from schemas.config import Config
+from schemas.cousins import Change, Donor, Recipe, parse_recipe
 from schemas.manifest import SceneKind
+from schemas.outcome import Dropped
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.dataset.cousin_rows import THEMES, list_cousins
+from tableverse_factory.dataset.cousin_rows import THEMES, digest_objects, list_cousins
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.dataset.shard_plan import read_plan
 from tableverse_factory.dataset.splits import find_split
 from tableverse_factory.evaluation.bench.cousins import measure_cousins
 from tableverse_factory.evaluation.verify import verify_scenes
+from tableverse_factory.models.services import Services
 from tableverse_factory.rebuild import manifest_from_dataset
 from tableverse_factory.run_record import read_run
 from tableverse_factory.sources.manifest import write_manifest
+from tableverse_factory.stages.cousins.derive import derive_cousin
 from tableverse_factory.stages.curate.lexicon import find_kind
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tests.helpers.builds import Silent, digests
@@ -77,6 +81,8 @@ def test_families_stay_together_in_every_split(made):
         assert row["split"] == split_of[row["parent"]] == find_split(row["family"])
         donors = parse_recipe(row["recipe"]).donors
         assert {split_of[donor.scene_id] for donor in donors} <= {row["split"]}
+        assert row["parent"] not in {donor.scene_id for donor in donors}
+        assert len({(donor.scene_id, donor.object_id) for donor in donors}) == len(donors)
 
 
 def test_cousins_of_cousins_are_of_the_same_family(made):
@@ -202,3 +208,28 @@ def test_the_gallery_shows_a_family_side_by_side(made, tmp_path):
             assert shown == (other["family"] == row["family"])
         assert (tmp_path / "gallery" / "pictures" / f"{row['scene_id']}-sketch-s.jpg").is_file()
         assert all(line in page for line in row["changes"])
+
+
+def test_what_is_borrowed_comes_with_its_colours_and_its_licence(made):
+    """A tea box for a cereal box, as a plan within one split would have it; another digest drops the cousin."""
+    dataset = open_dataset(made / "out")
+    desk, snack = (
+        next(row for row in rows_of(made / "out") if row["name"] == f"{name}.json") for name in ("desk", "snack")
+    )
+    lent = next(row for row in dataset.scene(snack["scene_id"]).object_rows() if row["label"] == "tea box")
+    lost = next(row for row in dataset.scene(desk["scene_id"]).object_rows() if row["label"] == "cereal box")
+    (row,) = (its for its in plan(made / "out", 1) if its.parent == desk["scene_id"])
+    where = {"scene_id": snack["scene_id"], "object_id": lent["object_id"]}
+    for digest in (digest_objects([lent])[:12], "0" * 12):
+        donor = Donor(replaces=lost["object_id"], digest=digest, **where)
+        recipe = Recipe(changes=(Change.SWAP,), donors=(donor,)).model_dump_json()
+        rng, services = np.random.default_rng(0), Services(made / "cache")
+        outcome = derive_cousin(row.model_copy(update={"recipe": recipe}), Config(), rng, services)
+        if digest == "0" * 12:
+            assert isinstance(outcome, Dropped)
+            assert outcome.reason == "content_changed"
+            continue
+        assert outcome.value.changes[0] == f"swap:{lost['object_id']}={snack['scene_id']}/{lent['object_id']}"
+        (found,) = (item for item in outcome.value.objects if item.object_id == lost["object_id"])
+        assert (found.label, found.mesh_licence) == ("tea box", "CC0-1.0")
+        assert found.mesh.texture is not None or found.mesh.vertex_colors is not None
