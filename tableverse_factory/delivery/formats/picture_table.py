@@ -20,7 +20,7 @@ from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.dataset.card_yaml import make_license_keys, name_size
 from tableverse_factory.dataset.dataset import Dataset, Scene
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH
-from tableverse_factory.dataset.splits import SPLITS, find_split
+from tableverse_factory.dataset.splits import SPLITS, get_split
 
 MASKS = "observation/masks.png"
 _MAX_FILE_BYTES = 400 * 1024**2  # before a new file begins
@@ -55,7 +55,7 @@ def export_pictures(dataset: Dataset, dest: Path, progress: Callable[[int, int],
         for number, row in enumerate(rows, 1):
             made = _build_row(dataset.scene_at(row))
             if made is not None:
-                split = find_split(row)
+                split = get_split(row)
                 writers[split].add(made)
                 counts[split] += 1
                 licences[row["licence"] or ""] += 1
