@@ -37,6 +37,7 @@ EXTRAS = {  # of pyproject.toml, without `dev` and `docs`: packages and purpose
     "viewer": (("viser",), "tableverse view"),
     "hub": (("huggingface_hub",), "tableverse publish, datasets by hf://"),
     "gym": (("gymnasium",), "a scene and a task as an environment"),
+    "warp": (("mujoco-warp",), "thousands of scenes at once on a GPU, verify --engine warp"),
     "usd": (("usd-core",), "tableverse extract --format usd"),
     "models": (
         ("torch", "transformers", "onnx"),

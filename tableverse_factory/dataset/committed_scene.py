@@ -24,6 +24,7 @@ from tableverse_factory.dataset.trajectory_files import Row, strip_motions
 ADDED_BY_COMMIT = frozenset(
     {
         *("kind", "name", "url", "source", "uri", "licence", "licence_verdict", "content_sha256"),
+        *("known_length", "parent", "recipe", "family", "split"),
         *("status", "stage", "reason", "error_kind", "detail", "attempts"),
         *COST_COLUMNS,
         *("n_trajectories", "n_successes", "shard", "tar_offset", "tar_size"),

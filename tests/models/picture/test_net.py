@@ -96,9 +96,9 @@ def test_what_a_user_names_has_to_be_such_a_net(tmp_path: Path) -> None:
     with large.open("wb") as file:
         file.truncate(MAX_BYTES + 1)
     cases = {
-        tmp_path / "missing.onnx": "is no file of at most",
-        tmp_path: "is no file of at most",
-        large: f"is no file of at most {MAX_BYTES} bytes",
+        tmp_path / "missing.onnx": "is no file here",
+        tmp_path: "is no file here",
+        large: f"has {MAX_BYTES + 1} bytes, and a net at most {MAX_BYTES}",
         text: "is no ONNX file",
         write_net(tmp_path / "inputs.onnx", {"image": 3}, {**MAPS, **VECTORS}): "another net: it takes image and",
         write_net(tmp_path / "outputs.onnx", INPUTS, MAPS): "another net.*table.* is wanted",

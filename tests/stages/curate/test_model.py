@@ -18,6 +18,7 @@ from tableverse_factory.core.errors import ModelAccessError, ModelError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.models.services import Services
+from tableverse_factory.physics.simulate.sizes import SimulationSizes
 from tableverse_factory.stages.curate.curate import curate
 from tableverse_factory.stages.curate.judge_input import build_judge_input
 from tableverse_factory.stages.curate.prompt import RULES, build_judge_prompt, build_judge_schema
@@ -57,7 +58,7 @@ def verdict(outcome) -> Assessment:
     """The verdict, after proving that it travels and fits the tables."""
     assert isinstance(outcome, Done)
     scene = decode(encode(outcome.value))
-    row = build_scene_row(scene, Certificate(0.001, *[0.0] * 6, (), (), (), True, False))
+    row = build_scene_row(scene, Certificate(0.001, *[0.0] * 6, (), (), (), True, False), SimulationSizes(0, 8, 8))
     json.dumps(scene.assessment.model_dump(mode="json"), allow_nan=False, ensure_ascii=False).encode()
     build_table([row], SCENES)
     tasks = build_table(build_task_rows(scene), TASKS)

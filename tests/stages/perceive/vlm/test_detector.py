@@ -22,6 +22,7 @@ from tableverse_factory.core.errors import AnswerInvalidError, ModelAccessError,
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.parquet import build_table
 from tableverse_factory.models.services import Services
+from tableverse_factory.physics.simulate.sizes import SimulationSizes
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.export.rows import build_scene_row
 from tableverse_factory.stages.observe.observe import observe
@@ -369,7 +370,9 @@ def test_who_found_the_objects_and_what_the_rules_did_stand_in_the_scenes_row(lo
     placed = replace(scene.settled.rectified.placed, detection=record)
     found = replace(scene, settled=replace(scene.settled, rectified=replace(scene.settled.rectified, placed=placed)))
     certificate = Certificate(0.001, *[0.0] * 6, (), (), (), True, False)
-    rows = build_table([build_scene_row(one, certificate) for one in (found, scene)], SCENES).to_pylist()
+    rows = build_table(
+        [build_scene_row(one, certificate, SimulationSizes(0, 8, 8)) for one in (found, scene)], SCENES
+    ).to_pylist()
     columns = [(row["detector_model"], row["detector_prompt_sha256"], row["detector_remarks"]) for row in rows]
     remarks = ["person:detections[2]", "duplicate:detections[3]"]
     assert columns == [("seed-1-8-251228", hash_detection_prompt("xyxy"), remarks), (None, None, None)]
