@@ -91,7 +91,10 @@ def train_picture(
     seed: TrainSeed = 0,
     start: Annotated[
         Path | None,
-        typer.Option("--from", dir_okay=False, help="Start from the weights.safetensors of another training."),
+        typer.Option("--from", dir_okay=False, help="Start from weights.safetensors or picture.onnx of another."),
+    ] = None,
+    gpus: Annotated[
+        int | None, typer.Option(min=1, max=64, help="GPUs to train on, each with a batch of its own; all without.")
     ] = None,
     device: TrainDevice = "auto",
     jobs: TrainJobs = None,
@@ -116,14 +119,28 @@ def train_picture(
     from tableverse_factory.evaluation.training.picture.train import TrainRun, train_pictures
 
     processes = count_available_cpus() if jobs is None else jobs
-    settings = PictureSettings(steps, scenes, seed, batch, capacity=views, first=min(views, 2_000))
+    ranks = _choose_gpus(where, gpus)
+    settings = PictureSettings(steps, scenes, seed, batch, capacity=views, first=min(views, 2_000), gpus=ranks)
     pool = _provide_pool(folder, scenes, seed, processes)
-    run = TrainRun(folder, pool, where, processes, math.inf if minutes is None else minutes, start=start)
+    own = -(-processes // ranks)
+    run = TrainRun(folder, pool, where, own, math.inf if minutes is None else minutes, start=start)
     done = train_pictures(settings, run, lambda line: print(line, file=sys.stderr, flush=True))
     path = folder / "picture.onnx"
     difference = export_network(folder, path)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, within {difference:.0e} of the net in torch")
     print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
+
+
+def _choose_gpus(device: str, wanted: int | None) -> int:
+    """Choose the number of training processes: the one that is wanted, else one per GPU."""
+    import torch
+
+    from tableverse_factory.core.errors import InputError
+
+    seen = torch.cuda.device_count() if device == "cuda" else 1
+    if device == "cuda" and wanted is not None and wanted > seen:
+        raise InputError(f"--gpus {wanted}: torch sees {seen}")
+    return seen if wanted is None else wanted
 
 
 def _provide_pool(folder: Path, scenes: int, seed: int, jobs: int) -> Path:

@@ -16,7 +16,9 @@ SHIPPED = Path(__file__).with_name("picture.onnx")
 DIGEST = SHIPPED.with_suffix(".sha256")
 MULTIPLE: Final = 32  # height and width of the input are multiples of it
 INPUTS: Final = {"image": 3, "rays": 3, "depth": 1}  # channels of (1, c, h, w)
-MAPS: Final = {"label": 3, "log_depth": 1, "height": 1, "center": 1, "votes": 2, "boundary": 1}
+MAPS: Final = {"label": 3, "log_depth": 1, "height": 1, "center": 1, "votes": 2, "boundary": 1, "affinity": 6}
+LATER: Final = frozenset({"affinity"})  # maps that the first nets lack: they are 0
+REACHES: Final = (2, 8, 16)  # of affinities [px]
 VECTORS: Final = {"plane": 4, "table": 1, "log_scale_sigma": 1}  # lengths of (1, n)
 MAX_BYTES = 256 * 1024 * 1024
 
@@ -30,7 +32,8 @@ class PictureNet:
 
     Maps: `label` logits of neither, table and object; `log_depth` natural logarithm of the depth [m]; `height` over the
     table as a share of the depth; `center` logit of the middle of an object; `votes` from each pixel to the middle of
-    its object, x and y [px]; `boundary` logit of an edge between objects.
+    its object, x and y [px]; `boundary` logit of an edge between objects; `affinity` logits that a pixel and the one
+    `REACHES` px to its right, and then below it, are of one object.
 
     Vectors: `plane` the table's unit normal towards the camera, and its distance [m]; `table` logit of a table-top
     being shown; `log_scale_sigma` standard deviation of the logarithm of the scale.
@@ -42,11 +45,12 @@ class PictureNet:
         inputs, outputs = (
             {one.name for one in ends} for ends in (self._session.get_inputs(), self._session.get_outputs())
         )
-        if inputs != {*INPUTS} or not outputs >= {*MAPS, *VECTORS}:
+        if inputs != {*INPUTS} or not outputs >= {*MAPS, *VECTORS} - LATER:
             raise WeightsError(
                 f"{str(path)!r} is another net: it takes {', '.join(sorted(inputs))} and gives "
                 f"{', '.join(sorted(outputs))}; one of {', '.join(INPUTS)} to {', '.join([*MAPS, *VECTORS])} is wanted"
             )
+        self._outputs = [name for name in (*MAPS, *VECTORS) if name in outputs]
 
     def __call__(self, inputs: _Arrays) -> dict[str, Float32[np.ndarray, "..."]]:
         """Run the net on maps of shape (c, h, w); the outputs come without their first axis.
@@ -54,17 +58,17 @@ class PictureNet:
         Raises:
             ModelError: if it cannot be run, or an output has another shape or is not finite.
         """
-        names = [*MAPS, *VECTORS]
         try:
-            found = self._session.run(names, {name: inputs[name][None] for name in INPUTS})
+            found = self._session.run(self._outputs, {name: inputs[name][None] for name in INPUTS})
         except Exception as error:  # onnxruntime's errors have no common base
             raise ModelError(f"{self._name} cannot be run: {shorten_onnx_error(error)}") from error
         size = inputs["image"].shape[1:]
         shapes = {name: (1, count, *size) for name, count in MAPS.items()} | {n: (1, c) for n, c in VECTORS.items()}
-        for name, array in zip(names, found, strict=True):
+        for name, array in zip(self._outputs, found, strict=True):
             if array.shape != shapes[name] or not np.isfinite(array).all():
                 raise ModelError(f"{self._name} answers {name} of shape {array.shape}; finite {shapes[name]} is wanted")
-        return {name: array[0].astype(np.float32) for name, array in zip(names, found, strict=True)}
+        unknown = {name: np.zeros(shapes[name][1:], np.float32) for name in LATER}
+        return unknown | {name: a[0].astype(np.float32) for name, a in zip(self._outputs, found, strict=True)}
 
 
 @cache

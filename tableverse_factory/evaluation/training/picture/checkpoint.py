@@ -1,7 +1,7 @@
 """Settings and checkpoints of a training of pictures, and its averaged weights in half precision."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,17 @@ class PictureSettings:
     """Settings that determine the weights, with the meshes of the pool and the device.
 
     Attributes:
-        steps: Of `batch` views; a continued training may change them, and with them its schedule.
+        steps: Of `batch` views per process; a continued training may change them, and with them its schedule.
         scenes: Arrangements in the pool of meshes.
         capacity: Views that are kept to draw from.
         first: Views that are rendered before the first step.
-        fresh: New views that are rendered per step.
+        fresh: New views that are rendered per step, by all processes together.
         small: Share of the steps, the first ones, whose samples have five sixths of the views' width and height.
         samples: Rays per pixel.
         packages, patterns: Textures, of which a package has three.
+        flat: Flat pictures that show no table.
         rate: Peak of the learning rate.
+        gpus: Processes, a GPU each, that average their gradients.
         start: SHA-256 of the weights that the training starts from; empty if it starts from random ones.
     """
 
@@ -44,7 +46,9 @@ class PictureSettings:
     samples: int = 12
     packages: int = 320
     patterns: int = 900
+    flat: int = 1_200
     rate: float = 1.2e-3
+    gpus: int = 1
     start: str = ""
 
     @property
@@ -61,7 +65,7 @@ class PictureSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrainPosition:
-    """How far a training has come: steps, packs, views, and the numbers of views of the packs in its ring.
+    """How far a process has come: steps, packs, views, and the numbers of views of the packs in its ring.
 
     `pool` is the sha256 of the file of meshes.
     """
@@ -74,24 +78,32 @@ class TrainPosition:
 
 
 def save_checkpoint(
-    folder: Path, network: Any, average: Any, optimizer: Any, settings: PictureSettings, position: TrainPosition
+    folder: Path,
+    network: Any,
+    average: Any,
+    optimizer: Any,
+    settings: PictureSettings,
+    positions: Sequence[TrainPosition],
 ) -> None:
-    """Write everything that the training needs to go on."""
+    """Write everything that the training needs to go on; `positions` are those of its processes."""
     safetensors = import_extra("safetensors.torch", "training", "models")
     tensors = {f"net.{name}": tensor.contiguous().clone() for name, tensor in network.state_dict().items()}
     tensors |= {f"mean.{name}": tensor.contiguous().clone() for name, tensor in average.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in state.items()}
-    metadata = {"settings": json.dumps(asdict(settings)), "position": json.dumps(asdict(position))}
+    metadata = {"settings": json.dumps(asdict(settings)), "positions": json.dumps([asdict(p) for p in positions])}
     partial = folder / f"{CHECKPOINT}.partial"
     safetensors.save_file(tensors, partial, metadata)
     partial.rename(folder / CHECKPOINT)
 
 
 def load_checkpoint(
-    folder: Path, network: Any, average: Any, optimizer: Any, settings: PictureSettings, device: str
+    folder: Path, network: Any, average: Any, optimizer: Any, settings: PictureSettings, device: str, rank: int = 0
 ) -> TrainPosition:
-    """Restore a training of the same settings, but for `steps`; the start if there is no checkpoint."""
+    """Restore a training of the same settings, but for `steps`; the start if there is no checkpoint.
+
+    Returns the position of the process `rank`.
+    """
     path = folder / CHECKPOINT
     if not path.is_file():
         return TrainPosition()
@@ -101,11 +113,13 @@ def load_checkpoint(
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
         theirs = PictureSettings(**json.loads(metadata["settings"]))
-        position = TrainPosition(**json.loads(metadata["position"]))
+        positions = [TrainPosition(**each) for each in json.loads(metadata["positions"])]
     except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a checkpoint ({error}): remove it, or give another folder") from error
     if replace(theirs, steps=settings.steps) != settings:
         raise InputError(f"{path} is of another training, {theirs}: give the same, or another folder")
+    if len(positions) != settings.gpus:
+        raise InputError(f"{path} lacks the positions of {settings.gpus} processes: remove it")
     try:
         network.load_state_dict(_pick(tensors, "net."))
         average.load_state_dict(_pick(tensors, "mean."))
@@ -116,7 +130,7 @@ def load_checkpoint(
         index, _, part = name.partition(".")
         state.setdefault(int(index), {})[part] = tensor
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
-    return position
+    return positions[rank]
 
 
 def _pick(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -1,10 +1,12 @@
 """Losses of the network of pictures, and the targets that need counting: centres, votes, boundaries."""
 
 from dataclasses import dataclass
+from itertools import product
 
 from tableverse_factory.evaluation.training.picture.network import HEIGHT_UNIT, VOTE_PX
 from tableverse_factory.evaluation.training.picture.samples import Sample
 from tableverse_factory.models.local.device import Tensor, import_torch
+from tableverse_factory.models.picture.net import REACHES
 
 torch = import_torch()
 functional = torch.nn.functional
@@ -14,7 +16,10 @@ NEAREST_M, FARTHEST_M = 0.1, 8.0
 SURROUNDINGS = 0.15  # weight of depth that is neither table nor thing
 EDGE_STEPS = (1, 2, 4)  # at which differences of depth are compared [px]
 LEAST_PIXELS = 40.0
-WEIGHTS = {"votes": 1.5, "center": 6.0, "boundary": 0.6, "normal": 4.0, "distance": 0.5, "table": 0.3, "sigma": 0.02}
+WEIGHTS = {"votes": 1.5, "center": 6.0, "boundary": 0.6, "affinity": 0.5, "normal": 1.5, "distance": 0.5}
+WEIGHTS |= {"table": 0.3, "sigma": 0.02}
+APART = 3.0  # weight of pairs of pixels on two things, of which there are fewer
+SMALL = 1e-3  # below which errors of a normal count by their square
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +57,7 @@ def find_targets(sample: Sample) -> ThingTargets:
 
 def compute_losses(outputs: tuple[Tensor, ...], sample: Sample, targets: ThingTargets) -> dict[str, Tensor]:
     """Compute each term of the loss, weighted; their sum is what is minimised."""
-    label, log_depth, height, center, votes, boundary, plane, table, sigma = outputs
+    label, log_depth, height, center, votes, boundary, affinity, plane, table, sigma = outputs
     things, tops = sample.things, sample.tops
     classes = torch.where(things, 2, torch.where(tops, 1, 0))
     losses = {"label": functional.cross_entropy(label, classes)}
@@ -68,9 +73,10 @@ def compute_losses(outputs: tuple[Tensor, ...], sample: Sample, targets: ThingTa
     losses["center"] = WEIGHTS["center"] * _compare_logits(center[:, 0], heat, 1 + 8 * heat)
     edge = targets.boundary
     losses["boundary"] = WEIGHTS["boundary"] * _compare_logits(boundary[:, 0], edge, 1 + 3 * edge)
+    losses["affinity"] = WEIGHTS["affinity"] * _compare_affinities(affinity, sample)
     shown = sample.table
     present = shown.sum().clamp(min=1)
-    error = 1 - (plane[:, :3] * sample.plane[:, :3]).sum(1)
+    error = ((plane[:, :3] - sample.plane[:, :3]).square().sum(1) + SMALL**2).sqrt() - SMALL
     losses["normal"] = WEIGHTS["normal"] * (error * shown).sum() / present
     apart = (plane[:, 3].clamp(min=1e-3).log() - sample.plane[:, 3].clamp(min=0.05).log()).abs()
     losses["distance"] = WEIGHTS["distance"] * (apart * shown).sum() / present
@@ -80,6 +86,22 @@ def compute_losses(outputs: tuple[Tensor, ...], sample: Sample, targets: ThingTa
 
 def _compare_logits(logits: Tensor, wanted: Tensor, weight: Tensor) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logits, wanted, weight)
+
+
+def _compare_affinities(affinity: Tensor, sample: Sample) -> Tensor:
+    """Compare whether pixels that lie apart by each reach are of one thing, where both are of things."""
+    total, weights = torch.zeros((), device=affinity.device), torch.zeros((), device=affinity.device)
+    height, width = sample.ids.shape[1:]
+    for index, (reach, axis) in enumerate(product(REACHES, (2, 1))):
+        length = (width if axis == 2 else height) - reach
+        one, other = (sample.ids.narrow(axis, start, length) for start in (0, reach))
+        both = sample.things.narrow(axis, 0, length) & sample.things.narrow(axis, reach, length)
+        same = (one == other).float()
+        weight = both * (same + APART * (1 - same))
+        logits = affinity[:, index].narrow(axis, 0, length)
+        total = total + functional.binary_cross_entropy_with_logits(logits, same, weight, reduction="sum")
+        weights = weights + weight.sum()
+    return total / weights.clamp(min=1)
 
 
 def _compare_depth(log_depth: Tensor, sample: Sample, sigma: Tensor) -> dict[str, Tensor]:

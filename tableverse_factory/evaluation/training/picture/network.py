@@ -17,7 +17,7 @@ CHANNELS = 8  # colour, slopes of the rays and their square, log depth and wheth
 REFERENCE_PX = 300.0  # focal length at which the network sees depth as it is
 VOTE_PX = 32.0
 HEIGHT_UNIT = 0.1
-DENSE = 16  # three classes, log depth, trust in the sensor, height, centre, two votes, boundary; six fill a tensor core
+DENSE = 16  # three classes, log depth, trust in the sensor, height, centre, two votes, boundary, six affinities
 GLOBAL = 6  # normal, log distance, whether there is a table, log of the scale's deviation
 
 
@@ -110,18 +110,19 @@ class PictureNetwork(Module):  # type: ignore[misc]
         tilt = slopes.square().sum(1, keepdim=True)
         inputs = torch.cat([image * 4 - 2, slopes * 2, tilt, sensed * known, known], dim=1)
         dense, summary = self._compute(inputs, slopes)
-        trust = torch.sigmoid(dense[:, 4:5]) * known
-        free = dense[:, 3:4]
+        label, free, trust, share, center, votes, boundary, affinity = dense.split([3, 1, 1, 1, 1, 2, 1, 6], dim=1)
+        trust = torch.sigmoid(trust) * known
         log_depth = free + trust * (sensed - free) + zoom
         normal = functional.normalize(summary[:, :3], dim=1)
         distance = (summary[:, 3:4] + zoom[:, :, 0, 0]).exp()
         return (
-            dense[:, :3],
+            label,
             log_depth,
-            dense[:, 5:6] * HEIGHT_UNIT,
-            dense[:, 6:7],
-            dense[:, 7:9] * VOTE_PX,
-            dense[:, 9:10],
+            share * HEIGHT_UNIT,
+            center,
+            votes * VOTE_PX,
+            boundary,
+            affinity,
             torch.cat([normal, distance], dim=1),
             summary[:, 4:5],
             summary[:, 5:6].clamp(-5.0, 1.0).exp(),

@@ -268,10 +268,10 @@ def _draw_face(rng: np.random.Generator, palette: Sequence[Color]) -> UInt8[np.n
         ground = _blend(make_noise(rng, (2, 2), 3), [palette[0], palette[int(rng.integers(len(palette)))]])
     image = Image.fromarray(to_bytes(ground))
     draw = ImageDraw.Draw(image)
-    for _ in range(int(rng.integers(1, 6))):
+    for _ in range(int(rng.integers(1, 9))):
         _draw_block(rng, draw, _ink(palette[int(rng.integers(len(palette)))]))
-    if rng.random() < 0.5:
-        side = int(rng.uniform(0.25, 0.8) * SIDE)
+    if rng.random() < 0.6:
+        side = int(rng.uniform(0.25, 0.95) * SIDE)
         photograph = to_bytes(draw_leaves(rng, [*_pick(rng, 4, 5), *palette]))[:side, :side]
         image.paste(Image.fromarray(photograph), (int(rng.uniform(0, SIDE - side)), int(rng.uniform(0, SIDE - side))))
     for _ in range(int(rng.integers(0, 6))):

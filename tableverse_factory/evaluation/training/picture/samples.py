@@ -12,11 +12,11 @@ from tableverse_factory.models.local.device import Tensor, import_torch
 torch = import_torch()
 functional = torch.nn.functional
 
-DEPTH_SHARE = 0.4  # of samples that have a sensor's depth
-ZOOM_SHARE, MAX_ZOOM = 0.6, 1.7
+DEPTH_SHARE = 0.25  # of samples that have a sensor's depth
+ZOOM_SHARE, MAX_ZOOM = 0.5, 1.7
 RECOLOR_SHARE = 0.5  # of samples whose things change colour one by one
 SWAP_SHARE = 0.15  # whose surroundings are another picture's
-FLAT_SHARE = 0.02  # that are another picture's surface, flat: no table and no depth
+FLAT_SHARE = 0.08  # that are a flat picture: no table and no depth
 GREY_SHARE = 0.06
 JPEG_SHARE = 0.4
 _LUMA = (
@@ -63,11 +63,16 @@ class Sample:
 
 
 def make_sample(
-    views: Views, augment: bool, depth_share: float = DEPTH_SHARE, size: tuple[int, int] | None = None
+    views: Views,
+    augment: bool,
+    depth_share: float = DEPTH_SHARE,
+    size: tuple[int, int] | None = None,
+    flat: Tensor | None = None,
 ) -> Sample:
     """Make a batch; without `augment` only the sensor is drawn, for the first `depth_share` of the views.
 
-    `size` is the width and height of augmented samples [px], else those of the views.
+    `size` is the width and height of augmented samples [px], else those of the views. `flat` are pictures that show no
+    table, of shape (n, 3, s, s) in bytes, some of which replace samples.
     """
     image, labels, camera = views.images.float() / 255, _stack_labels(views), views.cameras[:, View.INTRINSICS].clone()
     plane = torch.cat([views.cameras[:, View.UP], views.cameras[:, [View.HEIGHT]]], dim=1)
@@ -90,9 +95,10 @@ def make_sample(
     table, solid = views.cameras[:, View.HAS_TABLE].clone(), torch.ones_like(focal)
     if augment:
         image = _swap_surroundings(image, ids, has_depth)
-        image, flat = _flatten_some(image, has_depth)
-        keep = (~flat)[:, None, None]
-        ids, table, solid = ids * keep, table * ~flat, solid * ~flat
+        if flat is not None:
+            image, is_flat = _flatten_some(image, has_depth, flat)
+            keep = (~is_flat)[:, None, None]
+            ids, table, solid = ids * keep, table * ~is_flat, solid * ~is_flat
         image = _shoot(image, ids)
     return Sample(image.clamp(0, 1), rays, sensed, ids, depth.clamp(max=FARTHEST_M), height, plane, table, solid)
 
@@ -149,15 +155,20 @@ def _swap_surroundings(image: Tensor, ids: Tensor, has_depth: Tensor) -> Tensor:
     return torch.where(where[:, None], image.roll(1, 0).flip(3), image)
 
 
-def _flatten_some(image: Tensor, has_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Blow up a corner of some pictures, blend it with another: a pattern without a table."""
-    flat = (torch.rand(len(image), device=image.device) < FLAT_SHARE) & ~has_depth
-    height, width = image.shape[-2:]
-    corner = image[:, :, : height // 6, : width // 6]
-    blown = functional.interpolate(corner, size=(height, width), mode="bilinear", align_corners=False)
-    noise = torch.rand_like(image) * torch.rand(len(image), 1, 1, 1, device=image.device) ** 3
-    mixed = (blown + noise + 0.5 * image.roll(2, 0).flip(2)) / 2
-    return torch.where(flat[:, None, None, None], mixed, image), flat
+def _flatten_some(image: Tensor, has_depth: Tensor, flat: Tensor) -> tuple[Tensor, Tensor]:
+    """Put a part of a flat picture in the place of some; say which."""
+    count, _, height, width = image.shape
+    device = image.device
+    is_flat = (torch.rand(count, device=device) < FLAT_SHARE) & ~has_depth
+    which = torch.randint(len(flat), (count,), device=device)
+    part, mirrored = 0.55 + 0.45 * torch.rand(2, count, device=device), torch.rand(count, device=device) < 0.5
+    shift = (2 * torch.rand(2, count, device=device) - 1) * (1 - part)
+    affine = torch.zeros(count, 2, 3, device=device)
+    affine[:, 0, 0], affine[:, 1, 1] = torch.where(mirrored, -part[0], part[0]), part[1]
+    affine[:, 0, 2], affine[:, 1, 2] = shift
+    grid = functional.affine_grid(affine, [count, 3, height, width], align_corners=False)
+    shown = functional.grid_sample(flat[which].float() / 255, grid, padding_mode="border", align_corners=False)
+    return torch.where(is_flat[:, None, None, None], shown, image), is_flat
 
 
 def _shoot(image: Tensor, ids: Tensor) -> Tensor:
@@ -201,9 +212,10 @@ def _recolor_things(linear: Tensor, ids: Tensor) -> Tensor:
     mix = mix / mix.sum(-1, keepdim=True).clamp(min=0.4)
     mix = mix * torch.exp(torch.randn(count, 32, 1, 1, device=device) * 0.22 * changed)
     slot = ids % 31 + 1
-    own = mix.reshape(count, 32, 9).gather(1, slot.flatten(1)[..., None].expand(-1, -1, 9))
-    own = own.reshape(*ids.shape, 3, 3)
-    mixed = torch.einsum("bhwij,bjhw->bihw", own, linear).clamp(0, 1.5)
+    slot = (slot + 32 * torch.arange(count, device=device)[:, None, None]).flatten()
+    rows = [mix[:, :, row].reshape(count * 32, 3)[slot].reshape(*ids.shape, 3) for row in range(3)]
+    channels = linear.permute(0, 2, 3, 1)
+    mixed = torch.stack([(row * channels).sum(-1) for row in rows], dim=1).clamp(0, 1.5)
     chosen = (torch.rand(count, device=device) < RECOLOR_SHARE)[:, None, None, None]
     return torch.where(chosen, mixed, linear)
 

@@ -28,6 +28,8 @@ from tableverse_factory.evaluation.training.picture.things import Part, ThingMak
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 
 FOCAL_RANGE = (0.67, 1.5)  # in widths of the picture
+RIG_SHARE = 0.4  # of views as the cameras of robots and desks see: their focal lengths, heights and distances
+RIG_FOCAL, RIG_ELEVATION, RIG_DISTANCE_M = (0.78, 1.02), (24, 62), (0.45, 1.35)
 COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16)
 COUNT_SHARES = (0.08, 0.1, 0.11, 0.12, 0.12, 0.12, 0.12, 0.1, 0.08, 0.05)
 SETTLED_SHARE, EMPTY_SHARE = 0.4, 0.03
@@ -74,7 +76,7 @@ class SceneMaker:
         self._add_things(rng, builder, maker)
         azimuth = rng.integers(4) * np.pi / 2 + rng.normal(0, 0.25)
         extras = rng.random(2)
-        far = rng.uniform(0.4, 1.1) if extras[0] < 0.17 else 0.0
+        far = rng.uniform(0.4, 1.1) if extras[0] < 0.22 else 0.0
         add_table(rng, builder, azimuth, far)
         add_room(rng, builder)
         add_furniture(rng, builder)
@@ -156,15 +158,17 @@ def _aim_at_things(
     """Aim a camera at all things, or closely at one; None if no try stays within the room."""
     low, high = builder.measure_things()
     for _ in range(TRIES):
-        focal = size[0] * float(np.exp(rng.uniform(*np.log(FOCAL_RANGE))))
-        elevation = np.radians(rng.uniform(20, 72) if rng.random() < 0.85 else rng.uniform(10, 89))
-        close = rng.random() < CLOSE_SHARE and builder.boxes
+        rig = rng.random() < RIG_SHARE
+        focal = size[0] * float(np.exp(rng.uniform(*np.log(RIG_FOCAL if rig else FOCAL_RANGE))))
+        angles = RIG_ELEVATION if rig else (20, 72) if rng.random() < 0.8 else (10, 89)
+        elevation = np.radians(rng.uniform(*angles))
+        close = not rig and rng.random() < CLOSE_SHARE and builder.boxes
         box = builder.boxes[int(rng.integers(len(builder.boxes)))] if close else np.stack([low, high])
         middle, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         if close:
             distance = max(0.14, focal * radius / (size[1] * rng.uniform(0.3, 0.75)))
         else:
-            distance = rng.uniform(0.4, 1.6)
+            distance = rng.uniform(*RIG_DISTANCE_M) if rig else rng.uniform(0.4, 1.6)
             if not rng.uniform(0.08, 0.16) < focal * radius / distance / size[0] < 0.68:
                 continue
         target = middle + np.array([*rng.normal(0, 0.25 * radius + 0.02, 2), 0.0])

@@ -14,15 +14,16 @@ from tableverse_factory.evaluation.training.picture.checkpoint import (
     PictureSettings,
     TrainPosition,
     load_checkpoint,
-    read_weights,
     save_checkpoint,
     write_weights,
 )
 from tableverse_factory.evaluation.training.picture.exposure import Renderer, Views
 from tableverse_factory.evaluation.training.picture.losses import compute_losses, find_targets
 from tableverse_factory.evaluation.training.picture.network import make_network
+from tableverse_factory.evaluation.training.picture.ranks import Ranks, start_ranks
 from tableverse_factory.evaluation.training.picture.ring import ViewRing
-from tableverse_factory.evaluation.training.picture.samples import make_sample
+from tableverse_factory.evaluation.training.picture.samples import Sample, make_sample
+from tableverse_factory.evaluation.training.picture.start import measure_norms, read_start
 from tableverse_factory.evaluation.training.picture.validate import validate_network
 from tableverse_factory.evaluation.training.picture.world import World, make_world
 from tableverse_factory.models.local.device import Tensor, import_torch
@@ -38,6 +39,7 @@ LEAST_RATE = 0.02
 MAX_NORM = 2.0
 AVERAGE = 0.999  # of the weights that are kept
 LOG_STEPS = 100
+NORM_BATCHES = 30  # that give the norms of an exported network their statistics
 VALIDATION_VIEWS, VALIDATION_SEED, VALIDATION_BATCH = 256, 1_000_003, 32
 
 Log = Callable[[str], object]
@@ -55,7 +57,7 @@ class TrainRun:
         minutes: After which to stop with a checkpoint.
         save_minutes: Between checkpoints.
         validate: Whether to measure held-out views at every checkpoint.
-        start: Weights to start from, as `write_weights` writes them; random ones without.
+        start: Weights to start from, as `write_weights` writes them, or an exported network; random ones without.
     """
 
     folder: Path
@@ -71,15 +73,20 @@ class TrainRun:
 def train_pictures(settings: PictureSettings, run: TrainRun, log: Log) -> int:
     """Train until all steps are done or the minutes are over; return the last step.
 
-    A checkpoint in the folder is continued.
+    A checkpoint in the folder is continued. With several `gpus` there is a process for each.
     """
+    with start_ranks(settings.gpus, run.device, _train_rank, settings, run) as ranks:
+        return _train_rank(settings, run, ranks, log)
+
+
+def _train_rank(settings: PictureSettings, run: TrainRun, ranks: Ranks, log: Log = lambda _: None) -> int:
     if run.device == "cuda":  # the fastest kernels: only a CPU is held to the same weights
         torch.backends.cudnn.benchmark = True
         torch.backends.cudnn.deterministic = False
         torch.backends.cudnn.allow_tf32 = True
         torch.backends.cuda.matmul.allow_tf32 = True
     try:
-        return _Trainer(settings, run, log).train()
+        return _Trainer(settings, run, ranks, log).train()
     except torch.OutOfMemoryError as error:
         raise InputError("the GPU's memory ran out: a ring of fewer views, or smaller batches, need less") from error
 
@@ -87,29 +94,35 @@ def train_pictures(settings: PictureSettings, run: TrainRun, log: Log) -> int:
 class _Trainer:
     """Networks, optimizer and views of a training."""
 
-    def __init__(self, settings: PictureSettings, run: TrainRun, log: Log) -> None:
+    def __init__(self, settings: PictureSettings, run: TrainRun, ranks: Ranks, log: Log) -> None:
         self._started = time.monotonic()
-        self._run, self._log = run, log
+        self._run, self._ranks, self._log = run, ranks, log
         network = make_network(settings.seed)
+        lacks_statistics = False
         if run.start is not None:
-            read_weights(run.start, network)
+            lacks_statistics = read_start(run.start, network)
             with run.start.open("rb") as file:
                 settings = replace(settings, start=hashlib.file_digest(file, "sha256").hexdigest())
         self._settings = settings
         self._network = network.to(run.device, memory_format=torch.channels_last).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
-        position = load_checkpoint(run.folder, self._network, self._average, self._optimizer, settings, run.device)
+        restored = self._network, self._average, self._optimizer
+        position = load_checkpoint(run.folder, *restored, settings, run.device, ranks.rank)
         self._pool = hash_file(run.pool)
         if position.step and position.pool != self._pool:
             raise InputError(f"{run.pool} holds other meshes than those that the checkpoint was trained on")
         world = make_world(run.pool, settings, run.jobs)
         renderer = world.make_renderer(settings, run.device)
         self._say(f"{len(world.tables.roots)} meshes, {len(world.textures)} textures")
-        self._ring = ViewRing(renderer, settings.capacity, settings.size, settings.seed, run.device)
-        self._ring.start(world.training, settings.seed, run.jobs, position.packs, position.made, position.past)
-        self._held_out = self._render_held_out(world, renderer) if run.validate else []
+        self._flat = torch.from_numpy(world.flat).to(run.device).permute(0, 3, 1, 2).contiguous()
+        self._seed = ranks.shift_seed(settings.seed)
+        self._ring = ViewRing(renderer, settings.capacity, settings.size, self._seed, run.device)
+        self._ring.start(world.training, self._seed, run.jobs, position.packs, position.made, position.past)
+        self._held_out = self._render_held_out(world, renderer) if run.validate and not ranks.rank else []
         self._step = position.step
+        if lacks_statistics and not self._step:
+            self._measure_norms()
         self._mark = (self._step, self._ring.rendered, time.monotonic())  # since when rates are measured
         self._say(f"views are rendered, {settings.steps - self._step} steps are left")
 
@@ -126,39 +139,65 @@ class _Trainer:
             ring.render_pack()
         return [ring.get(slice(k, k + VALIDATION_BATCH)) for k in range(0, count, VALIDATION_BATCH)]
 
+    def _render_fresh(self) -> None:
+        """Render the views that are due before the next step."""
+        due = self._settings.first + self._settings.fresh / self._settings.gpus * self._step
+        while self._ring.made < due:
+            self._ring.render_pack()
+
+    def _measure_norms(self) -> None:
+        self._render_fresh()
+        measure_norms(self._network, (self._draw_sample(-k) for k in range(NORM_BATCHES)), self._run.device)
+        self._ranks.average([*self._network.parameters(), *self._list_statistics()])
+        self._average.load_state_dict(self._network.state_dict())
+
+    def _list_statistics(self) -> list[Tensor]:
+        return [buffer for buffer in self._network.buffers() if buffer.is_floating_point()]
+
     def train(self) -> int:
         """Take the steps that are left, or as many as the minutes allow, but one at least; return the last one."""
         settings, run, first, saved = self._settings, self._run, self._step, time.monotonic()
         while self._step < settings.steps:
-            while self._ring.made < settings.first + settings.fresh * self._step:
-                self._ring.render_pack()
+            self._render_fresh()
             self._step += 1
             losses = self._take_step(self._step)
             if self._step % LOG_STEPS == 0 or self._step == first + 1:
                 self._log_step(losses)
-            if time.monotonic() - self._started > 60 * run.minutes:
+            now = time.monotonic()
+            is_over, is_due = self._ranks.agree(
+                now - self._started > 60 * run.minutes,
+                now - saved > 60 * run.save_minutes and self._step < settings.steps,
+            )
+            if is_over:
                 break
-            if time.monotonic() - saved > 60 * run.save_minutes and self._step < settings.steps:
+            if is_due:
                 self._save()
                 saved = time.monotonic()
         if self._step > first:
             self._save()
         return self._step
 
-    def _take_step(self, step: int) -> dict[str, Tensor]:
-        settings, device = self._settings, self._run.device
-        torch.manual_seed(settings.seed * 100_000_007 + step)
-        for group in self._optimizer.param_groups:
-            group["lr"] = compute_rate(step, settings)
+    def _draw_sample(self, step: int) -> Sample:
+        settings = self._settings
+        torch.manual_seed(self._seed * 100_000_007 + step)
         with torch.no_grad():
-            sample = make_sample(self._ring.draw(settings.batch), augment=True, size=settings.sample_size(step))
-            targets = find_targets(sample)
+            views, size = self._ring.draw(settings.batch), settings.sample_size(step)
+            return make_sample(views, augment=True, size=size, flat=self._flat)
+
+    def _take_step(self, step: int) -> dict[str, Tensor]:
+        device = self._run.device
+        for group in self._optimizer.param_groups:
+            group["lr"] = compute_rate(step, self._settings)
+        sample = self._draw_sample(step)
+        targets = find_targets(sample)
         image = sample.image.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
             outputs = self._network(image, sample.rays, sample.sensed)
         losses = compute_losses(outputs, sample, targets)
         self._optimizer.zero_grad(set_to_none=True)
         torch.stack([*losses.values()]).sum().backward()
+        gradients = [each.grad for each in self._network.parameters()]
+        self._ranks.average([*gradients, *self._list_statistics()])
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), MAX_NORM)
         self._optimizer.step()
         self._average_weights(step)
@@ -176,7 +215,10 @@ class _Trainer:
         if not all(torch.isfinite(each).all() for each in self._average.parameters()):
             raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
         position = TrainPosition(self._step, ring.packs_done, ring.made, tuple(ring.past), self._pool)
-        save_checkpoint(folder, self._network, self._average, self._optimizer, self._settings, position)
+        positions = self._ranks.gather(position)
+        if self._ranks.rank:
+            return
+        save_checkpoint(folder, self._network, self._average, self._optimizer, self._settings, positions)
         write_weights(self._average, folder)
         for with_depth in (False, True) if self._held_out else ():
             figures = validate_network(self._average, self._held_out, self._run.device, with_depth)

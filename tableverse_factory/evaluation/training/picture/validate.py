@@ -45,7 +45,7 @@ def validate_network(network: Any, batches: Iterable[Views], device: str, with_d
 
 def _measure(outputs: tuple[Tensor, ...], sample: Sample, targets: ThingTargets) -> dict[str, Tensor]:
     """Measure each view; `inner` and `things` are numbers of pixels."""
-    label, log_depth, _, _, votes, _, plane, table, sigma = outputs
+    label, log_depth, _, _, votes, _, _, plane, table, sigma = outputs
     things = sample.things
     inner = (things | sample.tops).float()
     pixels, thing_pixels = inner.sum((1, 2)), things.flatten(1).sum(1)

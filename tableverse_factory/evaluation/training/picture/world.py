@@ -11,6 +11,7 @@ import numpy as np
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.evaluation.training.picture.checkpoint import PictureSettings
 from tableverse_factory.evaluation.training.picture.exposure import Renderer
+from tableverse_factory.evaluation.training.picture.flat_pictures import draw_flat_block
 from tableverse_factory.evaluation.training.picture.materials import TextureBook
 from tableverse_factory.evaluation.training.picture.patterns import BLOCKS, Textures, draw_block
 from tableverse_factory.evaluation.training.picture.pool import MeshPool
@@ -22,10 +23,11 @@ MESHES_AT_A_TIME = 64
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """Meshes and textures, and the makers of training and validation scenes."""
+    """Meshes, textures and flat pictures, and the makers of training and validation scenes."""
 
     tables: MeshTables
     textures: Textures
+    flat: Textures
     training: SceneMaker
     validation: SceneMaker
 
@@ -51,6 +53,7 @@ def make_world(pool: Path, settings: PictureSettings, jobs: int) -> World:
     blocks = list(parallel_map(draw, range(BLOCKS), jobs, "draws textures"))
     printed, plain = zip(*blocks, strict=True)
     textures = np.concatenate([*printed, *plain])
+    shown = parallel_map(partial(draw_flat_block, settings.seed, settings.flat), range(BLOCKS), jobs, "draws pictures")
     book = TextureBook(settings.packages, settings.patterns)
     training, validation = SceneMaker.hold_out(tables, book, settings.size)
-    return World(tables, textures, training, validation)
+    return World(tables, textures, np.concatenate([*shown]), training, validation)

@@ -7,7 +7,7 @@ import pytest
 
 from tableverse_factory.evaluation.training.picture.pool import MeshPool, make_pool
 
-SMALL = {"scenes": 2, "batch": 2, "width": 64, "height": 64, "packages": 4, "patterns": 12}
+SMALL = {"scenes": 2, "batch": 2, "width": 64, "height": 64, "packages": 4, "patterns": 12, "flat": 8}
 SMALL |= {"capacity": 64, "first": 8, "fresh": 50.0}  # three steps render more views than are kept
 
 

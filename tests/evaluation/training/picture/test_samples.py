@@ -1,5 +1,6 @@
 """Samples: geometry survives augmentation, a sensor's model stays within bounds, targets lead to the middle."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from tableverse_factory.evaluation.training.picture.sensor import (  # noqa: E40
     NEAREST_M,
     sense_depth,
 )
+from tableverse_factory.models.picture.net import REACHES  # noqa: E402
 
 SIZE = (96, 80)
 NEAR = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]  # a pixel and its eight neighbours
@@ -131,6 +133,21 @@ def test_votes_lead_from_every_pixel_to_one_middle_of_its_thing(views: Views) ->
         assert set(edge.unique().tolist()) <= {0.0, 1.0}
 
 
+def test_flat_pictures_take_the_place_of_some_samples_without_a_sensor(views: Views, world: Any) -> None:
+    torch.manual_seed(0)
+    flat = torch.zeros(3, 3, 32, 32, dtype=torch.uint8)
+    many = views.select(torch.arange(48).repeat(8))
+    sample = make_sample(many, augment=True, flat=flat)
+    replaced = sample.solid == 0
+    assert 0.02 < replaced.float().mean() < 0.12
+    assert (sample.table[replaced] == 0).all()
+    assert (sample.ids[replaced] == 0).all()
+    assert (sample.sensed[replaced] == 0).all()
+    assert sample.image[replaced].mean() < 0.15 < sample.image[~replaced].mean()
+    shown = np.unique(world.flat.reshape(len(world.flat), -1), axis=0)
+    assert len(shown) == len(world.flat) == 8, "each is another"
+
+
 def answer(sample: Sample) -> list[Any]:
     """Outputs that say the truth."""
     targets = find_targets(sample)
@@ -140,22 +157,38 @@ def answer(sample: Sample) -> list[Any]:
     height = (sample.height / sample.depth.clamp(min=0.1))[:, None]
     center = torch.logit(torch.exp(-targets.votes.square().sum(1, keepdim=True) / 8) * sample.things[:, None], 1e-6)
     boundary = 40 * targets.boundary[:, None] - 20
+    affinity = torch.zeros(*sample.image[:, :1].shape).repeat(1, 6, 1, 1)
+    for index, (reach, axis) in enumerate(itertools.product(REACHES, (2, 1))):
+        same = sample.ids == sample.ids.roll(-reach, axis)
+        affinity[:, index] = 40 * same.float() - 20
     table = 40 * sample.table[:, None] - 20
     sigma = torch.full((len(table), 1), 0.1)
-    return [label, log_depth, height, center, targets.votes, boundary, sample.plane, table, sigma]
+    return [label, log_depth, height, center, targets.votes, boundary, affinity, sample.plane, table, sigma]
 
 
 def test_the_truth_costs_nothing_and_each_error_costs_in_its_own_term(views: Views) -> None:
     sample = make_sample(views.select(slice(0, 8)), augment=False)
     targets = find_targets(sample)
     best = compute_losses(answer(sample), sample, targets)
-    exact = ("label", "depth", "shape", "steps", "height", "votes", "boundary", "normal", "distance", "table")
+    exact = (
+        "label",
+        "depth",
+        "shape",
+        "steps",
+        "height",
+        "votes",
+        "boundary",
+        "affinity",
+        "normal",
+        "distance",
+        "table",
+    )
     for name in exact:
         assert best[name] < 1e-3, name
-    shifted = {0: "label", 2: "height", 4: "votes", 5: "boundary", 7: "table"}
+    shifted = {0: "label", 2: "height", 4: "votes", 5: "boundary", 6: "affinity", 8: "table"}
     for index, name in shifted.items():
         outputs = answer(sample)
-        outputs[index] = outputs[index].roll(9, -1) if index != 7 else -outputs[index]
+        outputs[index] = outputs[index].roll(9, -1) if index != 8 else -outputs[index]
         worse = compute_losses(outputs, sample, targets)
         assert worse[name] > best[name] + 1e-2, name
         assert all(torch.equal(worse[other], best[other]) for other in best if other != name), name
@@ -182,6 +215,6 @@ def test_without_a_sensor_depth_is_free_and_a_sensor_is_passed_on_where_it_is_tr
     assert torch.allclose(trusting[1].exp(), depth, atol=1e-4)
     assert not torch.allclose(doubting[1].exp(), depth, atol=1e-2)
     assert not torch.allclose(alone[1].exp(), depth, atol=1e-2)
-    assert torch.allclose(trusting[6][:, :3].norm(dim=1), torch.ones(()))
+    assert torch.allclose(trusting[7][:, :3].norm(dim=1), torch.ones(()))
     shapes = [tuple(each.shape[1:]) for each in trusting]
-    assert shapes == [(c, 32, 48) for c in (3, 1, 1, 1, 2, 1)] + [(4,), (1,), (1,)]
+    assert shapes == [(c, 32, 48) for c in (3, 1, 1, 1, 2, 1, 6)] + [(4,), (1,), (1,)]

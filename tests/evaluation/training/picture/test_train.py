@@ -58,7 +58,7 @@ def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(pool_fil
         train(tmp_path / "parts", pool_file, minutes=0.0)
     assert_same(tmp_path / "whole", tmp_path / "parts")
     with safe_open(tmp_path / "whole" / CHECKPOINT, "pt") as file:
-        assert json.loads(file.metadata()["position"])["made"] > SETTINGS.capacity, "some views were replaced"
+        assert json.loads(file.metadata()["positions"])[0]["made"] > SETTINGS.capacity, "some views were replaced"
     before = (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns
     train(tmp_path / "parts", pool_file)
     assert (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns == before, "nothing is left to do"
@@ -172,7 +172,7 @@ def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(po
     with pytest.raises(ModelError, match=r"weights of step 2 are not finite; the last checkpoint is kept"):
         train(tmp_path, pool_file, wild, save_minutes=0.0)  # between two looks at the loss
     with safe_open(tmp_path / CHECKPOINT, "pt") as file:
-        assert json.loads(file.metadata()["position"])["step"] == 1
+        assert json.loads(file.metadata()["positions"])[0]["step"] == 1
 
 
 def test_the_rate_rises_stays_and_falls() -> None:
@@ -188,7 +188,7 @@ def test_the_rate_rises_stays_and_falls() -> None:
 
 
 def test_the_command_trains_exports_and_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {name: SMALL[name] for name in ("width", "height", "packages", "patterns", "fresh")}
+    small = {name: SMALL[name] for name in ("width", "height", "packages", "patterns", "flat", "fresh")}
     where = "tableverse_factory.evaluation.training.picture.checkpoint.PictureSettings"
     monkeypatch.setattr(where, partial(PictureSettings, **small))
     monkeypatch.setattr(train_module, "VALIDATION_VIEWS", 8)
