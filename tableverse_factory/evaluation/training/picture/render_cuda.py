@@ -23,9 +23,11 @@ class CudaRenderer:
     ) -> None:
         self._torch = import_torch()
         self._cupy: Any = import_extra("cupy", "rendering on a GPU", "training")
+        self._device = self._cupy.cuda.Device(self._torch.cuda.current_device())  # that CuPy does not know by itself
         source = Path(__file__).with_name("tracer.cu").read_text()
         module = self._cupy.RawModule(code=source, options=("--use_fast_math", "--std=c++17"))
-        self._kernel = module.get_function("render")
+        with self._device:
+            self._kernel = module.get_function("render")
         self._world = [self._to_device(each) for each in (tables.nodes, tables.triangles, tables.normals)]
         self._textures = self._to_device(textures)
         self._size, self._samples = size, samples
@@ -47,7 +49,7 @@ class CudaRenderer:
         outputs = [np.uint64(each.data_ptr()) for each in (out.light, out.depth, out.ids, out.normals, out.shine)]
         side, numbers = np.int32(self._textures.shape[1]), [np.int32(v) for v in (count, width, height, self._samples)]
         grid = (-(-width // BLOCK), -(-height // BLOCK), count)
-        with self._cupy.cuda.ExternalStream(torch.cuda.current_stream().cuda_stream):
+        with self._device, self._cupy.cuda.ExternalStream(torch.cuda.current_stream().cuda_stream):
             arguments = (*inputs, side, np.uint64(views.data_ptr()), *numbers, *outputs)
             self._kernel(grid, (BLOCK * BLOCK,), arguments)
         return out
