@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.models.picture.net import REACHES
 from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction
 
 SPREAD_PX = 3.5  # standard deviation of the votes of one object about its middle
@@ -19,6 +21,7 @@ EDGE = 0.5  # probability from which a boundary separates
 ACROSS_PX = 3  # surfaces are compared at this distance from the border of two pieces
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
 AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
+SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
 SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
 
 
@@ -31,12 +34,14 @@ class _Border:
         bend: Median distance of one surface out of the other's tangent plane, as a share of that across the line of
             sight.
         boundary: Median probability of an edge.
+        affinity: Mean logit that pixels on either side are of one object; 0 if the net does not say.
     """
 
     pieces: tuple[int, int]
     length: int
     bend: float
     boundary: float
+    affinity: float
 
 
 def segment_prediction(found: PicturePrediction, shape: tuple[int, int]) -> IdImage:
@@ -56,7 +61,8 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         agreement = _measure_agreement(density, middles[middle_of[a]], middles[middle_of[b]])
         touches = border.length >= MIN_CONTACT * np.sqrt(min(sizes[a], sizes[b]))
         limit = CREASED if agreement >= LIKELY else SMOOTH if agreement >= AGREED else 0.0
-        if touches and border.boundary < EDGE and border.bend < limit:
+        continues = border.boundary < EDGE and border.bend < limit and border.affinity > -SURE
+        if touches and (continues or border.affinity > SURE):
             group[group == group[b]] = group[a]
     return _renumber(group[pieces])
 
@@ -118,9 +124,24 @@ def _measure_borders(found: PicturePrediction, pieces: IdImage) -> Iterator[_Bor
     pairs, bends, edges = (np.concatenate(part) for part in zip(*parts, strict=True))
     bends *= found.camera.fx
     keys, index = np.unique(pairs, axis=0, return_inverse=True)
+    affinities = _average_affinities(found, pieces)
     for k, (a, b) in enumerate(keys.tolist()):
-        on = index.ravel() == k
-        yield _Border((a, b), int(on.sum()), float(np.median(bends[on])), float(np.median(edges[on])))
+        on, affinity = index.ravel() == k, affinities.get((a, b), 0.0)
+        yield _Border((a, b), int(on.sum()), float(np.median(bends[on])), float(np.median(edges[on])), affinity)
+
+
+def _average_affinities(found: PicturePrediction, pieces: IdImage) -> dict[tuple[int, int], float]:
+    """Average the logits of all pairs of pixels that lie on two pieces, the one of the lesser number first."""
+    pairs, logits = [], []
+    for (reach, axis), map_ in zip(product(REACHES, (1, 0)), found.affinity, strict=True):
+        own, values = (np.moveaxis(each, axis, 0)[:-reach] for each in (pieces, map_))
+        other = np.moveaxis(pieces, axis, 0)[reach:]
+        on = (own > 0) & (other > 0) & (own != other)
+        pairs.append(np.sort(np.stack([own[on], other[on]], axis=-1), axis=-1))
+        logits.append(values[on])
+    keys, index, counts = np.unique(np.concatenate(pairs), axis=0, return_inverse=True, return_counts=True)
+    sums = np.bincount(index.ravel(), np.concatenate(logits), len(keys))
+    return {(int(a), int(b)): float(v) for (a, b), v in zip(keys, sums / counts, strict=True)}
 
 
 def _compare_across(

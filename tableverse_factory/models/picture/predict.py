@@ -28,6 +28,7 @@ class PicturePrediction(Frozen):
         label: Probabilities of `OTHER`, `TABLE` and `OBJECT`.
         votes: From each pixel to the middle of its object, x and y [px].
         boundary: Probability of an edge between objects.
+        affinity: Logits that a pixel and the one each of `REACHES` to its right, and below it, are of one object.
         normal: Of the table, towards the camera, in the camera frame; a unit vector.
         distance_m: Of the camera from the table's plane [m].
         table_probability: That a table-top is shown.
@@ -39,6 +40,7 @@ class PicturePrediction(Frozen):
     label: Float32[np.ndarray, "3 h w"]
     votes: Float32[np.ndarray, "2 h w"]
     boundary: Float32[np.ndarray, "h w"]
+    affinity: Float32[np.ndarray, "6 h w"]
     normal: Float64[np.ndarray, "3"]
     distance_m: float
     table_probability: float
@@ -101,6 +103,7 @@ def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"],
         softmax(out["label"], axis=0),
         out["votes"],
         expit(out["boundary"][0]),
+        out["affinity"],
         plane[:3] / max(float(np.linalg.norm(plane[:3])), 1e-9),
         float(plane[3]),
         float(expit(float(out["table"][0]))),

@@ -27,6 +27,7 @@ def make_prediction(*things: tuple[slice, slice]) -> PicturePrediction:
         label,
         votes,
         np.zeros((ROWS, COLUMNS), np.float32),
+        np.zeros((6, ROWS, COLUMNS), np.float32),
         np.array([0.0, 0.0, -1.0]),
         1.0,
         0.9,
@@ -95,6 +96,17 @@ def test_a_crease_between_two_peaks_separates() -> None:
     depth[:, 60:] = 1.5
     ids = segment(replace(found, depth=depth))
     assert ids[40, 40] != ids[40, 80]
+
+
+def test_pixels_that_belong_together_join_what_print_cut_and_others_keep_apart_what_votes_would_join() -> None:
+    halves = draw_boundary(vote_in_halves(30.0), 58, 59, 60, 61)
+    assert segment(halves).max() == 2
+    assert segment(replace(halves, affinity=halves.affinity + np.float32(3.0))).max() == 1
+    votes = vote_in_halves(14.0)
+    rng = np.random.default_rng(0)
+    found = replace(votes, votes=(votes.votes + rng.normal(0.0, 4.0, votes.votes.shape)).astype(np.float32))
+    assert segment(found).max() == 1
+    assert segment(replace(found, affinity=found.affinity - np.float32(3.0))).max() == 2
 
 
 def test_ids_are_dense_from_one_the_largest_first() -> None:
