@@ -12,7 +12,7 @@ from tableverse_factory.models.local.device import Tensor, import_torch
 torch = import_torch()
 functional = torch.nn.functional
 
-DEPTH_SHARE = 0.25  # of samples that have a sensor's depth
+DEPTH_SHARE = 0.2  # of samples that have a sensor's depth
 ZOOM_SHARE, MAX_ZOOM = 0.5, 1.7
 RECOLOR_SHARE = 0.5  # of samples whose things change colour one by one
 SWAP_SHARE = 0.15  # whose surroundings are another picture's

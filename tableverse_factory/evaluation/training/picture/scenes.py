@@ -33,8 +33,8 @@ RIG_FOCAL, RIG_ELEVATION, RIG_DISTANCE_M = (0.78, 1.02), (24, 62), (0.45, 1.35)
 COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16)
 COUNT_SHARES = (0.08, 0.1, 0.11, 0.12, 0.12, 0.12, 0.12, 0.1, 0.08, 0.05)
 SETTLED_SHARE, EMPTY_SHARE = 0.4, 0.03
-NO_TABLE_SHARE = 0.12
-CLOSE_SHARE = 0.14
+NO_TABLE_SHARE = 0.09
+CLOSE_SHARE = 0.1
 HELD_OUT = 10
 TRIES = 12  # cameras tried per view
 
@@ -160,7 +160,7 @@ def _aim_at_things(
     for _ in range(TRIES):
         rig = rng.random() < RIG_SHARE
         focal = size[0] * float(np.exp(rng.uniform(*np.log(RIG_FOCAL if rig else FOCAL_RANGE))))
-        angles = RIG_ELEVATION if rig else (20, 72) if rng.random() < 0.8 else (10, 89)
+        angles = RIG_ELEVATION if rig else (20, 72) if rng.random() < 0.75 else (10, 89)
         elevation = np.radians(rng.uniform(*angles))
         close = not rig and rng.random() < CLOSE_SHARE and builder.boxes
         box = builder.boxes[int(rng.integers(len(builder.boxes)))] if close else np.stack([low, high])

@@ -16,6 +16,7 @@ from tableverse_factory.evaluation.training.picture.tables import TABLE_TOP
 from tableverse_factory.evaluation.training.picture.things import ThingMaker, make_turn
 
 SLAB, DISC = 1.0, 2.0
+LONG_SHARE, LONG_M = 0.3, (0.4, 1.6)  # of tables that go on far to one or both sides of the things, and by how much
 SHEET_M = 0.0015  # thickest cloth or sheet of paper, part of the table
 
 
@@ -29,6 +30,8 @@ def add_table(rng: np.random.Generator, builder: SceneBuilder, azimuth: float, f
     kind = rng.random()
     margin = rng.uniform(0.02, 0.25)
     size = half + margin + (rng.uniform(0, [0.8, 0.6]) if rng.random() < 0.65 else 0.0)
+    if rng.random() < LONG_SHARE:
+        size[int(rng.integers(2))] += rng.uniform(*LONG_M)
     slack = np.maximum(size - half - 0.02, 0)
     center = middle + rng.uniform(-0.95, 0.95, 2) * slack
     if far_m > 0.0:
