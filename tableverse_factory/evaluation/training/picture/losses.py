@@ -16,7 +16,7 @@ NEAREST_M, FARTHEST_M = 0.1, 8.0
 SURROUNDINGS = 0.15  # weight of depth that is neither table nor thing
 EDGE_STEPS = (1, 2, 4)  # at which differences of depth are compared [px]
 LEAST_PIXELS = 40.0
-WEIGHTS = {"votes": 1.5, "center": 6.0, "boundary": 0.6, "affinity": 0.5, "normal": 1.5, "distance": 0.5}
+WEIGHTS = {"votes": 1.5, "center": 1.0, "boundary": 0.6, "affinity": 0.5, "normal": 2.0, "distance": 0.5}
 WEIGHTS |= {"table": 0.3, "sigma": 0.02}
 APART = 3.0  # weight of pairs of pixels on two things, of which there are fewer
 SMALL = 1e-3  # below which errors of a normal count by their square
@@ -125,7 +125,7 @@ def _compare_depth(log_depth: Tensor, sample: Sample, sigma: Tensor) -> dict[str
     likelihood = (0.5 * (scale.detach() / sigma) ** 2 + sigma.log()) * any_inner
     return {
         "depth": plain,
-        "shape": 2 * shape,
+        "shape": 4 * shape,
         "steps": 2 * steps,
         "sigma": WEIGHTS["sigma"] * likelihood.sum() / any_inner.sum().clamp(min=1),
     }
