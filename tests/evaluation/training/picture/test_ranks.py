@@ -14,6 +14,8 @@ torch = pytest.importorskip("torch", reason="the extra `models` is not installed
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
 
+from tableverse_factory.evaluation.training.picture import network  # noqa: E402
+from tableverse_factory.evaluation.training.picture import train as train_module  # noqa: E402
 from tableverse_factory.evaluation.training.picture.checkpoint import CHECKPOINT, PictureSettings  # noqa: E402
 from tableverse_factory.evaluation.training.picture.ranks import Ranks, start_ranks  # noqa: E402
 from tableverse_factory.evaluation.training.picture.train import TrainRun, train_pictures  # noqa: E402
@@ -50,13 +52,21 @@ def test_a_process_that_ends_ends_the_training(tmp_path: Path) -> None:
             ranks.agree(True)
 
 
+def train_thin(settings: PictureSettings, run: TrainRun, ranks: Ranks) -> int:
+    """Train a network of few channels; a process that is started knows nothing of the fixture `thin`."""
+    network.WIDTHS, network.ATTENTION = (8, 16, 24, 32), 1
+    return train_module._train_rank(settings, run, ranks)
+
+
+@pytest.mark.usefixtures("thin")
 def test_two_processes_in_parts_give_the_weights_of_one_go(pool_file: Path, tmp_path: Path) -> None:
     settings = PictureSettings(2, **SMALL | {"fresh": 40.0}, gpus=2)
 
-    def train(folder: Path, own: PictureSettings = settings, minutes: float = 60.0) -> dict[str, "torch.Tensor"]:
+    def train(folder: Path, minutes: float = 60.0) -> dict[str, "torch.Tensor"]:
         folder.mkdir(exist_ok=True)
         run = TrainRun(folder, pool_file, "cpu", minutes=minutes, validate=False)
-        train_pictures(own, run, lambda _: None)
+        with start_ranks(2, "cpu", train_thin, settings, run) as ranks:
+            train_thin(settings, run, ranks)
         return load_file(folder / CHECKPOINT)
 
     whole = train(tmp_path / "whole")
@@ -66,6 +76,12 @@ def test_two_processes_in_parts_give_the_weights_of_one_go(pool_file: Path, tmp_
     with safe_open(tmp_path / "whole" / CHECKPOINT, "pt") as file:
         one, other = json.loads(file.metadata()["positions"])
     assert one["step"] == other["step"] == 2
-    assert one["past"] != other["past"], "each process has scenes of its own"
+    run = TrainRun(tmp_path / "parts", pool_file, "cpu", validate=False)
+    alone = replace(settings, gpus=1, fresh=settings.fresh / 2)
+    (tmp_path / "alone").mkdir()
+    train_pictures(alone, replace(run, folder=tmp_path / "alone"), lambda _: None)
+    single = load_file(tmp_path / "alone" / CHECKPOINT)
+    differs = [name for name, tensor in whole.items() if not torch.equal(tensor, single[name])]
+    assert len(differs) > 20, "each process has scenes of its own: the mean is not what one of them learns"
     with pytest.raises(InputError, match="is of another training"):
-        train(tmp_path / "parts", replace(settings, gpus=1))
+        train_pictures(replace(settings, gpus=1), run, lambda _: None)
