@@ -8,7 +8,9 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
-from tableverse_factory.models.local.device import Tensor
+from tableverse_factory.models.local.device import Tensor, import_torch
+
+torch = import_torch()
 
 CHECKPOINT = "checkpoint.safetensors"
 WEIGHTS = "weights.safetensors"
@@ -125,9 +127,13 @@ def load_checkpoint(
         average.load_state_dict(_pick(tensors, "mean."))
     except RuntimeError as error:
         raise InputError(f"{path} is of another network than this version trains: remove it") from error
+    parameters = [each for group in optimizer.param_groups for each in group["params"]]
     state: dict[int, dict[str, Any]] = {}
     for name, tensor in _pick(tensors, "adam.").items():
         index, _, part = name.partition(".")
+        like = parameters[int(index)]
+        if tensor.shape == like.shape:  # the fused optimizer wants the order in memory of the weights
+            tensor = torch.empty_like(like).copy_(tensor)
         state.setdefault(int(index), {})[part] = tensor
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
     return positions[rank]
