@@ -111,7 +111,7 @@ def train_picture(
     where = _prepare_training(device).kind
     if where == "cuda":
         import_extra("cupy", "rendering on a GPU", "training")
-    from tableverse_factory.evaluation.training.picture.checkpoint import PictureSettings  # these import torch
+    from tableverse_factory.evaluation.training.picture.settings import PictureSettings  # these import torch
     from tableverse_factory.evaluation.training.picture.export import export_network
     from tableverse_factory.evaluation.training.picture.train import TrainRun, train_pictures
 

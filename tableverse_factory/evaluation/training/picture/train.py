@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelError
-from tableverse_factory.evaluation.training.picture.checkpoint import (
-    PictureSettings,
-    TrainPosition,
+from tableverse_factory.evaluation.training.checkpoint import (
     load_checkpoint,
     read_weights,
     save_checkpoint,
@@ -23,6 +21,7 @@ from tableverse_factory.evaluation.training.picture.losses import compute_losses
 from tableverse_factory.evaluation.training.picture.network import make_network
 from tableverse_factory.evaluation.training.picture.ring import ViewRing
 from tableverse_factory.evaluation.training.picture.samples import make_sample
+from tableverse_factory.evaluation.training.picture.settings import PictureSettings, TrainPosition
 from tableverse_factory.evaluation.training.picture.validate import validate_network
 from tableverse_factory.evaluation.training.picture.world import World, make_world
 from tableverse_factory.models.local.device import Tensor, import_torch
@@ -99,7 +98,9 @@ class _Trainer:
         self._network = network.to(run.device, memory_format=torch.channels_last).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
-        position = load_checkpoint(run.folder, self._network, self._average, self._optimizer, settings, run.device)
+        position = load_checkpoint(
+            run.folder, self._network, self._average, self._optimizer, settings, TrainPosition(), run.device
+        )
         self._pool = hash_file(run.pool)
         if position.step and position.pool != self._pool:
             raise InputError(f"{run.pool} holds other meshes than those that the checkpoint was trained on")

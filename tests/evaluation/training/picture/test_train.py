@@ -21,14 +21,10 @@ torch = pytest.importorskip("torch", reason="the extra `models` is not installed
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
 
+from tableverse_factory.evaluation.training.checkpoint import CHECKPOINT, WEIGHTS, read_weights  # noqa: E402
 from tableverse_factory.evaluation.training.picture import train as train_module  # noqa: E402
-from tableverse_factory.evaluation.training.picture.checkpoint import (  # noqa: E402
-    CHECKPOINT,
-    WEIGHTS,
-    PictureSettings,
-    read_weights,
-)
 from tableverse_factory.evaluation.training.picture.network import make_network  # noqa: E402
+from tableverse_factory.evaluation.training.picture.settings import PictureSettings  # noqa: E402
 from tableverse_factory.evaluation.training.picture.train import TrainRun, compute_rate, train_pictures  # noqa: E402
 from tableverse_factory.evaluation.training.picture.world import World  # noqa: E402
 

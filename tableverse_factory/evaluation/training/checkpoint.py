@@ -1,10 +1,10 @@
-"""Settings and checkpoints of a training of pictures, and its averaged weights in half precision."""
+"""Checkpoints of a training that continues in parts, and its averaged weights in half precision."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
@@ -12,71 +12,11 @@ from tableverse_factory.models.local.device import Tensor
 
 CHECKPOINT = "checkpoint.safetensors"
 WEIGHTS = "weights.safetensors"
+Position = TypeVar("Position")
 
 
-@dataclass(frozen=True, slots=True)
-class PictureSettings:
-    """Settings that determine the weights, with the meshes of the pool and the device.
-
-    Attributes:
-        steps: Of `batch` views; a continued training may change them, and with them its schedule.
-        scenes: Arrangements in the pool of meshes.
-        capacity: Views that are kept to draw from.
-        first: Views that are rendered before the first step.
-        fresh: New views that are rendered per step.
-        small: Share of the steps, the first ones, whose samples have five sixths of the views' width and height.
-        samples: Rays per pixel.
-        packages, patterns: Textures, of which a package has three.
-        rate: Peak of the learning rate.
-        start: SHA-256 of the weights that the training starts from; empty if it starts from random ones.
-    """
-
-    steps: int
-    scenes: int = 1200
-    seed: int = 0
-    batch: int = 64
-    width: int = 384
-    height: int = 288
-    capacity: int = 24_000
-    first: int = 2_000
-    fresh: float = 12.0
-    small: float = 0.6
-    samples: int = 12
-    packages: int = 320
-    patterns: int = 900
-    rate: float = 1.2e-3
-    start: str = ""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of a view [px]."""
-        return self.width, self.height
-
-    def sample_size(self, step: int) -> tuple[int, int]:
-        """Width and height of the samples of a step [px], multiples of the network's 16."""
-        if step > self.small * self.steps:
-            return self.size
-        return max(16, self.width * 5 // 96 * 16), max(16, self.height * 5 // 96 * 16)
-
-
-@dataclass(frozen=True, slots=True)
-class TrainPosition:
-    """How far a training has come: steps, packs, views, and the numbers of views of the packs in its ring.
-
-    `pool` is the sha256 of the file of meshes.
-    """
-
-    step: int = 0
-    packs: int = 0
-    made: int = 0
-    past: tuple[int, ...] = ()
-    pool: str = ""
-
-
-def save_checkpoint(
-    folder: Path, network: Any, average: Any, optimizer: Any, settings: PictureSettings, position: TrainPosition
-) -> None:
-    """Write everything that the training needs to go on."""
+def save_checkpoint(folder: Path, network: Any, average: Any, optimizer: Any, settings: Any, position: Any) -> None:
+    """Write everything that the training needs to go on; settings and position are dataclasses of plain values."""
     safetensors = import_extra("safetensors.torch", "training", "models")
     tensors = {f"net.{name}": tensor.contiguous().clone() for name, tensor in network.state_dict().items()}
     tensors |= {f"mean.{name}": tensor.contiguous().clone() for name, tensor in average.state_dict().items()}
@@ -89,19 +29,19 @@ def save_checkpoint(
 
 
 def load_checkpoint(
-    folder: Path, network: Any, average: Any, optimizer: Any, settings: PictureSettings, device: str
-) -> TrainPosition:
-    """Restore a training of the same settings, but for `steps`; the start if there is no checkpoint."""
+    folder: Path, network: Any, average: Any, optimizer: Any, settings: Any, start: Position, device: str
+) -> Position:
+    """Restore a training of the same settings, but for `steps`; `start` if there is no checkpoint."""
     path = folder / CHECKPOINT
     if not path.is_file():
-        return TrainPosition()
+        return start
     safetensors = import_extra("safetensors", "training", "models")
     try:
         with safetensors.safe_open(path, "pt", device=device) as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
-        theirs = PictureSettings(**json.loads(metadata["settings"]))
-        position = TrainPosition(**json.loads(metadata["position"]))
+        theirs = type(settings)(**json.loads(metadata["settings"]))
+        position = type(start)(**json.loads(metadata["position"]))
     except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a checkpoint ({error}): remove it, or give another folder") from error
     if replace(theirs, steps=settings.steps) != settings:
