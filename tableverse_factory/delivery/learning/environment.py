@@ -92,7 +92,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             )
         self.render_mode = render_mode
         self.sim = PickPlaceSim(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
-        self._scene, self._reward = scene, reward
+        self.scene, self._reward = scene, reward
         self._max_steps = None if max_steps is None else _check_count("max_steps", max_steps, 1)
         self._variation = _check_variation(Variation() if variation is None else variation)
         self._pictures = check_pictures(pictures)
@@ -193,7 +193,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         """Take pictures of the present state; cameras are kept by their use."""
         names, sample = self.sim.object_ids, self._now.sample
         if use not in self._cameras:
-            self._cameras[use] = SceneCameras(self._scene, self.sim.station, names, pictures, size, *self._look)
+            self._cameras[use] = SceneCameras(self.scene, self.sim.station, names, pictures, size, *self._look)
         return self._cameras[use].take(dict(zip(names, self.sim.poses(), strict=True)), sample.qpos, sample.tcp)
 
     @property
