@@ -48,7 +48,7 @@ def parallel_map(
         return
     # Forked children would share the threads' locks of libraries that are already at work.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(items)), context, _prepare_child) as pool, _translate_death(doing):
+    with ProcessPoolExecutor(min(jobs, len(items)), context, prepare_child) as pool, _translate_death(doing):
         with _defer_interrupt():
             results = pool.map(work, items, chunksize=chunk)
         yield from results
@@ -66,7 +66,7 @@ def parallel_stream(
             yield from map(work, items)
         return
     rest, context = iter(items), multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, _prepare_child)
+    pool = ProcessPoolExecutor(jobs, context, prepare_child)
     try:
         with _translate_death(doing):
             with _defer_interrupt():
@@ -86,7 +86,7 @@ def _translate_death(doing: str) -> Iterator[None]:
         raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
 
 
-def _prepare_child() -> None:
+def prepare_child() -> None:
     """Limit a child to one thread, and end it with its parent: it would wait for work forever."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
