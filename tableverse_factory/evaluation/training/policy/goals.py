@@ -19,7 +19,7 @@ from tableverse_factory.models.local.device import Tensor, import_torch
 torch = import_torch()
 functional = torch.nn.functional
 
-X_POINTS, Y_POINTS, OTHER_POINTS = 128, 64, 16
+X_POINTS, Y_POINTS, OTHER_POINTS = 128, 63, 16  # with the task, a multiple of 8: the fast kernels want that
 DRAWN_POINTS = X_POINTS
 GRASP_UNIT_M, PLACE_UNIT_M = 0.05, 0.15
 OPENING_UNIT_M = 0.04

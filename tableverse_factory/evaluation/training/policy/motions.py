@@ -26,7 +26,7 @@ OPENING_UNIT_M = 0.08
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """State of the robot and of X, in the table frame; lengths in metres, all of b rows."""
+    """State of the robot, in the table frame; lengths in metres, all of b rows."""
 
     tcp_at: Tensor  # commanded
     tcp_turn: Tensor
@@ -35,7 +35,7 @@ class RobotState:
     goal_turn: Tensor
     fingers: Tensor  # openings on the way to the goal and while holding, (b, 2)
     phase: Tensor  # of the last command
-    moved: Tensor  # of X since the start, (b, 3)
+    moved: Tensor  # from the pose of the grasp, once X is lifted; else 0; (b, 3)
     base_at: Tensor
     base_turn: Tensor
 

@@ -94,7 +94,7 @@ class GoalNetwork(Module):  # type: ignore[misc]
         return self.memory(tokens), mask
 
     def compute_flow(self, memory: tuple[Tensor, Tensor], noisy: Tensor, time: Tensor) -> Tensor:
-        """Compute the velocity of noisy goals, each by itself. Shapes (b, m, GOAL), (b, m) from 0 to 1, (b, m, GOAL)."""
+        """Compute the velocity of noisy goals, (b, m, GOAL), each by itself, at times (b, m) from 0 to 1."""
         angle = time[..., None] * (2.0 ** torch.arange(8, device=time.device)) * (torch.pi / 2)
         x = self.noisy(torch.cat([noisy, angle.sin(), angle.cos()], -1))
         x = x + memory[0][:, :1]

@@ -42,7 +42,7 @@ def pack_demonstrations(
     dataset: Dataset,
     splits: Sequence[str] = ("train", "validation"),
     robot: str = "panda",
-    on_scene: Callable[[], object] = lambda: None,
+    on_scene: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Demonstrations:
     """Pack the successful motions of an arm in these splits, by scene and task; of `validation` they are held out.
 
@@ -56,9 +56,9 @@ def pack_demonstrations(
     for scene_id, _, row in rows:
         by_scene.setdefault(scene_id, []).append(row)
     packer = _Packer(robot)
-    for scene_id, own in by_scene.items():
+    for done, (scene_id, own) in enumerate(by_scene.items(), 1):
         packer.add_scene(dataset.scene(scene_id), own, split_of[scene_id] == "validation")
-        on_scene()
+        on_scene(done, len(by_scene))
     if not by_scene:
         raise InputError(f"{dataset.path}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
     return packer.finish()

@@ -35,6 +35,7 @@ TURN_RAD = 0.25  # deviation of the frames of goals
 JITTER_M = 0.0007  # of the points
 LOST = 0.15  # share of other objects that are left out
 RETURN = 6  # samples within which a disturbed motion is back on its path
+BLIND = 0.2  # share of states that are told of no object, as those of a policy on pictures are
 LATE = 0.15  # share of states whose phase is told late, by up to LATE_STEPS
 LATE_STEPS = 3
 
@@ -119,7 +120,6 @@ def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> Chu
     opening = torch.where(grasping[:, 0], data.openings[demos, 0], data.openings[demos, 1])
     tcp_at, tcp_turn = data.tcp_at[now], data.tcp_turn[now]
     next_at, next_turn = data.tcp_at[steps], data.tcp_turn[steps]
-    moved = data.carried_at[now] - data.carried_at[data.first[demos]]
     carried_at, measured = data.carried_at[now], data.opening[now]
     if augment:
         shift, turn = _draw_disturbance(data, demos, tcp_at)
@@ -128,9 +128,10 @@ def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> Chu
         next_at = next_at + fade * shift[:, None]
         next_turn = matrix_from_vector(fade * turn[:, None]) @ next_turn
         held = ((phase >= POST_GRASP) & (phase <= PLACE))[:, None]
-        moved, carried_at = moved + shift * held, carried_at + shift * held
+        carried_at = carried_at + shift * held
         measured = measured + 0.0005 * torch.randn_like(measured) * torch.tensor([0.0, 1.0], device=now.device)
     fingers = torch.stack([opening, data.holding[demos]], 1)
+    moved = torch.where(grasping, 0.0, tcp_at - data.grasp_at[demos])
     state = RobotState(
         tcp_at,
         tcp_turn,
@@ -149,6 +150,8 @@ def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> Chu
     points, present = data.place_points(demos, MOTION_POINTS)
     points = _carry_points(data, demos, points, carried_at, data.carried_turn[now])
     points = localize_points(points, goal_at, goal_turn, mirror)
+    if augment:
+        present = present & (torch.rand(len(now), 1, device=now.device) > BLIND)
     return ChunkBatch(describe_state(state, mirror), points, present, chunk, data.phases[steps], left)
 
 

@@ -198,7 +198,7 @@ class StatePolicy:
             *self._goal,
             fingers,
             torch.tensor([self._phase]),
-            _tensor(objects[:1, :3] - self._stood[:1, :3]),
+            torch.zeros(1, 3) if self._phase <= GRASP else tcp_at - self._grasp_at,
             self._base_at,
             self._base_turn,
         )

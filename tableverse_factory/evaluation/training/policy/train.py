@@ -1,6 +1,7 @@
 """Training of the policy on states from packed demonstrations; it needs numpy and torch alone."""
 
 import copy
+import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -18,7 +19,6 @@ from tableverse_factory.evaluation.training.policy.settings import PolicyPositio
 from tableverse_factory.evaluation.training.policy.tensors import DemonstrationTensors
 from tableverse_factory.evaluation.training.policy.validate import validate_network
 from tableverse_factory.models.local.device import Tensor, import_torch
-from tableverse_factory.models.local.weight_files import hash_file
 
 torch = import_torch()
 
@@ -77,7 +77,7 @@ class _Trainer:
         position = load_checkpoint(
             run.folder, self._network, self._average, self._optimizer, settings, PolicyPosition(), run.device
         )
-        self._hash = hash_file(run.demonstrations)
+        self._hash = hashlib.sha256(run.demonstrations.read_bytes()).hexdigest()
         if position.step and position.demonstrations != self._hash:
             raise InputError(f"{run.demonstrations} holds other demonstrations than the checkpoint was trained on")
         self._data = DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device)

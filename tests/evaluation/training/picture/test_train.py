@@ -185,7 +185,7 @@ def test_the_rate_rises_stays_and_falls() -> None:
 
 def test_the_command_trains_exports_and_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {name: SMALL[name] for name in ("width", "height", "packages", "patterns", "fresh")}
-    where = "tableverse_factory.evaluation.training.picture.checkpoint.PictureSettings"
+    where = "tableverse_factory.evaluation.training.picture.settings.PictureSettings"
     monkeypatch.setattr(where, partial(PictureSettings, **small))
     monkeypatch.setattr(train_module, "VALIDATION_VIEWS", 8)
     options, folder = "--scenes 2 --batch 2 --views 64 --device cpu --jobs 0", tmp_path / "net"
