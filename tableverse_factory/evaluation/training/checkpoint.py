@@ -82,5 +82,7 @@ def read_weights(path: Path, network: Any) -> None:
         with safetensors.safe_open(path, "pt") as file:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
         network.load_state_dict({k: each.float() if each.is_floating_point() else each for k, each in weights.items()})
-    except (OSError, safetensors.SafetensorError, RuntimeError) as error:
+        if not all(each.isfinite().all() for each in network.parameters()):
+            raise ValueError("numbers that are not finite")
+    except (OSError, safetensors.SafetensorError, RuntimeError, ValueError) as error:
         raise InputError(f"{path} holds no weights of this network: train it first") from error

@@ -7,7 +7,14 @@ knows exactly.
 
 from dataclasses import dataclass
 
-from tableverse_factory.evaluation.training.policy.network import PHASES, STATE, expand_lengths
+from tableverse_factory.evaluation.training.policy.network import (
+    NEAR_M,
+    OPENING_UNIT_M,
+    PHASES,
+    POSITION_UNIT_M,
+    STATE,
+    expand_lengths,
+)
 from tableverse_factory.evaluation.training.policy.rotations import (
     apply,
     columns_from_matrix,
@@ -20,8 +27,6 @@ torch = import_torch()
 functional = torch.nn.functional
 
 MOTION_POINTS = 24
-POSITION_UNIT_M = 0.1
-OPENING_UNIT_M = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +57,7 @@ def describe_state(state: RobotState, mirror: Tensor) -> Tensor:
     rotation = back @ state.tcp_turn * mirror[:, :, None] * mirror[:, None, :]
     told = torch.cat(
         [
-            expand_lengths(turn_in(state.tcp_at - state.goal_at), (0.3, 0.05, 0.01)),
+            expand_lengths(turn_in(state.tcp_at - state.goal_at), (NEAR_M, 0.05, 0.01)),
             columns_from_matrix(rotation),
             turn_in(up),
             turn_in(state.base_at - state.goal_at),

@@ -6,6 +6,7 @@ the next `CHUNK` poses of the gripper, their openings and phases, on the way to 
 
 from typing import Any
 
+from tableverse_factory.evaluation.training.policy.rotations import matrix_from_columns, vector_from_matrix
 from tableverse_factory.models.local.device import Tensor, import_torch
 
 torch = import_torch()
@@ -21,6 +22,8 @@ STATE = 42  # numbers of the robot's state (`samples.ChunkBatch`)
 CHUNK = 16  # samples of `STEP_S`
 PHASES = 6
 STEP = 7 + PHASES  # of a chunk: position, rotation vector, opening, scores of the phases
+NEAR_M = 0.3  # scale of `expand_lengths` that is linear for the robot's state
+POSITION_UNIT_M, OPENING_UNIT_M = 0.1, 0.08  # of chunks
 ROLES = 3  # X, Y, others
 FLOW_STEPS = 10
 
@@ -120,7 +123,7 @@ class ChunkNetwork(Module):  # type: ignore[misc]
         self.point = _make_perceptron(3 * 3 + ROLES, WIDTH)
         self.layers = nn.ModuleList([Attention() for _ in range(MOTION)])
         self.head = nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 2 * WIDTH), nn.GELU())
-        self.chunk = nn.Linear(2 * WIDTH, CHUNK * STEP)
+        self.chunk = nn.Linear(2 * WIDTH, CHUNK * (STEP + 6))
 
     def forward(self, state: Tensor, points: Tensor, mask: Tensor) -> Tensor:
         """Compute a chunk.
@@ -130,9 +133,12 @@ class ChunkNetwork(Module):  # type: ignore[misc]
             points: Of each object, X and Y first, in the goal's frame. Shape (b, r, p, 3) [m].
             mask: Which objects are there. Shape (b, r).
 
+        Each step has six gates more, shares of what is left to the goal: so that arrival is exact, and what is
+        predicted beside them may be coarse.
+
         Returns:
-            Position from the present one [0.1 m], rotation vector from the present orientation [rad], opening
-            [0.08 m] and scores of the phases. Shape (b, CHUNK, STEP).
+            Position from the present one [`POSITION_UNIT_M`], rotation vector from the present orientation [rad],
+            opening [`OPENING_UNIT_M`] and scores of the phases. Shape (b, CHUNK, STEP).
         """
         roles = torch.arange(points.shape[1], device=points.device).clamp(max=ROLES - 1)
         role = functional.one_hot(roles, ROLES).to(points.dtype)[:, None].expand(*points.shape[:3], -1)
@@ -141,7 +147,11 @@ class ChunkNetwork(Module):  # type: ignore[misc]
         mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
         for layer in self.layers:
             tokens = layer(tokens, mask)
-        return self.chunk(self.head(tokens[:, 0])).reshape(-1, CHUNK, STEP).float()
+        chunk = self.chunk(self.head(tokens[:, 0])).reshape(-1, CHUNK, STEP + 6).float()
+        position = state[:, :3].float() * NEAR_M / POSITION_UNIT_M
+        turn = vector_from_matrix(matrix_from_columns(state[:, 9:15].float()))
+        left = torch.cat([position, turn], 1)[:, None]
+        return torch.cat([chunk[..., :6] - chunk[..., STEP:] * left, chunk[..., 6:STEP]], -1)
 
 
 class StateNetwork(Module):  # type: ignore[misc]

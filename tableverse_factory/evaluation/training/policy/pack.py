@@ -102,9 +102,9 @@ class _Packer:
             self._rows.append(
                 {
                     "objects": first + order_by_distance(centers, x, y),
-                    "scenes": np.int32(self._scenes),
-                    "relations": np.uint8(RELATIONS.index(row["relation"])),
-                    "held_out": np.uint8(held_out),
+                    "scenes": np.array(self._scenes),
+                    "relations": np.array(RELATIONS.index(row["relation"])),
+                    "held_out": np.array(held_out),
                     "bases": np.concatenate([recording.base.position, recording.base.quaternion_wxyz]),
                 }
             )

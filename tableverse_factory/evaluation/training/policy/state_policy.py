@@ -44,6 +44,7 @@ from tableverse_factory.evaluation.training.policy.select import select_goals
 from tableverse_factory.evaluation.training.policy.tensors import (
     GRASP,
     PLACE,
+    POST_PLACE,
     PRE_GRASP,
     describe_relations,
 )
@@ -57,6 +58,9 @@ DRAWN = 64  # goals of which the densest that the arm reaches is taken
 TRIED = 24
 EXECUTED = 4  # samples of a chunk
 IK_STEPS = 4
+RISE_M, LEFT_BEHIND_M = 0.05, 0.01  # X is lost where it has risen by less while the gripper rose by more [m]
+WAIT_S = 2.0  # after the release, before another attempt
+RETURN_SPEED = 0.8  # of joints on the way home [rad/s]
 HOMING = 0.02  # share of the way home that joints go per step where the gripper's pose leaves them free
 
 
@@ -81,8 +85,8 @@ class StatePolicy:
         self._base_turn = matrix_from_quaternion(_tensor(start.base.quaternion_wxyz[None]))
         self._base_at = _tensor(start.base.position[None])
         self._queue: deque[np.ndarray] = deque()
-        self._phase = PRE_GRASP
         self._home: JointVector | None = None
+        self._attempts = 0
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the next command as an action."""
@@ -92,19 +96,42 @@ class StatePolicy:
                 self._home = robot[: len(self._chain.lower)].copy()
                 self._command = np.array([*self._home, self._start.upper[-1]])
                 self._plan(objects)
-            if not self._queue:
+            if not self._queue and self._has_failed(objects):
+                self._return_home()
+            elif not self._queue:
+                if self._returning:
+                    self._plan(objects)
                 self._extend_queue(robot, objects)
         self._command = self._queue.popleft()
+        self._released_s += self._start.step_s * (self._phase == POST_PLACE)
         return self._start.to_action(self._command)
+
+    def _has_failed(self, objects: np.ndarray) -> bool:
+        """Test whether X was left behind, or lies where it was released and that was not what the task asks for."""
+        if self._returning:
+            return False
+        rise = float(self._command_tcp()[0][0, 2] - self._grasp_at[0, 2])
+        left = objects[0, 2] - self._stood[0, 2] < LEFT_BEHIND_M and rise > RISE_M and GRASP < self._phase < PLACE
+        return bool(left) or self._released_s > WAIT_S
+
+    def _return_home(self) -> None:
+        """Append commands that open the fingers and lead home, for another attempt from there."""
+        way = self._home - self._command[:-1]
+        steps = max(2, int(np.ceil(np.abs(way).max() / (RETURN_SPEED * self._start.step_s))))
+        for share in np.arange(1, steps + 1) / steps:
+            self._queue.append(np.array([*(self._command[:-1] + share * way), self._start.upper[-1]]))
+        self._returning, self._phase, self._released_s = True, PRE_GRASP, 0.0
 
     def _plan(self, objects: np.ndarray) -> None:
         """Draw a grasp and a release for the scene as it stands."""
+        self._phase, self._returning, self._released_s = PRE_GRASP, False, 0.0
         self._stood = objects[: len(self._start.points)]
         self._rows = self._order_objects()
         scenes = self._describe_scene()
         self._grasp_at, self._grasp_turn, self._grasp_fingers = self._draw_grasp(scenes)
         self._draw_release(scenes)
         self._goal = (self._grasp_at, self._grasp_turn)
+        self._attempts += 1
 
     def _order_objects(self) -> list[int]:
         """List X, Y, and the others nearest to X, as demonstrations do."""
@@ -127,13 +154,13 @@ class StatePolicy:
         return Scenes(*self._place_points(self._stood, DRAWN_POINTS), self._base_at, self._base_turn, kind, side)
 
     def _draw(self, scenes: Scenes, release: bool, grasp: Tensor) -> tuple[GoalFrame, Tensor]:
-        """Draw goals; return their frame, and them, the densest first."""
+        """Draw goals; return their frame, and them, the densest first, but in later attempts as they were drawn."""
         flag = torch.tensor([release])
         frame = find_frame(scenes, flag, torch.zeros(1), torch.tensor([False]))
         task = describe_task(scenes, frame, flag, grasp)
         memory = self._network.goal.encode(*select_points(scenes, frame), task)
         drawn = self._network.goal.draw(memory, torch.randn(1, DRAWN, GOAL, generator=self._random))
-        return frame, drawn[:, select_goals(drawn)[0]]
+        return frame, drawn if self._attempts else drawn[:, select_goals(drawn)[0]]
 
     def _draw_grasp(self, scenes: Scenes) -> tuple[Tensor, Tensor, Tensor]:
         frame, drawn = self._draw(scenes, False, torch.zeros(1, 9))
@@ -183,11 +210,14 @@ class StatePolicy:
             torch.cat([state.tcp_at[:, None], at], 1)[0], torch.cat([state.tcp_turn[:, None], turn], 1)[0], opening[0]
         )
 
+    def _command_tcp(self) -> tuple[Tensor, Tensor]:
+        """Compute the gripper's commanded pose in the table frame."""
+        rotation, position = self._chain.forward(self._command[None, :-1])
+        return self._base_at + apply(self._base_turn, _tensor(position)), self._base_turn @ _tensor(rotation)
+
     def _describe_robot(self, robot: np.ndarray, objects: np.ndarray) -> RobotState:
         joints = len(self._chain.lower)
-        rotation, position = self._chain.forward(self._command[None, :joints])
-        tcp_at = self._base_at + apply(self._base_turn, _tensor(position))
-        tcp_turn = self._base_turn @ _tensor(rotation)
+        tcp_at, tcp_turn = self._command_tcp()
         fingers = self._grasp_fingers if self._phase <= GRASP else self._release_fingers
         if GRASP < self._phase < PLACE:
             self._goal = self._locate_release(robot[2 * joints + 1 :], objects[0])
