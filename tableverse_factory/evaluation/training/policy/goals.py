@@ -118,6 +118,12 @@ def decode_openings(goals: Tensor) -> Tensor:
     return (goals[..., 9:GOAL] * OPENING_UNIT_M + WIDTH_M / 2).clamp(0.0, WIDTH_M)
 
 
+def describe_grasp(scenes: Scenes, frame: GoalFrame, at: Tensor, turn: Tensor) -> Tensor:
+    """Describe the grasp to which a release belongs. Shape (b, 9)."""
+    position = frame.turn_in(at - scenes.middle[:, 0]) / GRASP_UNIT_M
+    return torch.cat([position, columns_from_matrix(frame.rotation_in(turn))], 1)
+
+
 def describe_task(scenes: Scenes, frame: GoalFrame, release: Tensor, grasp: Tensor) -> Tensor:
     """Describe the task beside the points; `grasp` (b, 9) is only told for releases. Shape (b, QUERY)."""
     side = torch.cat([scenes.side, torch.zeros_like(scenes.side[:, :1])], 1)

@@ -8,7 +8,7 @@ knows exactly.
 from dataclasses import dataclass
 
 from tableverse_factory.evaluation.training.policy.network import (
-    NEAR_M,
+    LINEAR_M,
     OPENING_UNIT_M,
     PHASES,
     POSITION_UNIT_M,
@@ -57,7 +57,7 @@ def describe_state(state: RobotState, mirror: Tensor) -> Tensor:
     rotation = back @ state.tcp_turn * mirror[:, :, None] * mirror[:, None, :]
     told = torch.cat(
         [
-            expand_lengths(turn_in(state.tcp_at - state.goal_at), (NEAR_M, 0.05, 0.01)),
+            expand_lengths(turn_in(state.tcp_at - state.goal_at), (LINEAR_M, 0.05, 0.01)),
             columns_from_matrix(rotation),
             turn_in(up),
             turn_in(state.base_at - state.goal_at),

@@ -22,7 +22,7 @@ STATE = 42  # numbers of the robot's state (`samples.ChunkBatch`)
 CHUNK = 16  # samples of `STEP_S`
 PHASES = 6
 STEP = 7 + PHASES  # of a chunk: position, rotation vector, opening, scores of the phases
-NEAR_M = 0.3  # scale of `expand_lengths` that is linear for the robot's state
+LINEAR_M = 0.3  # scale of `expand_lengths` that is linear for the robot's state
 POSITION_UNIT_M, OPENING_UNIT_M = 0.1, 0.08  # of chunks
 ROLES = 3  # X, Y, others
 FLOW_STEPS = 10
@@ -148,7 +148,7 @@ class ChunkNetwork(Module):  # type: ignore[misc]
         for layer in self.layers:
             tokens = layer(tokens, mask)
         chunk = self.chunk(self.head(tokens[:, 0])).reshape(-1, CHUNK, STEP + 6).float()
-        position = state[:, :3].float() * NEAR_M / POSITION_UNIT_M
+        position = state[:, :3].float() * LINEAR_M / POSITION_UNIT_M
         turn = vector_from_matrix(matrix_from_columns(state[:, 9:15].float()))
         left = torch.cat([position, turn], 1)[:, None]
         return torch.cat([chunk[..., :6] - chunk[..., STEP:] * left, chunk[..., 6:STEP]], -1)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from tableverse_factory.evaluation.training.policy.goals import (
     DRAWN_POINTS,
-    GRASP_UNIT_M,
     Scenes,
+    describe_grasp,
     describe_task,
     encode_grasp,
     encode_release,
@@ -20,7 +20,7 @@ from tableverse_factory.evaluation.training.policy.motions import (
     localize_points,
 )
 from tableverse_factory.evaluation.training.policy.network import CHUNK
-from tableverse_factory.evaluation.training.policy.rotations import apply, columns_from_matrix, matrix_from_vector
+from tableverse_factory.evaluation.training.policy.rotations import apply, matrix_from_vector
 from tableverse_factory.evaluation.training.policy.tensors import (
     GRASP,
     PLACE,
@@ -93,12 +93,6 @@ def sample_goals(data: DemonstrationTensors, demos: Tensor, release: Tensor, aug
     goal = torch.where(release[:, None], encode_release(frame, middle, motion, opening[:, 1], holding), grasp)
     held = describe_grasp(scenes, frame, grasp_at, grasp_turn)
     return GoalBatch(*select_points(scenes, frame), describe_task(scenes, frame, release, held), goal, release)
-
-
-def describe_grasp(scenes: Scenes, frame: object, at: Tensor, turn: Tensor) -> Tensor:
-    """Describe the grasp to which a release belongs. Shape (b, 9)."""
-    position = frame.turn_in(at - scenes.middle[:, 0]) / GRASP_UNIT_M  # type: ignore[attr-defined]
-    return torch.cat([position, columns_from_matrix(frame.rotation_in(turn))], 1)  # type: ignore[attr-defined]
 
 
 def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> ChunkBatch:
