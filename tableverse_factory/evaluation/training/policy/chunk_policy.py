@@ -121,7 +121,7 @@ class ChunkPolicy(ABC):
         return 0
 
     def _begin_attempt(self, observation: Observation) -> None:
-        self._phase, self._returning, self._released_s = PRE_GRASP, False, 0.0
+        self._phase, self._since_s, self._returning, self._released_s = PRE_GRASP, 0.0, False, 0.0
         self.plan(observation)
         self._goal = (self._grasp_at, self._grasp_turn)
         self._attempts += 1
@@ -153,10 +153,17 @@ class ChunkPolicy(ABC):
         points = localize_points(points, state.goal_at, state.goal_turn, mirror)
         chunk = self._network.motion(describe_state(state, mirror), points, present)
         at, turn, opening = decode_chunk(state, chunk)
-        self._phase = max(self._phase, int(chunk[0, EXECUTED - 1, 7:].argmax()))
+        self._advance_phase(chunk[0, :EXECUTED, 7:].argmax(1).tolist())
         self._append_commands(
             torch.cat([state.tcp_at[:, None], at], 1)[0], torch.cat([state.tcp_turn[:, None], turn], 1)[0], opening[0]
         )
+
+    def _advance_phase(self, phases: list[int]) -> None:
+        """Advance the phase, and the time since it began, by the samples that are executed next."""
+        for phase in phases:
+            self._since_s += STEP_S
+            if phase > self._phase:
+                self._phase, self._since_s = phase, 0.0
 
     def _command_tcp(self) -> tuple[Tensor, Tensor]:
         """Compute the gripper's commanded pose in the table frame."""
@@ -177,6 +184,7 @@ class ChunkPolicy(ABC):
             self._grasp_fingers if grasping else self._release_fingers,
             torch.tensor([self._phase]),
             torch.zeros(1, 3) if grasping else tcp_at - self._grasp_at,
+            torch.tensor([self._since_s]),
             self._base_at,
             self._base_turn,
         )

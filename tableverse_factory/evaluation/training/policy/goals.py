@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from tableverse_factory.evaluation.training.policy.network import GOAL
 from tableverse_factory.evaluation.training.policy.rotations import (
+    apply,
     columns_from_matrix,
     matrix_from_columns,
     turn_about_z,
@@ -40,9 +41,7 @@ class GoalFrame:
 
     def turn_in(self, vectors: Tensor) -> Tensor:
         """Express directions here. Shape (b, …, 3)."""
-        return (_widen(self.turn, vectors).transpose(-1, -2) @ vectors[..., None])[..., 0] * _widen(
-            self.mirror, vectors
-        )
+        return apply(_widen(self.turn, vectors).mT, vectors) * _widen(self.mirror, vectors)
 
     def rotation_in(self, rotation: Tensor) -> Tensor:
         """Express the orientation of a gripper here; a reflected gripper is one again, with its fingers swapped."""
@@ -95,15 +94,16 @@ def encode_grasp(
 ) -> Tensor:
     """Encode grasps: the gripper's pose, the opening on the way there, and the one that holds. Shape (b, GOAL)."""
     position = frame.turn_in(at - scenes.middle[:, 0]) / GRASP_UNIT_M
-    return _join(position, frame.rotation_in(turn), opening, holding)
+    return join_goal(position, frame.rotation_in(turn), opening, holding)
 
 
 def encode_release(frame: GoalFrame, middle: Tensor, motion: Tensor, opening: Tensor, holding: Tensor) -> Tensor:
     """Encode releases: where X's middle comes to be, its rotation from where it stood, the opening. Shape (b, GOAL)."""
-    return _join(frame.localize(middle) / PLACE_UNIT_M, frame.motion_in(motion), opening, holding)
+    return join_goal(frame.localize(middle) / PLACE_UNIT_M, frame.motion_in(motion), opening, holding)
 
 
-def _join(position: Tensor, rotation: Tensor, opening: Tensor, holding: Tensor) -> Tensor:
+def join_goal(position: Tensor, rotation: Tensor, opening: Tensor, holding: Tensor) -> Tensor:
+    """Join the parts of goals; position in units of its own, openings [m]. Shape (b, GOAL)."""
     fingers = (torch.stack([opening, holding], 1) - WIDTH_M / 2) / OPENING_UNIT_M
     return torch.cat([position, 1.5 * columns_from_matrix(rotation), fingers], 1)
 
@@ -149,25 +149,26 @@ def select_points(scenes: Scenes, frame: GoalFrame) -> tuple[Tensor, Tensor, Ten
     Returns:
         Points in the frame and from the middle of their object, (b, n, 6); roles, (n,); which are there, (b, n).
     """
-    counts = [X_POINTS, Y_POINTS, *[OTHER_POINTS] * (scenes.points.shape[1] - 2)]
-    rows, masks = [], []
-    for row, count in enumerate(counts):
-        points = scenes.points[:, row, :count]
-        rows.append(torch.cat([frame.localize(points), frame.turn_in(points - points.mean(1, keepdim=True))], -1))
-        masks.append(scenes.present[:, row, None].expand(-1, count))
-    roles = torch.tensor([min(row, 2) for row, count in enumerate(counts) for _ in range(count)])
-    return torch.cat(rows, 1), roles.to(scenes.points.device), torch.cat(masks, 1)
+    groups = ((0, 1, X_POINTS), (1, 2, Y_POINTS), (2, scenes.points.shape[1], OTHER_POINTS))
+    rows, roles, masks = [], [], []
+    for role, (first, end, count) in enumerate(groups):
+        points = scenes.points[:, first:end, :count]
+        own = frame.turn_in(points - points.mean(2, keepdim=True))
+        rows.append(torch.cat([frame.localize(points), own], -1).flatten(1, 2))
+        roles.append(torch.full((rows[-1].shape[1],), role, device=points.device))
+        masks.append(scenes.present[:, first:end, None].expand(-1, -1, count).flatten(1, 2))
+    return torch.cat(rows, 1), torch.cat(roles), torch.cat(masks, 1)
 
 
 def decode_grasp(scenes: Scenes, frame: GoalFrame, goals: Tensor) -> tuple[Tensor, Tensor]:
     """Decode the gripper's pose of grasps, (b, m, GOAL), in the table frame: (b, m, 3) and (b, m, 3, 3)."""
     turn = frame.turn[:, None]
-    at = (turn @ goals[..., :3, None])[..., 0] * GRASP_UNIT_M + scenes.middle[:, None, 0]
+    at = apply(turn, goals[..., :3]) * GRASP_UNIT_M + scenes.middle[:, None, 0]
     return at, turn @ decode_rotation(goals)
 
 
 def decode_release(frame: GoalFrame, goals: Tensor) -> tuple[Tensor, Tensor]:
     """Decode where X's middle comes to be, and its rotation, of releases (b, m, GOAL): (b, m, 3) and (b, m, 3, 3)."""
     turn = frame.turn[:, None]
-    at = (turn @ goals[..., :3, None])[..., 0] * PLACE_UNIT_M + frame.at[:, None]
+    at = apply(turn, goals[..., :3]) * PLACE_UNIT_M + frame.at[:, None]
     return at, turn @ decode_rotation(goals) @ turn.mT

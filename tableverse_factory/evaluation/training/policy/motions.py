@@ -41,6 +41,7 @@ class RobotState:
     fingers: Tensor  # openings on the way to the goal and while holding, (b, 2)
     phase: Tensor  # of the last command
     moved: Tensor  # from the pose of the grasp, once X is lifted; else 0; (b, 3)
+    since: Tensor  # when the phase began [s]
     base_at: Tensor
     base_turn: Tensor
 
@@ -67,6 +68,8 @@ def describe_state(state: RobotState, mirror: Tensor) -> Tensor:
             functional.one_hot(state.phase, PHASES).to(up.dtype),
             state.goal_at[:, 2:] / 0.3,
             state.tcp_at[:, 2:] / 0.3,
+            state.since[:, None].clamp(max=2.0),
+            torch.tanh(state.since[:, None] / 0.2),
         ],
         1,
     )

@@ -18,10 +18,11 @@ ENCODER, DECODER, MOTION = 5, 3, 4  # layers
 DROPOUT = 0.1
 GOAL = 11  # position, two columns of the rotation, opening on the way there, opening that holds
 QUERY = 24  # numbers that describe the task beside the points (`samples.GoalBatch`)
-STATE = 42  # numbers of the robot's state (`samples.ChunkBatch`)
+STATE = 44  # numbers of the robot's state (`samples.ChunkBatch`)
 CHUNK = 16  # samples of `STEP_S`
 PHASES = 6
 STEP = 7 + PHASES  # of a chunk: position, rotation vector, opening, scores of the phases
+GATES = 8  # of a chunk's step: shares of the position, of the rotation and of two openings that are left to go
 LINEAR_M = 0.3  # scale of `expand_lengths` that is linear for the robot's state
 POSITION_UNIT_M, OPENING_UNIT_M = 0.1, 0.08  # of chunks
 ROLES = 3  # X, Y, others
@@ -50,7 +51,8 @@ class Attention(Module):  # type: ignore[misc]
         return x + self.drop(self.narrow(functional.gelu(self.widen(self.between(x)))))
 
 
-def _make_perceptron(inputs: int, outputs: int) -> Any:
+def make_perceptron(inputs: int, outputs: int) -> Any:
+    """Make a perceptron of one hidden layer."""
     return nn.Sequential(nn.Linear(inputs, WIDTH), nn.GELU(), nn.Linear(WIDTH, outputs))
 
 
@@ -59,39 +61,20 @@ def expand_lengths(vectors: Tensor, scales: tuple[float, ...]) -> Tensor:
     return torch.cat([vectors / scales[0], *(torch.tanh(vectors / scale) for scale in scales[1:])], -1)
 
 
-class GoalNetwork(Module):  # type: ignore[misc]
-    """Points of the scene and a description of the task; a field that carries noise to goals."""
+class GoalFlow(Module):  # type: ignore[misc]
+    """Tokens of a scene and its task; a field that carries noise to goals."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.point = _make_perceptron(3 * 4 + 3 * 2 + ROLES, WIDTH)
-        self.task = _make_perceptron(QUERY, WIDTH)
         self.encoder = nn.ModuleList([Attention() for _ in range(ENCODER)])
         self.memory = nn.LayerNorm(WIDTH)
-        self.noisy = _make_perceptron(GOAL + 16, WIDTH)
+        self.noisy = make_perceptron(GOAL + 16, WIDTH)
         self.decoder = nn.ModuleList([Attention() for _ in range(DECODER)])
         self.flow = nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, GOAL))
         nn.init.zeros_(self.flow[1].weight)
 
-    def encode(self, points: Tensor, roles: Tensor, mask: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode a scene once.
-
-        Args:
-            points: In the goal's frame, and from the middle of their object. Shape (b, n, 6) [m].
-            roles: 0 for X, 1 for Y, 2 for others. Shape (n,).
-            mask: Which points are there. Shape (b, n).
-            task: Shape (b, QUERY).
-
-        Returns:
-            Tokens of shape (b, n + 1, c), and which of them are there.
-        """
-        at, own = points[..., :3], points[..., 3:]
-        shown = torch.cat([expand_lengths(at, (0.3, 0.15, 0.05, 0.015)), expand_lengths(own, (0.1, 0.03))], -1)
-        role = functional.one_hot(roles, ROLES).to(points.dtype).expand(len(points), -1, -1)
-        task_token = self.task(task)
-        tokens = self.point(torch.cat([shown, role], -1)) + task_token[:, None]
-        tokens = torch.cat([task_token[:, None], tokens], 1)
-        mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
+    def attend(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Let tokens, (b, n, c), attend to those that are there, (b, n); return both."""
         for layer in self.encoder:
             tokens = layer(tokens, mask)
         return self.memory(tokens), mask
@@ -114,16 +97,45 @@ class GoalNetwork(Module):  # type: ignore[misc]
         return goals
 
 
+class GoalNetwork(GoalFlow):
+    """Goals from points of the scene."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.point = make_perceptron(3 * 4 + 3 * 2 + ROLES, WIDTH)
+        self.task = make_perceptron(QUERY, WIDTH)
+
+    def encode(self, points: Tensor, roles: Tensor, mask: Tensor, task: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode a scene once.
+
+        Args:
+            points: In the goal's frame, and from the middle of their object. Shape (b, n, 6) [m].
+            roles: 0 for X, 1 for Y, 2 for others. Shape (n,).
+            mask: Which points are there. Shape (b, n).
+            task: Shape (b, QUERY).
+
+        Returns:
+            Tokens of shape (b, n + 1, c), and which of them are there.
+        """
+        at, own = points[..., :3], points[..., 3:]
+        shown = torch.cat([expand_lengths(at, (0.3, 0.15, 0.05, 0.015)), expand_lengths(own, (0.1, 0.03))], -1)
+        role = functional.one_hot(roles, ROLES).to(points.dtype).expand(len(points), -1, -1)
+        task_token = self.task(task)
+        tokens = self.point(torch.cat([shown, role], -1)) + task_token[:, None]
+        tokens = torch.cat([task_token[:, None], tokens], 1)
+        return self.attend(tokens, torch.cat([torch.ones_like(mask[:, :1]), mask], 1))
+
+
 class ChunkNetwork(Module):  # type: ignore[misc]
     """The robot's state and the objects, both in the goal's frame; the next samples of the motion."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.state = _make_perceptron(STATE, WIDTH)
-        self.point = _make_perceptron(3 * 3 + ROLES, WIDTH)
+        self.state = make_perceptron(STATE, WIDTH)
+        self.point = make_perceptron(3 * 3 + ROLES, WIDTH)
         self.layers = nn.ModuleList([Attention() for _ in range(MOTION)])
         self.head = nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 2 * WIDTH), nn.GELU())
-        self.chunk = nn.Linear(2 * WIDTH, CHUNK * (STEP + 6))
+        self.chunk = nn.Linear(2 * WIDTH, CHUNK * (STEP + GATES))
 
     def forward(self, state: Tensor, points: Tensor, mask: Tensor) -> Tensor:
         """Compute a chunk.
@@ -133,8 +145,8 @@ class ChunkNetwork(Module):  # type: ignore[misc]
             points: Of each object, X and Y first, in the goal's frame. Shape (b, r, p, 3) [m].
             mask: Which objects are there. Shape (b, r).
 
-        Each step has six gates more, shares of what is left to the goal: so that arrival is exact, and what is
-        predicted beside them may be coarse.
+        Each step has gates more, shares of what is left to the goal and to its openings: so that arrival is exact, and
+        what is predicted beside them may be coarse.
 
         Returns:
             Position from the present one [`POSITION_UNIT_M`], rotation vector from the present orientation [rad],
@@ -147,11 +159,18 @@ class ChunkNetwork(Module):  # type: ignore[misc]
         mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
         for layer in self.layers:
             tokens = layer(tokens, mask)
-        chunk = self.chunk(self.head(tokens[:, 0])).reshape(-1, CHUNK, STEP + 6).float()
-        position = state[:, :3].float() * LINEAR_M / POSITION_UNIT_M
-        turn = vector_from_matrix(matrix_from_columns(state[:, 9:15].float()))
-        left = torch.cat([position, turn], 1)[:, None]
-        return torch.cat([chunk[..., :6] - chunk[..., STEP:] * left, chunk[..., 6:STEP]], -1)
+        chunk = self.chunk(self.head(tokens[:, 0])).reshape(-1, CHUNK, STEP + GATES).float()
+        left = describe_left(state.float())[:, None]
+        gated = chunk[..., STEP:] * left
+        change = torch.cat([gated[..., :6], gated[..., 6:7] + gated[..., 7:8] - state[:, None, 24:25].float()], -1)
+        return torch.cat([chunk[..., :7] - change, chunk[..., 7:STEP]], -1)
+
+
+def describe_left(state: Tensor) -> Tensor:
+    """Compute what is left to go from a described state: position, rotation, two openings. Shape (b, GATES)."""
+    position = state[:, :3] * LINEAR_M / POSITION_UNIT_M
+    turn = vector_from_matrix(matrix_from_columns(state[:, 9:15]))
+    return torch.cat([position, turn, state[:, 24:25] - state[:, 26:28]], 1)
 
 
 class StateNetwork(Module):  # type: ignore[misc]

@@ -49,19 +49,24 @@ def pack_demonstrations(
     Raises:
         InputError: `no_trajectories` where there are none.
     """
+    packer, motions = _Packer(robot), list_motions(dataset, splits, robot)
+    for done, (scene_id, (rows, split)) in enumerate(motions.items(), 1):
+        packer.add_scene(dataset.scene(scene_id), rows, split == "validation")
+        on_scene(done, len(motions))
+    return packer.finish()
+
+
+def list_motions(dataset: Dataset, splits: Sequence[str], robot: str) -> dict[str, tuple[list[Row], str]]:
+    """List the successful motions of an arm, and the split, of each scene of these splits that has any."""
     split_of = {row["scene_id"]: get_split(row) for row in _list_scenes(dataset)}
     found = dataset.trajectories.to_table(filter=pc.field("success") & (pc.field("robot") == robot)).to_pylist()
-    rows = sorted((row["scene_id"], row["task_id"], row) for row in found if split_of[row["scene_id"]] in splits)
-    by_scene: dict[str, list[Row]] = {}
-    for scene_id, _, row in rows:
-        by_scene.setdefault(scene_id, []).append(row)
-    packer = _Packer(robot)
-    for done, (scene_id, own) in enumerate(by_scene.items(), 1):
-        packer.add_scene(dataset.scene(scene_id), own, split_of[scene_id] == "validation")
-        on_scene(done, len(by_scene))
-    if not by_scene:
+    motions: dict[str, tuple[list[Row], str]] = {}
+    for row in sorted(found, key=lambda row: (row["scene_id"], row["task_id"])):
+        if (split := split_of[row["scene_id"]]) in splits:
+            motions.setdefault(row["scene_id"], ([], split))[0].append(row)
+    if not motions:
         raise InputError(f"{dataset.path}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
-    return packer.finish()
+    return motions
 
 
 def _list_scenes(dataset: Dataset) -> list[dict[str, Any]]:

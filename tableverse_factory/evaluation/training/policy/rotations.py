@@ -58,5 +58,5 @@ def turn_about_z(angle: Tensor) -> Tensor:
 
 
 def apply(matrix: Tensor, vectors: Tensor) -> Tensor:
-    """Rotate vectors. Shapes (…, 3, 3) and (…, 3)."""
-    return (matrix @ vectors[..., None])[..., 0]
+    """Rotate vectors. Shapes (…, 3, 3) and (…, 3); a sum of products, as GPUs multiply many small matrices slowly."""
+    return (matrix * vectors[..., None, :]).sum(-1)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from tableverse_factory.evaluation.training.policy.demonstrations import STEP_S
 from tableverse_factory.evaluation.training.policy.goals import (
     DRAWN_POINTS,
     Scenes,
@@ -33,6 +34,8 @@ torch = import_torch()
 
 TURN_RAD = 0.25  # deviation of the frames of goals
 JITTER_M = 0.0007  # of the points
+CLOCK_S = 0.06  # noise of the time since a phase began
+MEASURED_M = 0.0005  # noise of the measured opening
 LOST = 0.15  # share of other objects that are left out
 RETURN = 6  # samples within which a disturbed motion is back on its path
 BLIND = 0.2  # share of states that are told of no object, as those of a policy on pictures are
@@ -115,7 +118,9 @@ def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> Chu
     tcp_at, tcp_turn = data.tcp_at[now], data.tcp_turn[now]
     next_at, next_turn = data.tcp_at[steps], data.tcp_turn[steps]
     carried_at, measured = data.carried_at[now], data.opening[now]
+    since = STEP_S * (now - data.phase_start[told]).float()
     if augment:
+        since = (since + CLOCK_S * torch.randn_like(since)).clamp(min=0.0)
         shift, turn = _draw_disturbance(data, demos, tcp_at)
         fade = (1.0 - torch.arange(1, CHUNK + 1, device=now.device) / RETURN).clamp(min=0.0)[:, None]
         tcp_at, tcp_turn = tcp_at + shift, matrix_from_vector(turn) @ tcp_turn
@@ -123,7 +128,8 @@ def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> Chu
         next_turn = matrix_from_vector(fade * turn[:, None]) @ next_turn
         held = ((phase >= POST_GRASP) & (phase <= PLACE))[:, None]
         carried_at = carried_at + shift * held
-        measured = measured + 0.0005 * torch.randn_like(measured) * torch.tensor([0.0, 1.0], device=now.device)
+        noise = MEASURED_M * torch.randn_like(measured[:, 1])
+        measured = torch.stack([measured[:, 0], measured[:, 1] + noise], 1)
     fingers = torch.stack([opening, data.holding[demos]], 1)
     moved = torch.where(grasping, 0.0, tcp_at - data.grasp_at[demos])
     state = RobotState(
@@ -135,6 +141,7 @@ def sample_chunks(data: DemonstrationTensors, now: Tensor, augment: bool) -> Chu
         fingers,
         stage,
         moved,
+        since,
         data.base_at[demos],
         data.base_turn[demos],
     )

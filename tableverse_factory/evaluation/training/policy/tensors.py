@@ -54,6 +54,11 @@ class DemonstrationTensors:
         self.first = torch.cat([torch.zeros_like(self.last[:1]), self.last[:-1] + 1])
         counts = np.diff(own.ends, prepend=0)
         self.owner = torch.tensor(np.repeat(np.arange(len(own)), counts), device=device)
+        begins = np.r_[
+            True, (np.diff(own.phases.astype(int)) != 0) | (np.diff(np.repeat(np.arange(len(own)), counts)) != 0)
+        ]
+        starts = np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0))
+        self.phase_start = torch.tensor(starts, device=device)  # first sample of each sample's phase
         kinds, sides = describe_relations([RELATIONS[k] for k in own.relations])
         self.kind, self.side = kinds.to(device), sides.to(device)
         self._find_goals(own, device)
@@ -88,7 +93,7 @@ class DemonstrationTensors:
         rows = self.objects[demos]
         index = rows.clamp(min=0)
         drawn = torch.randperm(self.points.shape[1], device=self.points.device)[:count]
-        points = self.points[index][:, :, drawn]
+        points = self.points[:, drawn][index]
         placed = apply(self.object_turn[index][:, :, None], points) + self.object_at[index][:, :, None]
         return placed, rows >= 0
 

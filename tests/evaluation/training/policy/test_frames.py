@@ -113,7 +113,7 @@ def test_chunks_invert_and_reflect() -> None:
     state = motions.RobotState(
         torch.randn(COUNT, 3), random_turns(COUNT), torch.rand(COUNT, 2) * 0.08, torch.randn(COUNT, 3),
         random_turns(COUNT), torch.rand(COUNT, 2) * 0.08, torch.tensor([0, 1, 3, 5]), torch.randn(COUNT, 3),
-        torch.randn(COUNT, 3), random_turns(COUNT),
+        torch.rand(COUNT), torch.randn(COUNT, 3), random_turns(COUNT),
     )  # fmt: skip
     at, opening = torch.randn(COUNT, 2, 3), torch.rand(COUNT, 2) * 0.08
     turn = matrix_from_vector(torch.randn(COUNT, 2, 3)) @ state.tcp_turn[:, None]
