@@ -26,6 +26,7 @@ TrainDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Devic
 TrainMinutes = Annotated[
     float | None, typer.Option(min=0.1, help="Stop with a checkpoint after so many; the command again continues.")
 ]
+_PICTURES_FROM = "Train goals on pictures instead; motions are those of these weights, of a policy on states."
 TrainJobs = Annotated[
     int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make views; one per CPU by default.")
 ]
@@ -133,21 +134,24 @@ def train_picture(
 def train_policy(
     folder: TrainFolder,
     dataset: Annotated[
-        str | None,
-        typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories; later only where it has grown."),
+        str | None, typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories, read the first time.")
     ] = None,
     steps: TrainSteps = 16_000,
     minutes: TrainMinutes = None,
     goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 256,
     chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 1_024,
+    state: Annotated[
+        Path | None,
+        typer.Option("--pictures-from", metavar="WEIGHTS", dir_okay=False, exists=True, help=_PICTURES_FROM),
+    ] = None,
     seed: TrainSeed = 0,
     device: TrainDevice = "auto",
 ) -> None:
     """Train a policy on states from the successful motions of a dataset's splits train and validation.
 
     Writes DIR/demonstrations.npz (the motions, packed), DIR/checkpoint.safetensors and DIR/weights.safetensors, with
-    which `tableverse benchmark run` plays it. Where the demonstrations are there already, the dataset is not read. The
-    same command again continues from the checkpoint.
+    which `tableverse benchmark run` plays it; with --pictures-from also DIR/pictures.npz. What is packed already is not
+    read from the dataset again. The same command again continues from the checkpoint.
 
     Example: `tableverse train policy net --dataset out --minutes 10`
     """
@@ -155,21 +159,27 @@ def train_policy(
 
     where = _prepare_training(device, ("torch", "safetensors")).kind
     from tableverse_factory.evaluation.training.policy.settings import PolicySettings
-    from tableverse_factory.evaluation.training.policy.train import TrainRun, train_state_policy
+    from tableverse_factory.evaluation.training.policy.train import TrainRun, train_picture_policy, train_state_policy
 
-    demonstrations = _provide_demonstrations(folder, dataset)
+    def say(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    demonstrations = _provide_packed(folder / "demonstrations.npz", dataset, pictures=False)
     run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
     settings = PolicySettings(steps, seed, goals, chunks=chunks)
-    done = train_state_policy(settings, run, lambda line: print(line, file=sys.stderr, flush=True))
+    if state is None:
+        done = train_state_policy(settings, run, say)
+    else:
+        pictures = _provide_packed(folder / "pictures.npz", dataset, pictures=True)
+        done = train_picture_policy(settings, run, pictures, state, say)
     print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
     print(f"{folder / 'weights.safetensors'}: give it to `tableverse benchmark run --weights`")
 
 
-def _provide_demonstrations(folder: Path, dataset: str | None) -> Path:
-    """Pack the dataset's motions, unless an earlier command did, and return their file."""
+def _provide_packed(path: Path, dataset: str | None, pictures: bool) -> Path:
+    """Pack the dataset's motions, or their first pictures, unless an earlier command did, and return their file."""
     from tableverse_factory.core.errors import ConfigError
 
-    path = folder / "demonstrations.npz"
     if path.is_file():
         return path
     if dataset is None:
@@ -177,11 +187,12 @@ def _provide_demonstrations(folder: Path, dataset: str | None) -> Path:
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.evaluation.training.policy.pack import pack_demonstrations
+    from tableverse_factory.evaluation.training.policy.pack_pictures import pack_pictures
 
-    folder.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with count_progress("scenes") as done:
-        packed = pack_demonstrations(open_dataset(dataset), on_scene=done.update)
-    packed.write(path)
+        pack = pack_pictures if pictures else pack_demonstrations
+        pack(open_dataset(dataset), on_scene=done.update).write(path)
     return path
 
 

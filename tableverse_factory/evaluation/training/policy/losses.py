@@ -3,7 +3,7 @@
 from typing import Any
 
 from tableverse_factory.evaluation.training.policy.network import CHUNK, OPENING_UNIT_M, PHASES, POSITION_UNIT_M
-from tableverse_factory.evaluation.training.policy.samples import ChunkBatch, GoalBatch
+from tableverse_factory.evaluation.training.policy.samples import ChunkBatch
 from tableverse_factory.models.local.device import Tensor, import_torch
 
 torch = import_torch()
@@ -16,10 +16,9 @@ PHASE_WEIGHT = 0.3
 SOON, LATER = 1.6, 0.4  # weights of a chunk's first and last sample: the first are executed
 
 
-def compute_flow_loss(network: Any, batch: GoalBatch, flows: int) -> Tensor:
-    """Compute the mean squared error of the field along straight lines from noise to each goal."""
-    memory = network.encode(batch.points, batch.roles, batch.mask, batch.task)
-    goal = batch.goal[:, None].expand(-1, flows, -1)
+def compute_flow_loss(network: Any, memory: tuple[Tensor, Tensor], goal: Tensor, flows: int) -> Tensor:
+    """Compute the mean squared error of the field along straight lines from `flows` noises to each goal, (b, GOAL)."""
+    goal = goal[:, None].expand(-1, flows, -1)
     noise = torch.randn_like(goal)
     time = torch.sigmoid(1.2 * torch.randn(goal.shape[:2], device=goal.device))
     noisy = noise + time[..., None] * (goal - noise)

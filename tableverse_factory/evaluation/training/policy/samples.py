@@ -71,7 +71,8 @@ def _draw_mirror(count: int, like: Tensor, augment: bool) -> Tensor:
     return (torch.rand(count, device=like.device) < 0.5) & augment
 
 
-def _draw(choices: Tensor, count: int) -> Tensor:
+def draw_rows(choices: Tensor, count: int) -> Tensor:
+    """Draw with replacement. Shape (count,)."""
     return choices[torch.randint(len(choices), (count,), device=choices.device)]
 
 
@@ -175,11 +176,11 @@ def _carry_points(data: DemonstrationTensors, demos: Tensor, points: Tensor, at:
 
 def draw_goals(data: DemonstrationTensors, count: int, held_out: bool, augment: bool) -> GoalBatch:
     """Draw goals of random demonstrations."""
-    demos = _draw(data.choices[held_out][0], count)
+    demos = draw_rows(data.choices[held_out][0], count)
     release = torch.rand(count, device=demos.device) < 0.5
     return sample_goals(data, demos, release, augment)
 
 
 def draw_chunks(data: DemonstrationTensors, count: int, held_out: bool, augment: bool) -> ChunkBatch:
     """Draw chunks after random samples."""
-    return sample_chunks(data, _draw(data.choices[held_out][1], count), augment)
+    return sample_chunks(data, draw_rows(data.choices[held_out][1], count), augment)

@@ -10,14 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelError
-from tableverse_factory.evaluation.training.checkpoint import load_checkpoint, save_checkpoint, write_weights
+from tableverse_factory.evaluation.training.checkpoint import (
+    load_checkpoint,
+    read_weights,
+    save_checkpoint,
+    write_weights,
+)
 from tableverse_factory.evaluation.training.policy.demonstrations import Demonstrations
-from tableverse_factory.evaluation.training.policy.losses import compute_chunk_losses, compute_flow_loss
+from tableverse_factory.evaluation.training.policy.first_pictures import FirstPictures
+from tableverse_factory.evaluation.training.policy.lessons import Lesson, PictureLesson, StateLesson
 from tableverse_factory.evaluation.training.policy.network import make_network
-from tableverse_factory.evaluation.training.policy.samples import draw_chunks, draw_goals
 from tableverse_factory.evaluation.training.policy.settings import PolicyPosition, PolicySettings
 from tableverse_factory.evaluation.training.policy.tensors import DemonstrationTensors
-from tableverse_factory.evaluation.training.policy.validate import validate_network
+from tableverse_factory.evaluation.training.policy.validate import SEED
 from tableverse_factory.models.local.device import Tensor, import_torch
 
 torch = import_torch()
@@ -55,34 +60,71 @@ class TrainRun:
 
 
 def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int:
-    """Train until all steps are done or the minutes are over; return the last step.
+    """Train on states until all steps are done or the minutes are over; return the last step.
 
     A checkpoint in the folder is continued.
     """
+    data = DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device)
+    return _train(data, StateLesson(data), settings, run, log, _hash_files(run.demonstrations))
+
+
+def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path, state: Path, log: Log) -> int:
+    """Train goals on the pictures of the same demonstrations, likewise; `state` are the weights of a policy on states.
+
+    Its motions are taken over: they find their way without objects, as they were trained to.
+    """
+    data, packed = (
+        DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device),
+        FirstPictures.read(pictures),
+    )
+    if len(packed.ends) != len(data.last):
+        raise InputError(f"{pictures} has pictures of {len(packed.ends)} demonstrations, not of {len(data.last)}")
+    teacher = make_network(0)
+    read_weights(state, teacher)
+    shown = torch.tensor(packed.decode(), device=run.device).permute(0, 1, 4, 2, 3).contiguous()
+    words = torch.tensor(packed.words.astype("int64"), device=run.device)
+    lesson = PictureLesson(data, shown, words, teacher.motion.state_dict())
+    return _train(data, lesson, settings, run, log, _hash_files(run.demonstrations, pictures, state))
+
+
+def _train(
+    data: DemonstrationTensors, lesson: Lesson, settings: PolicySettings, run: TrainRun, log: Log, digest: str
+) -> int:
     try:
-        return _Trainer(settings, run, log).train()
+        return _Trainer(data, lesson, settings, run, log, digest).train()
     except torch.OutOfMemoryError as error:
         raise InputError("the GPU's memory ran out: fewer goals or chunks per step need less") from error
 
 
-class _Trainer:
-    """Networks, optimizer and demonstrations of a training."""
+def _hash_files(*paths: Path) -> str:
+    return hashlib.sha256(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in paths)).hexdigest()
 
-    def __init__(self, settings: PolicySettings, run: TrainRun, log: Log) -> None:
+
+class _Trainer:
+    """Networks and optimizer of a training."""
+
+    def __init__(
+        self,
+        data: DemonstrationTensors,
+        lesson: Lesson,
+        settings: PolicySettings,
+        run: TrainRun,
+        log: Log,
+        digest: str,
+    ) -> None:
         self._started, self._settings, self._run, self._log = time.monotonic(), settings, run, log
+        self._data, self._lesson, self._digest = data, lesson, digest
         run.folder.mkdir(parents=True, exist_ok=True)
-        self._network = make_network(settings.seed).to(run.device).train()
+        self._network = lesson.make_network(settings.seed).to(run.device).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
         position = load_checkpoint(
             run.folder, self._network, self._average, self._optimizer, settings, PolicyPosition(), run.device
         )
-        self._hash = hashlib.sha256(run.demonstrations.read_bytes()).hexdigest()
-        if position.step and position.demonstrations != self._hash:
+        if position.step and position.demonstrations != digest:
             raise InputError(f"{run.demonstrations} holds other demonstrations than the checkpoint was trained on")
-        self._data = DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device)
         self._step = position.step
-        counts = [len(self._data.choices[held_out][0]) for held_out in (False, True)]
+        counts = [len(data.choices[held_out][0]) for held_out in (False, True)]
         if not counts[0]:
             raise InputError(f"{run.demonstrations} holds no demonstrations to train on")
         self._say(f"{counts[0]} demonstrations, {counts[1]} held out, {settings.steps - self._step} steps are left")
@@ -108,16 +150,11 @@ class _Trainer:
         return self._step
 
     def _take_step(self, step: int) -> dict[str, Tensor]:
-        settings, device = self._settings, self._run.device
+        settings = self._settings
         torch.manual_seed(settings.seed * 100_000_007 + step)
         for group in self._optimizer.param_groups:
             group["lr"] = compute_rate(step, settings)
-        with torch.no_grad():
-            goals = draw_goals(self._data, settings.goals, held_out=False, augment=True)
-            chunks = draw_chunks(self._data, settings.chunks, held_out=False, augment=True)
-        with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
-            losses = {"flow": compute_flow_loss(self._network.goal, goals, settings.flows)}
-            losses |= compute_chunk_losses(self._network.motion, chunks)
+        losses = self._lesson.compute_losses(self._network, settings)
         self._optimizer.zero_grad(set_to_none=True)
         torch.stack([*losses.values()]).sum().backward()
         for part in (self._network.goal, self._network.motion):
@@ -135,12 +172,13 @@ class _Trainer:
         """Save, and measure the held-out demonstrations; weights that are not finite are refused."""
         if not all(torch.isfinite(each).all() for each in self._average.parameters()):
             raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
-        position = PolicyPosition(self._step, self._hash)
+        position = PolicyPosition(self._step, self._digest)
         save_checkpoint(self._run.folder, self._network, self._average, self._optimizer, self._settings, position)
         write_weights(self._average, self._run.folder)
         for held_out in (False, True):
             if len(self._data.choices[held_out][0]):
-                figures = validate_network(self._average, self._data, held_out)
+                torch.manual_seed(SEED)
+                figures = self._lesson.measure(self._average, held_out)
                 kind = "held out" if held_out else "trained on"
                 self._say(f"step {self._step} {kind}: {' '.join(f'{name} {v:.4g}' for name, v in figures.items())}")
 
