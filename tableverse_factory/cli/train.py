@@ -185,14 +185,17 @@ def _provide_packed(path: Path, dataset: str | None, pictures: bool) -> Path:
     if dataset is None:
         raise ConfigError(f"{path} is not there: give --dataset, whose motions are packed into it")
     from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.evaluation.training.policy.pack import pack_demonstrations
     from tableverse_factory.evaluation.training.policy.pack_pictures import pack_pictures
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with count_progress("scenes") as done:
-        pack = pack_pictures if pictures else pack_demonstrations
-        pack(open_dataset(dataset), on_scene=done.update).write(path)
+        if pictures:
+            pack_pictures(open_dataset(dataset), on_scene=done.update, jobs=count_available_cpus()).write(path)
+        else:
+            pack_demonstrations(open_dataset(dataset), on_scene=done.update).write(path)
     return path
 
 

@@ -36,7 +36,7 @@ def measure_goals(
     between = decode_rotation(chosen) @ decode_rotation(goal).mT
     trace = between.diagonal(dim1=1, dim2=2).sum(1)
     degrees = ((trace - 1) / 2).clamp(-1.0, 1.0).acos().rad2deg()
-    figures = {}
+    figures: dict[str, float] = {}
     for name, mask, unit in zip(("grasp", "release"), (~release, release), units_m, strict=True):
         away = (chosen - goal)[:, :3].norm(dim=1) * unit * 1000
         nearest = (drawn - goal[:, None])[..., :3].norm(dim=2).amin(1) * unit * 1000
