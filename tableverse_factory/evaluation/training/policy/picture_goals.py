@@ -19,7 +19,7 @@ Module: Any = nn.Module
 STRIDE = 8  # pixels of a picture per token, along each side
 ROWS, COLUMNS = 12, 16
 CHANNELS = (32, 64, 128)
-REACH_M = (0.55, 0.0, 0.1)  # middle of the goals in the base's frame
+REACH_M = 0.55  # middle of the goals along the base's x
 UNIT_M = 0.15
 GRASP = 9  # numbers of the grasp that belongs to a release
 
@@ -53,10 +53,10 @@ class PictureGoalNetwork(GoalFlow):
         for camera, stem in enumerate(self.cameras):
             seen = stem(4 * pictures[:, camera] - 2).flatten(2).transpose(1, 2)
             tokens.append(seen + self.place[camera])
-        mask = torch.ones(len(words), 1 + WORDS + self.place.shape[0] * self.place.shape[1], dtype=torch.bool)
-        mask = mask.to(words.device)
+        joined = torch.cat(tokens, 1)
+        mask = torch.ones(joined.shape[:2], dtype=torch.bool, device=words.device)
         mask[:, 1 : 1 + WORDS] = words > 0
-        return self.attend(torch.cat(tokens, 1), mask)
+        return self.attend(joined, mask)
 
 
 def _make_stem(width: int) -> Any:
@@ -87,13 +87,13 @@ def make_picture_network(seed: int) -> Any:
 
 def encode_pose(base: tuple[Tensor, Tensor], pose: tuple[Tensor, Tensor], opening: Tensor, holding: Tensor) -> Tensor:
     """Encode poses of the gripper, (b, 3) and (b, 3, 3), with their openings, as goals. Shape (b, GOAL)."""
-    middle = torch.tensor(REACH_M, device=pose[0].device)
-    position = (apply(base[1].mT, pose[0] - base[0]) - middle) / UNIT_M
+    x, y, z = apply(base[1].mT, pose[0] - base[0]).unbind(-1)
+    position = torch.stack([x - REACH_M, y, z], -1) / UNIT_M
     return join_goal(position, base[1].mT @ pose[1], opening, holding)
 
 
 def decode_pose(base: tuple[Tensor, Tensor], goals: Tensor) -> tuple[Tensor, Tensor]:
     """Decode goals, (b, m, GOAL), to poses of the gripper in the table frame: (b, m, 3) and (b, m, 3, 3)."""
-    middle = torch.tensor(REACH_M, device=goals.device)
-    at = apply(base[1][:, None], goals[..., :3] * UNIT_M + middle) + base[0][:, None]
+    x, y, z = (goals[..., :3] * UNIT_M).unbind(-1)
+    at = apply(base[1][:, None], torch.stack([x + REACH_M, y, z], -1)) + base[0][:, None]
     return at, base[1][:, None] @ decode_rotation(goals)

@@ -85,14 +85,15 @@ class DemonstrationTensors:
         self.openings = torch.stack([commanded[ends[:, PRE_GRASP]], commanded[ends[:, POST_PLACE]]], 1)
 
     def place_points(self, demos: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Place `count` random points of each object where it stands.
+        """Place `count` points of each object, whose order is random, where it stands.
 
         Returns:
             Points of shape (b, r, count, 3) in the table frame, and which objects are there, of shape (b, r).
         """
         rows = self.objects[demos]
         index = rows.clamp(min=0)
-        drawn = torch.randperm(self.points.shape[1], device=self.points.device)[:count]
+        kept, device = self.points.shape[1], self.points.device
+        drawn = (torch.randint(kept, (1,), device=device) + torch.arange(count, device=device)) % kept
         points = self.points[:, drawn][index]
         placed = apply(self.object_turn[index][:, :, None], points) + self.object_at[index][:, :, None]
         return placed, rows >= 0

@@ -49,6 +49,8 @@ class TrainRun:
         minutes: After which to stop with a checkpoint.
         save_minutes: Between checkpoints.
         log_steps: Between lines of the log.
+        graph: Record the kernels of a step once, on a GPU, and replay them: launching them one by one takes longer than
+            computing. Each start then takes three steps more, unlogged.
     """
 
     folder: Path
@@ -57,6 +59,7 @@ class TrainRun:
     minutes: float = math.inf
     save_minutes: float = 3.0
     log_steps: int = LOG_STEPS
+    graph: bool = True
 
 
 def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int:
@@ -124,6 +127,7 @@ class _Trainer:
         if position.step and position.demonstrations != digest:
             raise InputError(f"{run.demonstrations} holds other demonstrations than the checkpoint was trained on")
         self._step = position.step
+        self._replay: tuple[Any, dict[str, Tensor]] | None = None
         counts = [len(data.choices[held_out][0]) for held_out in (False, True)]
         if not counts[0]:
             raise InputError(f"{run.demonstrations} holds no demonstrations to train on")
@@ -150,18 +154,42 @@ class _Trainer:
         return self._step
 
     def _take_step(self, step: int) -> dict[str, Tensor]:
-        settings = self._settings
-        torch.manual_seed(settings.seed * 100_000_007 + step)
+        torch.manual_seed(self._settings.seed * 100_000_007 + step)
         for group in self._optimizer.param_groups:
-            group["lr"] = compute_rate(step, settings)
-        losses = self._lesson.compute_losses(self._network, settings)
+            group["lr"].fill_(compute_rate(step, self._settings))
+        if self._run.device != "cuda" or not self._run.graph:
+            losses = self._descend()
+        else:
+            if self._replay is None:
+                self._replay = self._record()
+            self._replay[0].replay()
+            losses = self._replay[1]
+        self._average_weights(step)
+        return losses
+
+    def _descend(self) -> dict[str, Tensor]:
+        """Compute losses and take a step down their gradient."""
+        losses = self._lesson.compute_losses(self._network, self._settings)
         self._optimizer.zero_grad(set_to_none=True)
         torch.stack([*losses.values()]).sum().backward()
         for part in (self._network.goal, self._network.motion):
             torch.nn.utils.clip_grad_norm_(part.parameters(), MAX_NORM)
         self._optimizer.step()
-        self._average_weights(step)
-        return losses
+        return {name: each.detach() for name, each in losses.items()}
+
+    def _record(self) -> tuple[Any, dict[str, Tensor]]:
+        """Record the kernels of a step; return them, and where they leave the losses."""
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            for _ in range(3):
+                self._descend()
+        torch.cuda.current_stream().wait_stream(aside)
+        graph = torch.cuda.CUDAGraph()
+        self._optimizer.zero_grad(set_to_none=True)
+        with torch.cuda.graph(graph):
+            losses = self._descend()
+        return graph, losses
 
     def _average_weights(self, step: int) -> None:
         keep = min(AVERAGE, (step + 1) / (step + 20))
@@ -183,7 +211,7 @@ class _Trainer:
                 self._say(f"step {self._step} {kind}: {' '.join(f'{name} {v:.4g}' for name, v in figures.items())}")
 
     def _log_step(self, losses: dict[str, Tensor], done: int) -> None:
-        parts = {name: float(each.detach()) for name, each in losses.items()}
+        parts = {name: float(each) for name, each in losses.items()}
         if not all(math.isfinite(each) for each in parts.values()):
             raise ModelError(f"the loss of step {self._step} is not finite: {parts}; the last checkpoint is kept")
         rate = done / max(time.monotonic() - self._started, 1e-6)
@@ -204,4 +232,5 @@ def _make_optimizer(network: Any, settings: PolicySettings, device: str) -> Any:
         {"params": [p for p in network.parameters() if p.ndim > 1], "weight_decay": WEIGHT_DECAY},
         {"params": [p for p in network.parameters() if p.ndim <= 1], "weight_decay": 0.0},
     ]
-    return torch.optim.AdamW(groups, lr=settings.rate, betas=BETAS, fused=device == "cuda")
+    rate, on_gpu = torch.tensor(settings.rate, device=device), device == "cuda"
+    return torch.optim.AdamW(groups, lr=rate, betas=BETAS, fused=on_gpu, capturable=on_gpu)
