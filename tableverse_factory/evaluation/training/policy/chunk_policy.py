@@ -112,13 +112,17 @@ class ChunkPolicy(ABC):
         drawn = self._network.goal.draw(memory, torch.randn(1, DRAWN, GOAL, generator=self._random))
         return drawn if self._attempts else drawn[:, select_goals(drawn)[0]]
 
-    def find_reachable(self, at: Tensor, turn: Tensor) -> int:
-        """Find the first pose of the table frame that the arm reaches; the first of all if it reaches none."""
-        for k in range(TRIED):
+    def find_reachable(self, at: Tensor, turn: Tensor, wanted: np.ndarray | None = None) -> int:
+        """Find the first pose of the table frame that the arm reaches, the `wanted` ones first; else return the first.
+
+        Shapes (m, 3), (m, 3, 3) and (m,).
+        """
+        order = np.arange(len(at)) if wanted is None else np.argsort(~wanted, kind="stable")
+        for k in order[:TRIED].tolist():
             pose = self._to_base(at[k].double().numpy(), turn[k].double().numpy())
             if len(solve_ik(self._chain, pose, self._command[:-1], 1)):
-                return k
-        return 0
+                return int(k)
+        return int(order[0])
 
     def _begin_attempt(self, observation: Observation) -> None:
         self._phase, self._since_s, self._returning, self._released_s = PRE_GRASP, 0.0, False, 0.0

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from schemas.trajectories import Grasps
 from tableverse_factory.evaluation.training.checkpoint import read_weights
 from tableverse_factory.evaluation.training.policy.chunk_policy import ChunkPolicy, Observation, to_tensor
 from tableverse_factory.evaluation.training.policy.demonstrations import ROWS
@@ -24,6 +25,9 @@ from tableverse_factory.evaluation.training.policy.network import make_network
 from tableverse_factory.evaluation.training.policy.rotations import apply, matrix_from_quaternion
 from tableverse_factory.evaluation.training.policy.tensors import describe_relations
 from tableverse_factory.models.local.device import Tensor, import_torch
+from tableverse_factory.robotics.grasps.clearance import find_clear_grasps
+from tableverse_factory.robotics.robots.gripper_clearance import FINGER_CLEARANCE_M
+from tableverse_factory.robotics.robots.registry import load_arm
 
 torch = import_torch()
 
@@ -80,9 +84,18 @@ class StatePolicy(ChunkPolicy):
         none = scenes.middle[:, 0], torch.eye(3)[None]
         frame, drawn = self._draw(scenes, False, none)
         at, turn = decode_grasp(scenes, frame, drawn)
-        best = self.find_reachable(at[0], turn[0])
+        best = self.find_reachable(at[0], turn[0], self._find_clear(at[0], turn[0], decode_openings(drawn[0])[:, 0]))
         self._grasp_at, self._grasp_turn = at[:, best], turn[:, best]
         self._grasp_fingers = decode_openings(drawn[:, best])
+
+    def _find_clear(self, at: Tensor, turn: Tensor, opening: Tensor) -> np.ndarray:
+        """Test which grasps keep the open gripper, on its straight way too, clear of the table and of all points."""
+        turns = matrix_from_quaternion(to_tensor(self._stood[:, 3:]))[:, None]
+        points = apply(turns, to_tensor(self._start.points)) + to_tensor(self._stood[:, None, :3])
+        arm = load_arm(self._start.robot)
+        widths = opening.double().numpy() - 2 * FINGER_CLEARANCE_M
+        grasps = Grasps(turn.double().numpy(), at.double().numpy(), widths, np.ones(len(at)))
+        return find_clear_grasps(grasps, arm.shape, arm.max_opening_m, points.reshape(-1, 3).double().numpy(), ())
 
     def _draw_release(self, scenes: Scenes) -> None:
         """Draw the motion of X, as a rotation about the middle of its points and where that comes to be."""

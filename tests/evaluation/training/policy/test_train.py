@@ -19,7 +19,7 @@ torch = pytest.importorskip("torch", reason="the extra `models` is not installed
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from tableverse_factory.evaluation.training.checkpoint import CHECKPOINT, WEIGHTS  # noqa: E402
-from tableverse_factory.evaluation.training.policy import validate  # noqa: E402
+from tableverse_factory.evaluation.training.policy import network, validate  # noqa: E402
 from tableverse_factory.evaluation.training.policy.settings import PolicySettings  # noqa: E402
 from tableverse_factory.evaluation.training.policy.state_policy import StatePolicy  # noqa: E402
 from tableverse_factory.evaluation.training.policy.train import TrainRun, train_state_policy  # noqa: E402
@@ -100,6 +100,24 @@ def test_it_learns(packed: Path, tmp_path: Path) -> None:
     losses = [sum(float(word) for word in words[1::2]) for words in parts]
     assert len(losses) == 60
     assert np.mean(losses[-6:]) < 0.6 * np.mean(losses[:6])
+
+
+@pytest.mark.slow
+def test_overfitted_to_one_demonstration_it_draws_its_goals_and_makes_its_motion(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"WIDTH": 64, "MOTION": 2}.items():
+        monkeypatch.setattr(network, name, value)
+    monkeypatch.setattr(validate, "GOALS", 32)
+    monkeypatch.setattr(validate, "CHUNKS", 128)
+    settings = replace(SETTINGS, steps=700, goals=8, flows=8, chunks=64, rate=2e-3)
+    last = train(tmp_path, packed, settings)[-1].partition("trained on: ")[2].split()
+    found = dict(zip(last[::2], map(float, last[1::2]), strict=True))
+    assert found["grasp_mm"] < 8.0, found
+    assert found["release_mm"] < 12.0, found
+    assert max(found["grasp_deg"], found["release_deg"]) < 8.0, found
+    assert found["position"] < 0.25, "some millimetres near the goals, some centimetres far away"
+    assert found["phase"] < 0.1, found
 
 
 def test_the_command_packs_trains_and_continues(
