@@ -41,6 +41,7 @@ IK_STEPS = 4
 RISE_M = 0.05  # of the gripper after the grasp, from which it is known whether X came along
 WAIT_S = 2.0  # after the release, before another attempt
 RETURN_SPEED = 0.8  # of joints on the way home [rad/s]
+STILL_M, STILL_OPENING_M, STILL_CHUNKS = 0.004, 0.001, 3  # motion of a chunk, and chunks, of a standstill
 HOMING = 0.02  # share of the way home that joints go per step where the gripper's pose leaves them free
 
 Observation = Mapping[str, np.ndarray]
@@ -125,7 +126,8 @@ class ChunkPolicy(ABC):
         return int(order[0])
 
     def _begin_attempt(self, observation: Observation) -> None:
-        self._phase, self._since_s, self._returning, self._released_s = PRE_GRASP, 0.0, False, 0.0
+        self._phase, self._since_s, self._still = PRE_GRASP, 0.0, 0
+        self._returning, self._released_s = False, 0.0
         self.plan(observation)
         self._goal = (self._grasp_at, self._grasp_turn)
         self._attempts += 1
@@ -158,6 +160,7 @@ class ChunkPolicy(ABC):
         chunk = self._network.motion(describe_state(state, mirror), points, present)
         at, turn, opening = decode_chunk(state, chunk)
         self._advance_phase(chunk[0, :EXECUTED, 7:].argmax(1).tolist())
+        self._end_standstill(float((at[0, EXECUTED - 1] - state.tcp_at[0]).norm()), float(opening[0, EXECUTED - 1]))
         self._append_commands(
             torch.cat([state.tcp_at[:, None], at], 1)[0], torch.cat([state.tcp_turn[:, None], turn], 1)[0], opening[0]
         )
@@ -168,6 +171,13 @@ class ChunkPolicy(ABC):
             self._since_s += STEP_S
             if phase > self._phase:
                 self._phase, self._since_s = phase, 0.0
+
+    def _end_standstill(self, way_m: float, opening_m: float) -> None:
+        """Advance the phase where the gripper stands still for longer than any demonstration does."""
+        still = way_m < STILL_M and abs(opening_m - self._command[-1]) < STILL_OPENING_M
+        self._still = self._still + 1 if still else 0
+        if self._still >= STILL_CHUNKS and self._phase < POST_PLACE:
+            self._phase, self._since_s, self._still = self._phase + 1, 0.0, 0
 
     def _command_tcp(self) -> tuple[Tensor, Tensor]:
         """Compute the gripper's commanded pose in the table frame."""
