@@ -34,7 +34,7 @@ from tableverse_factory.robotics.motion.kinematics import solve_ik
 
 torch = import_torch()
 
-DRAWN = 64  # goals of which the densest that the arm reaches is taken
+DRAWN = 128  # goals of which the densest that the arm reaches is taken
 TRIED = 24
 EXECUTED = 4  # samples of a chunk
 IK_STEPS = 4
