@@ -46,7 +46,7 @@ def run_benchmark(
 ) -> tuple[ResultsHeader, tuple[EpisodeResult, ...]]:
     """Play the episodes that `out` lacks, and write it; return what it then holds, in the order of the benchmark.
 
-    Rows are first appended to `out` + `.partial`, so that a run which was killed goes on with the same command. The
+    Rows are first appended to `out` + `.journal`, so that a run which was killed goes on with the same command. The
     outcome of an episode depends on nothing else, but for `policy_timeout`, which depends on the machine.
 
     Raises:
@@ -67,7 +67,7 @@ def run_benchmark(
         pictures=seen.pictures,
         picture_size=seen.picture_size,
     )
-    with _open_partial(out, header) as (file, known):
+    with _open_journal(out, header) as (file, known):
         left = [episode for episode in chosen if episode.episode_id not in known]
         progress(len(known), len(known) + len(left))
         total = len(known) + len(left)
@@ -97,9 +97,9 @@ def check_scenes(benchmark: Benchmark, dataset: Dataset, episodes: Sequence[Epis
 
 
 @contextmanager
-def _open_partial(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
+def _open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
     """Open the file that rows are appended to, locked, with the rows that it and `out` hold."""
-    path = out.with_name(f"{out.name}.partial")
+    path = out.with_name(f"{out.name}.journal")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+b") as file:
         try:
