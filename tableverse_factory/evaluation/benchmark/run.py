@@ -11,7 +11,7 @@ from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.evaluation.benchmark.benchmark import AXES, SPLITS, Axis, Benchmark, Episode, Split
-from tableverse_factory.evaluation.benchmark.episode_processes import PlayPlan, describe_policy, play_episodes
+from tableverse_factory.evaluation.benchmark.episode_processes import EpisodeProcesses, PlayPlan, PolicyDescription
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
 from tableverse_factory.evaluation.benchmark.play import check_scene
 from tableverse_factory.evaluation.benchmark.results import (
@@ -58,8 +58,25 @@ def run_benchmark(
         raise InputError("the benchmark has no episodes of these splits and axes: give others", "no_episodes")
     check_scenes(benchmark, dataset, chosen)
     plan = PlayPlan(benchmark, dataset.path, policy)
-    seen = describe_policy(plan)
-    header = ResultsHeader(
+    with EpisodeProcesses(plan, settings.episode_s) as processes:
+        header = _make_header(benchmark, policy, processes.describe_policy())
+        with _open_journal(out, header) as (file, known):
+            left = [episode for episode in chosen if episode.episode_id not in known]
+            total = len(known) + len(left)
+            progress(len(known), total)
+            for result in processes.play(left, settings.jobs):
+                file.write(encode_line(result))
+                file.flush()
+                known[result.episode_id] = result
+                progress(len(known), total)
+            rows = tuple(known[e.episode_id] for e in benchmark.episodes if e.episode_id in known)
+            write_atomic(out, encode_results(header, rows))
+            Path(file.name).unlink()
+    return header, rows
+
+
+def _make_header(benchmark: Benchmark, policy: PolicyName, seen: PolicyDescription) -> ResultsHeader:
+    return ResultsHeader(
         benchmark=benchmark.digest,
         policy=policy.shown,
         policy_digest=policy.digest,
@@ -67,19 +84,6 @@ def run_benchmark(
         pictures=seen.pictures,
         picture_size=seen.picture_size,
     )
-    with _open_journal(out, header) as (file, known):
-        left = [episode for episode in chosen if episode.episode_id not in known]
-        progress(len(known), len(known) + len(left))
-        total = len(known) + len(left)
-        for result in play_episodes(plan, left, settings.jobs, settings.episode_s) if left else ():
-            file.write(encode_line(result))
-            file.flush()
-            known[result.episode_id] = result
-            progress(len(known), total)
-        rows = tuple(known[e.episode_id] for e in benchmark.episodes if e.episode_id in known)
-        write_atomic(out, encode_results(header, rows))
-        Path(file.name).unlink()
-    return header, rows
 
 
 def check_scenes(benchmark: Benchmark, dataset: Dataset, episodes: Sequence[Episode]) -> None:
