@@ -13,15 +13,13 @@ from schemas.identity import content_hash
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.http_policy import HttpPolicy
-from tableverse_factory.evaluation.benchmark.planner import PlannerPolicy
 from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
-from tableverse_factory.evaluation.benchmark.random_policy import RandomPolicy
-from tableverse_factory.evaluation.benchmark.replay import ReplayPolicy
 
-BASELINES: Mapping[str, Callable[..., Policy]] = {
-    "planner": PlannerPolicy,
-    "replay": ReplayPolicy,
-    "random": RandomPolicy,
+_ROOM = "tableverse_factory.evaluation.benchmark"
+BASELINES: Mapping[str, str] = {  # imported when they are asked for, as the planner takes a second
+    "planner": f"{_ROOM}.planner:PlannerPolicy",
+    "replay": f"{_ROOM}.replay:ReplayPolicy",
+    "random": f"{_ROOM}.random_policy:RandomPolicy",
 }
 
 
@@ -62,7 +60,7 @@ def load_policy(name: PolicyName) -> Policy:
         if name.weights is not None:
             raise ConfigError("--weights: a process behind an address loads its own weights; leave them out")
         return HttpPolicy(name.name)
-    make = BASELINES[name.name] if name.name in BASELINES else _find_class(name.name)
+    make = _find_class(BASELINES.get(name.name, name.name))
     try:
         policy = make() if name.weights is None else make(name.weights)
     except (ConfigError, InputError):
