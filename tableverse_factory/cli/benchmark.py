@@ -70,6 +70,9 @@ def run(
     weights: Annotated[
         str | None, typer.Option(metavar="PATH", help="Given to the policy's class; of replay: the OUT to replay.")
     ] = None,
+    title: Annotated[
+        str | None, typer.Option("--name", metavar="NAME", help="The policy's name in tables; by default as given.")
+    ] = None,
     split: Annotated[list[str] | None, typer.Option(help="Only episodes of this split; may repeat.")] = None,
     axis: Annotated[list[str] | None, typer.Option(help="Only episodes of this axis; may repeat.")] = None,
     episode_s: Annotated[
@@ -95,7 +98,7 @@ def run(
     )
     with count_progress("episodes") as done:
         _, rows = run_benchmark(
-            read_benchmark(path), open_dataset(dataset), PolicyName(policy, weights), out, settings, done.update
+            read_benchmark(path), open_dataset(dataset), PolicyName(policy, weights, title), out, settings, done.update
         )
     print(f"{sum(row.success for row in rows)} of {pluralize(len(rows), 'episode')} succeed; {out}")
 

@@ -25,13 +25,14 @@ BASELINES: Mapping[str, str] = {  # imported when they are asked for, as the pla
 
 @dataclass(frozen=True, slots=True)
 class PolicyName:
-    """Name of a policy as on the command line, and the weights that its class is called with, if any.
+    """Name of a policy as on the command line, the weights that its class is called with, and its title in tables.
 
-    A baseline (`BASELINES`), `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
+    A name is a baseline (`BASELINES`), `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
     """
 
     name: str
     weights: str | None = None
+    title: str | None = None
 
     @property
     def digest(self) -> str:
@@ -41,7 +42,9 @@ class PolicyName:
 
     @property
     def shown(self) -> str:
-        """Name without folders, for results."""
+        """Title, else the name without folders."""
+        if self.title is not None:
+            return sanitize_line(self.title, 300)
         return sanitize_line(self.name.rpartition("/")[2] if not self.name.startswith("http") else self.name, 300)
 
 

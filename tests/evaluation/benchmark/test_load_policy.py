@@ -87,6 +87,7 @@ def test_other_code_or_weights_are_another_policy(file, tmp_path):
     digests.append(PolicyName(f"{file}:Good", str(weights)).digest)
     assert len(set(digests)) == 3
     assert PolicyName(f"{file}:Good").shown == "classes.py:Good"
+    assert PolicyName(f"{file}:Good", title="good\x1b[2J").shown == "good\\x1b[2J"
 
 
 def test_actions_are_checked_and_clipped():
