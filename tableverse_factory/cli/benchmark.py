@@ -39,9 +39,12 @@ def make(
 
     Example: `tableverse benchmark make out --dest benchmark.json`
     """
+    from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.core.storage.files import write_atomic
     from tableverse_factory.dataset.dataset import open_dataset
+
+    import_extra("gymnasium", "the benchmark", "gym")
     from tableverse_factory.evaluation.benchmark.make import BenchmarkSettings, make_benchmark
 
     settings = BenchmarkSettings(episodes, perturbed, seed, robot)
@@ -87,8 +90,11 @@ def run(
     Example: `tableverse benchmark run benchmark.json --dataset out --policy planner --out planner.jsonl`
     """
     from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
+
+    import_extra("gymnasium", "the benchmark", "gym")
     from tableverse_factory.evaluation.benchmark.benchmark import AXES, SPLITS, read_benchmark
     from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
     from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
