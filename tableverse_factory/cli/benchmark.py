@@ -39,9 +39,12 @@ def make(
 
     Example: `tableverse benchmark make out --dest benchmark.json`
     """
+    from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.core.storage.files import write_atomic
     from tableverse_factory.dataset.dataset import open_dataset
+
+    import_extra("gymnasium", "the benchmark", "gym")
     from tableverse_factory.evaluation.benchmark.make import BenchmarkSettings, make_benchmark
 
     settings = BenchmarkSettings(episodes, perturbed, seed, robot)
@@ -70,6 +73,9 @@ def run(
     weights: Annotated[
         str | None, typer.Option(metavar="PATH", help="Given to the policy's class; of replay: the OUT to replay.")
     ] = None,
+    title: Annotated[
+        str | None, typer.Option("--name", metavar="NAME", help="The policy's name in tables; by default as given.")
+    ] = None,
     split: Annotated[list[str] | None, typer.Option(help="Only episodes of this split; may repeat.")] = None,
     axis: Annotated[list[str] | None, typer.Option(help="Only episodes of this axis; may repeat.")] = None,
     episode_s: Annotated[
@@ -84,8 +90,11 @@ def run(
     Example: `tableverse benchmark run benchmark.json --dataset out --policy planner --out planner.jsonl`
     """
     from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
+
+    import_extra("gymnasium", "the benchmark", "gym")
     from tableverse_factory.evaluation.benchmark.benchmark import AXES, SPLITS, read_benchmark
     from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
     from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
@@ -95,7 +104,7 @@ def run(
     )
     with count_progress("episodes") as done:
         _, rows = run_benchmark(
-            read_benchmark(path), open_dataset(dataset), PolicyName(policy, weights), out, settings, done.update
+            read_benchmark(path), open_dataset(dataset), PolicyName(policy, weights, title), out, settings, done.update
         )
     print(f"{sum(row.success for row in rows)} of {pluralize(len(rows), 'episode')} succeed; {out}")
 

@@ -1,15 +1,13 @@
 """Scenes with objects of other scenes added to them, or their own objects moved, in memory."""
 
 import copy
-import posixpath
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from schemas.identity import make_file_stem
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
@@ -88,19 +86,21 @@ def _add_object(root: ET.Element, donor: Scene, thing: AddedObject, name: str) -
     body.set("pos", _format(thing.pose[:3]))
     body.set("quat", _format(thing.pose[3:]))
     body.set("name", name)
-    for index, element in enumerate(body.iter("geom")):
-        element.set("name", f"{name}_geom_{index:03d}")
-    for element in body.iter("joint"):
-        element.set("name", name)
-    taken = _take_assets(source, body, name)
+    rename = partial(_rename, old=thing.object_id, new=name)
+    for element in (*body.iter("geom"), *body.iter("joint")):
+        element.set("name", rename(element.get("name", "")))
+    taken = _take_assets(source, body, rename)
     find_or_add_child(root, "asset").extend(element for element, _ in taken)
     find_or_add_child(root, "worldbody").append(body)
-    files = {f"{ASSETS}/{element.get('file')}": _read(donor, old) for element, old in taken if old}
-    # the whole mesh has the name under which goals, grasps and points look for it
-    return {**files, f"{ASSETS}/{name}.obj": _read(donor, f"{make_file_stem(thing.object_id)}.obj")}
+    return {f"{ASSETS}/{element.get('file')}": _read(donor, old) for element, old in taken if old}
 
 
-def _take_assets(source: ET.Element, body: ET.Element, name: str) -> list[tuple[ET.Element, str]]:
+def _rename(text: str, old: str, new: str) -> str:
+    """Rename what is named after an object, as its geoms, meshes and their files are, so that it is found as before."""
+    return new + text.removeprefix(old) if text.startswith(old) else f"{new}_{text}"
+
+
+def _take_assets(source: ET.Element, body: ET.Element, rename: Callable[[str], str]) -> list[tuple[ET.Element, str]]:
     """Copy the assets that a body names, with the files they had; names in the body are changed along."""
     found: list[tuple[ET.Element, str]] = []
     known: dict[tuple[str, str], str] = {}
@@ -110,10 +110,10 @@ def _take_assets(source: ET.Element, body: ET.Element, name: str) -> list[tuple[
             element = copy.deepcopy(source.find(f"./asset/{kind}[@name='{old}']"))
             if element is None:
                 raise InputError(f"scene.xml has no {kind} {sanitize_line(old, 80)!r}", "bad_mjcf")
-            new, file = f"{name}_{kind}_{len(known):03d}", element.get("file", "")
+            new, file = rename(old), element.get("file", "")
             element.set("name", new)
             if kind in _FILED and file:
-                element.set("file", new + posixpath.splitext(file)[1])
+                element.set("file", rename(file))
             known[kind, old] = new
             if kind == "material" and (texture := element.get("texture")):
                 element.set("texture", take("texture", texture))

@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 from tableverse_factory.core.errors import InputError, TableverseError
 from tableverse_factory.core.process_pool import prepare_child
@@ -120,22 +121,44 @@ class _Player:
         )
 
 
-def play_episodes(plan: PlayPlan, episodes: Sequence[Episode], jobs: int, limit_s: float) -> Iterator[EpisodeResult]:
-    """Yield the result of each episode as it ends, played by `jobs` processes, each within `limit_s` of wall time.
+class EpisodeProcesses:
+    """Processes of one run; leave the context to end them."""
 
-    A process that dies gives `policy_crash`, one that takes too long `policy_timeout`, and another takes its place.
+    def __init__(self, plan: PlayPlan, limit_s: float) -> None:
+        """Every episode has to end within `limit_s` of wall time."""
+        self._plan, self._limit_s = plan, limit_s
+        self._players = [_Player(plan)]
 
-    Raises:
-        InputError: if the policy does not load, or a scene is not that of the benchmark.
-    """
-    left, players = deque(episodes), list[_Player]()
-    try:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        for player in self._players:
+            player.end()
+
+    def describe_policy(self) -> PolicyDescription:
+        """Wait until the policy is loaded, and return what it says of itself; InputError if it does not load."""
+        first = self._players[0]
+        while first.description is None:
+            _wait(self._players)
+            first.poll()
+        return first.description
+
+    def play(self, episodes: Sequence[Episode], jobs: int) -> Iterator[EpisodeResult]:
+        """Yield the result of each episode as it ends, played by up to `jobs` processes.
+
+        One that dies gives `policy_crash`, one that takes too long `policy_timeout`, and another takes its place.
+
+        Raises:
+            InputError: if the policy does not load, or a scene is not that of the benchmark.
+        """
+        left, players = deque(episodes), self._players
         while left or any(player.episode for player in players):
             wanted = min(jobs, len(left) + sum(player.episode is not None for player in players))
-            players += [_Player(plan) for _ in range(wanted - len(players))]
+            players += [_Player(self._plan) for _ in range(wanted - len(players))]
             for player in players:
                 if left and not player.is_waited_for:
-                    player.play(left.popleft(), limit_s)
+                    player.play(left.popleft(), self._limit_s)
             _wait(players)
             for player in tuple(players):
                 if (result := player.poll()) is not None:
@@ -143,21 +166,6 @@ def play_episodes(plan: PlayPlan, episodes: Sequence[Episode], jobs: int, limit_
                 if player.is_lost:
                     player.end()
                     players.remove(player)
-    finally:
-        for player in players:
-            player.end()
-
-
-def describe_policy(plan: PlayPlan) -> PolicyDescription:
-    """Load the policy in a process of its own, and return what it says of itself; InputError if it does not load."""
-    player = _Player(plan)
-    try:
-        while player.description is None:
-            _wait([player])
-            player.poll()
-        return player.description
-    finally:
-        player.end()
 
 
 def _wait(players: Sequence[_Player]) -> None:

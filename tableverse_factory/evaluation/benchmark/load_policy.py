@@ -13,27 +13,26 @@ from schemas.identity import content_hash
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.http_policy import HttpPolicy
-from tableverse_factory.evaluation.benchmark.planner import PlannerPolicy
 from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
-from tableverse_factory.evaluation.benchmark.random_policy import RandomPolicy
-from tableverse_factory.evaluation.benchmark.replay import ReplayPolicy
 
-BASELINES: Mapping[str, Callable[..., Policy]] = {
-    "planner": PlannerPolicy,
-    "replay": ReplayPolicy,
-    "random": RandomPolicy,
+_ROOM = "tableverse_factory.evaluation.benchmark"
+BASELINES: Mapping[str, str] = {  # imported when they are asked for, as the planner takes a second
+    "planner": f"{_ROOM}.planner:PlannerPolicy",
+    "replay": f"{_ROOM}.replay:ReplayPolicy",
+    "random": f"{_ROOM}.random_policy:RandomPolicy",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyName:
-    """Name of a policy as on the command line, and the weights that its class is called with, if any.
+    """Name of a policy as on the command line, the weights that its class is called with, and its title in tables.
 
-    A baseline (`BASELINES`), `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
+    A name is a baseline (`BASELINES`), `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
     """
 
     name: str
     weights: str | None = None
+    title: str | None = None
 
     @property
     def digest(self) -> str:
@@ -43,7 +42,9 @@ class PolicyName:
 
     @property
     def shown(self) -> str:
-        """Name without folders, for results."""
+        """Title, else the name without folders."""
+        if self.title is not None:
+            return sanitize_line(self.title, 300)
         return sanitize_line(self.name.rpartition("/")[2] if not self.name.startswith("http") else self.name, 300)
 
 
@@ -62,7 +63,7 @@ def load_policy(name: PolicyName) -> Policy:
         if name.weights is not None:
             raise ConfigError("--weights: a process behind an address loads its own weights; leave them out")
         return HttpPolicy(name.name)
-    make = BASELINES[name.name] if name.name in BASELINES else _find_class(name.name)
+    make = _find_class(BASELINES.get(name.name, name.name))
     try:
         policy = make() if name.weights is None else make(name.weights)
     except (ConfigError, InputError):

@@ -11,7 +11,7 @@ from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.evaluation.benchmark.benchmark import AXES, SPLITS, Axis, Benchmark, Episode, Split
-from tableverse_factory.evaluation.benchmark.episode_processes import PlayPlan, describe_policy, play_episodes
+from tableverse_factory.evaluation.benchmark.episode_processes import EpisodeProcesses, PlayPlan, PolicyDescription
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
 from tableverse_factory.evaluation.benchmark.play import check_scene
 from tableverse_factory.evaluation.benchmark.results import (
@@ -46,7 +46,7 @@ def run_benchmark(
 ) -> tuple[ResultsHeader, tuple[EpisodeResult, ...]]:
     """Play the episodes that `out` lacks, and write it; return what it then holds, in the order of the benchmark.
 
-    Rows are first appended to `out` + `.partial`, so that a run which was killed goes on with the same command. The
+    Rows are first appended to `out` + `.journal`, so that a run which was killed goes on with the same command. The
     outcome of an episode depends on nothing else, but for `policy_timeout`, which depends on the machine.
 
     Raises:
@@ -58,8 +58,25 @@ def run_benchmark(
         raise InputError("the benchmark has no episodes of these splits and axes: give others", "no_episodes")
     check_scenes(benchmark, dataset, chosen)
     plan = PlayPlan(benchmark, dataset.path, policy)
-    seen = describe_policy(plan)
-    header = ResultsHeader(
+    with EpisodeProcesses(plan, settings.episode_s) as processes:
+        header = _make_header(benchmark, policy, processes.describe_policy())
+        with _open_journal(out, header) as (file, known):
+            left = [episode for episode in chosen if episode.episode_id not in known]
+            total = len(known) + len(left)
+            progress(len(known), total)
+            for result in processes.play(left, settings.jobs):
+                file.write(encode_line(result))
+                file.flush()
+                known[result.episode_id] = result
+                progress(len(known), total)
+            rows = tuple(known[e.episode_id] for e in benchmark.episodes if e.episode_id in known)
+            write_atomic(out, encode_results(header, rows))
+            Path(file.name).unlink()
+    return header, rows
+
+
+def _make_header(benchmark: Benchmark, policy: PolicyName, seen: PolicyDescription) -> ResultsHeader:
+    return ResultsHeader(
         benchmark=benchmark.digest,
         policy=policy.shown,
         policy_digest=policy.digest,
@@ -67,19 +84,6 @@ def run_benchmark(
         pictures=seen.pictures,
         picture_size=seen.picture_size,
     )
-    with _open_partial(out, header) as (file, known):
-        left = [episode for episode in chosen if episode.episode_id not in known]
-        progress(len(known), len(known) + len(left))
-        total = len(known) + len(left)
-        for result in play_episodes(plan, left, settings.jobs, settings.episode_s) if left else ():
-            file.write(encode_line(result))
-            file.flush()
-            known[result.episode_id] = result
-            progress(len(known), total)
-        rows = tuple(known[e.episode_id] for e in benchmark.episodes if e.episode_id in known)
-        write_atomic(out, encode_results(header, rows))
-        Path(file.name).unlink()
-    return header, rows
 
 
 def check_scenes(benchmark: Benchmark, dataset: Dataset, episodes: Sequence[Episode]) -> None:
@@ -97,9 +101,9 @@ def check_scenes(benchmark: Benchmark, dataset: Dataset, episodes: Sequence[Epis
 
 
 @contextmanager
-def _open_partial(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
+def _open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
     """Open the file that rows are appended to, locked, with the rows that it and `out` hold."""
-    path = out.with_name(f"{out.name}.partial")
+    path = out.with_name(f"{out.name}.journal")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+b") as file:
         try:
