@@ -41,7 +41,8 @@ IK_STEPS = 4
 RISE_M = 0.05  # of the gripper after the grasp, from which it is known whether X came along
 WAIT_S = 2.0  # after the release, before another attempt
 RETURN_SPEED = 0.8  # of joints on the way home [rad/s]
-STILL_M, STILL_OPENING_M, STILL_CHUNKS = 0.004, 0.001, 3  # motion of a chunk, and chunks, of a standstill
+STILL_RAD, STILL_OPENING_M, STILL_CHUNKS = 0.015, 0.001, 3  # change within a chunk, and chunks, of a standstill
+MAX_TURN_RAD = 1.0  # of a joint along a straight way
 HOMING = 0.02  # share of the way home that joints go per step where the gripper's pose leaves them free
 
 Observation = Mapping[str, np.ndarray]
@@ -113,15 +114,18 @@ class ChunkPolicy(ABC):
         drawn = self._network.goal.draw(memory, torch.randn(1, DRAWN, GOAL, generator=self._random))
         return drawn if self._attempts else drawn[:, select_goals(drawn)[0]]
 
-    def find_reachable(self, at: Tensor, turn: Tensor, wanted: np.ndarray | None = None) -> int:
+    def find_reachable(self, at: Tensor, turn: Tensor, way: Tensor, wanted: np.ndarray | None = None) -> int:
         """Find the first pose of the table frame that the arm reaches, the `wanted` ones first; else return the first.
 
-        Shapes (m, 3), (m, 3, 3) and (m,).
+        It has to reach the other end of its straight way too, without another posture. Shapes (m, 3), (m, 3, 3),
+        (m, 3) [m] and (m,).
         """
         order = np.arange(len(at)) if wanted is None else np.argsort(~wanted, kind="stable")
+        places, turns, ends = (each.double().numpy() for each in (at, turn, at + way))
         for k in order[:TRIED].tolist():
-            pose = self._to_base(at[k].double().numpy(), turn[k].double().numpy())
-            if len(solve_ik(self._chain, pose, self._command[:-1], 1)):
+            near = solve_ik(self._chain, self._to_base(places[k], turns[k]), self._command[:-1], 1)
+            far = solve_ik(self._chain, self._to_base(ends[k], turns[k]), near[0], 1) if len(near) else near
+            if len(far) and np.abs(far[0] - near[0]).max() < MAX_TURN_RAD:
                 return int(k)
         return int(order[0])
 
@@ -160,10 +164,10 @@ class ChunkPolicy(ABC):
         chunk = self._network.motion(describe_state(state, mirror), points, present)
         at, turn, opening = decode_chunk(state, chunk)
         self._advance_phase(chunk[0, :EXECUTED, 7:].argmax(1).tolist())
-        self._end_standstill(float((at[0, EXECUTED - 1] - state.tcp_at[0]).norm()), float(opening[0, EXECUTED - 1]))
         self._append_commands(
             torch.cat([state.tcp_at[:, None], at], 1)[0], torch.cat([state.tcp_turn[:, None], turn], 1)[0], opening[0]
         )
+        self._end_standstill()
 
     def _advance_phase(self, phases: list[int]) -> None:
         """Advance the phase, and the time since it began, by the samples that are executed next."""
@@ -172,9 +176,10 @@ class ChunkPolicy(ABC):
             if phase > self._phase:
                 self._phase, self._since_s = phase, 0.0
 
-    def _end_standstill(self, way_m: float, opening_m: float) -> None:
+    def _end_standstill(self) -> None:
         """Advance the phase where the gripper stands still for longer than any demonstration does."""
-        still = way_m < STILL_M and abs(opening_m - self._command[-1]) < STILL_OPENING_M
+        change = np.abs(self._queue[-1] - self._command)
+        still = change[:-1].max() < STILL_RAD and change[-1] < STILL_OPENING_M
         self._still = self._still + 1 if still else 0
         if self._still >= STILL_CHUNKS and self._phase < POST_PLACE:
             self._phase, self._since_s, self._still = self._phase + 1, 0.0, 0

@@ -12,6 +12,7 @@ from tableverse_factory.evaluation.training.policy.goals import decode_openings
 from tableverse_factory.evaluation.training.policy.motions import MOTION_POINTS
 from tableverse_factory.evaluation.training.policy.picture_goals import GRASP, decode_pose, make_picture_network
 from tableverse_factory.models.local.device import Tensor, import_torch
+from tableverse_factory.robotics.robots.gripper_clearance import LIFT_M, STANDOFF_M
 
 torch = import_torch()
 
@@ -44,7 +45,8 @@ class PicturePolicy(ChunkPolicy):
         """Draw a goal that the arm reaches: the gripper's pose in the table frame, and the goal itself."""
         drawn = self.draw_goals(self._network.goal.encode(seen, words, torch.tensor([release]), grasp))
         at, turn = decode_pose((self._base_at, self._base_turn), drawn)
-        best = self.find_reachable(at[0], turn[0])
+        way = torch.tensor([0.0, 0.0, LIFT_M]) if release else -STANDOFF_M * turn[0, :, :, 2]
+        best = self.find_reachable(at[0], turn[0], way)
         return at[:, best], turn[:, best], drawn[:, best]
 
     def locate_release(self, _observation: Observation, _tcp: np.ndarray) -> tuple[Tensor, Tensor]:
