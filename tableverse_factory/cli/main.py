@@ -7,6 +7,7 @@ import typer
 from typer.core import TyperGroup
 
 from tableverse_factory.cli.bench import bench
+from tableverse_factory.cli.benchmark import benchmark
 from tableverse_factory.cli.build import build
 from tableverse_factory.cli.config import config
 from tableverse_factory.cli.cousins import cousins
@@ -74,7 +75,7 @@ PANELS: dict[str, dict[str, Callable[..., Any] | typer.Typer]] = {
     },
     "Look: what came out": {"report": report, "view": view, "stats": stats, "query": query},
     "Use: take it elsewhere": {"extract": extract, "export": export, "publish": publish},
-    "Measure: is it true, is it good": {"verify": verify, "evaluate": evaluate, "bench": bench},
+    "Measure: is it true, is it good": {"verify": verify, "evaluate": evaluate, "benchmark": benchmark, "bench": bench},
 }
 COMMANDS = {name: command for panel in PANELS.values() for name, command in panel.items()}
 

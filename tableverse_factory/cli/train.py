@@ -1,4 +1,4 @@
-"""`tableverse train`: training of networks on synthetic scenes."""
+"""`tableverse train`: training of networks on synthetic scenes, and of policies on the motions of a dataset."""
 
 import sys
 from pathlib import Path
@@ -12,15 +12,21 @@ if TYPE_CHECKING:
     from tableverse_factory.evaluation.training.train import TrainProgress
     from tableverse_factory.models.local.device import Device
 
-train = typer.Typer(name="train", help="Train networks on synthetic scenes.", no_args_is_help=True)
+train = typer.Typer(
+    name="train", help="Train networks on synthetic scenes, and policies on a dataset.", no_args_is_help=True
+)
 
 TrainFolder = Annotated[
     Path, typer.Argument(metavar="DIR", callback=require_local_path, help="New folder, or one to continue.")
 ]
-TrainSteps = Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps, of --batch views each.")]
+TrainSteps = Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps of the training.")]
 TrainBatch = Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")]
-TrainSeed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of scenes, order and first weights.")]
+TrainSeed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of what is drawn, and of the first weights.")]
 TrainDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device to train on.")]
+TrainMinutes = Annotated[
+    float | None, typer.Option(min=0.1, help="Stop with a checkpoint after so many; the command again continues.")
+]
+_PICTURES_FROM = "Train goals on pictures instead; motions are those of these weights, of a policy on states."
 TrainJobs = Annotated[
     int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make views; one per CPU by default.")
 ]
@@ -78,9 +84,7 @@ def train_segmenter(
 def train_picture(
     folder: TrainFolder,
     steps: TrainSteps = 7_900,
-    minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="Stop with a checkpoint after so many; the command again continues.")
-    ] = None,
+    minutes: TrainMinutes = None,
     batch: TrainBatch = 64,
     views: Annotated[
         int, typer.Option(min=64, max=1_000_000, help="Views that are kept to draw from, 1.3 MB of the GPU each.")
@@ -114,8 +118,8 @@ def train_picture(
     where = _prepare_training(device).kind
     if where == "cuda":
         import_extra("cupy", "rendering on a GPU", "training")
-    from tableverse_factory.evaluation.training.picture.checkpoint import PictureSettings  # these import torch
     from tableverse_factory.evaluation.training.picture.export import export_network
+    from tableverse_factory.evaluation.training.picture.settings import PictureSettings  # these import torch
     from tableverse_factory.evaluation.training.picture.train import TrainRun, train_pictures
 
     processes = count_available_cpus() if jobs is None else jobs
@@ -143,6 +147,75 @@ def _choose_gpus(device: str, wanted: int | None) -> int:
     return seen if wanted is None else wanted
 
 
+@train.command("policy")
+def train_policy(
+    folder: TrainFolder,
+    dataset: Annotated[
+        str | None, typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories, read the first time.")
+    ] = None,
+    steps: TrainSteps = 16_000,
+    minutes: TrainMinutes = None,
+    goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 256,
+    chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 1_024,
+    state: Annotated[
+        Path | None,
+        typer.Option("--pictures-from", metavar="WEIGHTS", dir_okay=False, exists=True, help=_PICTURES_FROM),
+    ] = None,
+    seed: TrainSeed = 0,
+    device: TrainDevice = "auto",
+) -> None:
+    """Train a policy on states from the successful motions of a dataset's splits train and validation.
+
+    Writes DIR/demonstrations.npz (the motions, packed), DIR/checkpoint.safetensors and DIR/weights.safetensors, with
+    which `tableverse benchmark run` plays it; with --pictures-from also DIR/pictures.npz. What is packed already is not
+    read from the dataset again. The same command again continues from the checkpoint.
+
+    Example: `tableverse train policy net --dataset out --minutes 10`
+    """
+    import math
+
+    where = _prepare_training(device, ("torch", "safetensors")).kind
+    from tableverse_factory.evaluation.training.policy.settings import PolicySettings
+    from tableverse_factory.evaluation.training.policy.train import TrainRun, train_picture_policy, train_state_policy
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
+    demonstrations = _provide_packed(folder / "demonstrations.npz", dataset, pictures=False)
+    run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
+    settings = PolicySettings(steps, seed, goals, chunks=chunks)
+    if state is None:
+        done = train_state_policy(settings, run, say)
+    else:
+        pictures = _provide_packed(folder / "pictures.npz", dataset, pictures=True)
+        done = train_picture_policy(settings, run, pictures, state, say)
+    print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
+    print(f"{folder / 'weights.safetensors'}: give it to `tableverse benchmark run --weights`")
+
+
+def _provide_packed(path: Path, dataset: str | None, pictures: bool) -> Path:
+    """Pack the dataset's motions, or their first pictures, unless an earlier command did, and return their file."""
+    from tableverse_factory.core.errors import ConfigError
+
+    if path.is_file():
+        return path
+    if dataset is None:
+        raise ConfigError(f"{path} is not there: give --dataset, whose motions are packed into it")
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.process_pool import count_available_cpus
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.evaluation.training.policy.pack import pack_demonstrations
+    from tableverse_factory.evaluation.training.policy.pack_pictures import pack_pictures
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with count_progress("scenes") as done:
+        if pictures:
+            pack_pictures(open_dataset(dataset), on_scene=done.update, jobs=count_available_cpus()).write(path)
+        else:
+            pack_demonstrations(open_dataset(dataset), on_scene=done.update).write(path)
+    return path
+
+
 def _provide_pool(folder: Path, scenes: int, seed: int, jobs: int) -> Path:
     """Settle the scenes whose meshes are used, unless an earlier command did, and return their file."""
     from tableverse_factory.cli.progress_bar import count_progress
@@ -156,12 +229,15 @@ def _provide_pool(folder: Path, scenes: int, seed: int, jobs: int) -> Path:
     return path
 
 
-def _prepare_training(device: Literal["auto", "cpu", "cuda"]) -> "Device":
+def _prepare_training(
+    device: Literal["auto", "cpu", "cuda"],
+    modules: tuple[str, ...] = ("torch", "safetensors", "onnx", "onnxruntime"),
+) -> "Device":
     """Choose the device, and fail before any work if a package is missing."""
     from schemas.config import ModelsConfig
     from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.models.local.device import select_device
 
-    for module in ("torch", "safetensors", "onnx", "onnxruntime"):
+    for module in modules:
         import_extra(module, "training", "models")
     return select_device(ModelsConfig(device=device, precision="float32"), "--device")

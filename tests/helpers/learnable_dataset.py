@@ -32,16 +32,23 @@ LICENCES = ("CC0-1.0", "CC-BY-4.0", "CC-BY-NC-4.0")
 TASKED = (("task_000", "next to", True), ("task_001", "to the right of", True), ("task_002", "on", False))
 
 
-def write_learnable_dataset(out: Path, scenes: int = 6, shard_size: int = 2, moved: int = 1) -> Path:
-    """Scenes `s-0`, `s-1`, … that differ in where a bystander stands; `moved` have a motion for each of two tasks."""
-    exported = [_exported(k, with_motions=k < moved) for k in range(scenes)]
+def write_learnable_dataset(
+    out: Path, scenes: int = 6, shard_size: int = 2, moved: int = 1, splits: tuple[str, ...] = ()
+) -> Path:
+    """Scenes `s-0`, `s-1`, … that differ in where a bystander stands; `moved` have a motion for each of two tasks.
+
+    The first ones are of `splits`, where given.
+    """
+    exported = [
+        _exported(k, with_motions=k < moved, split=splits[k] if k < len(splits) else None) for k in range(scenes)
+    ]
     for number in range(0, scenes, shard_size):
         _write_shard(out, number // shard_size, exported[number : number + shard_size])
     (out / "run.json").write_text("{}")
     return out
 
 
-def _exported(k: int, with_motions: bool) -> ExportedScene:
+def _exported(k: int, with_motions: bool, split: str | None) -> ExportedScene:
     solids = [
         Solid(box(0.04, 0.04, 0.06), (0.0, 0.0, 0.03), LABELS[0]),
         Solid(box(0.08, 0.08, 0.04), (0.18, 0.1, 0.02), LABELS[1]),
@@ -66,6 +73,7 @@ def _exported(k: int, with_motions: bool) -> ExportedScene:
     row = {
         **value.scene_row, "kind": "capture", "name": f"table {k}", "licence": LICENCES[k % 3], "status": "done",
         "stage": "export", "attempts": 1, "n_trajectories": len(rows), "n_successes": sum(r["success"] for r in rows),
+        "split": split,
     }  # fmt: skip
     objects = tuple({**item, "graspable": item["object_id"] != REFERENCE} for item in value.object_rows)
     return ExportedScene(

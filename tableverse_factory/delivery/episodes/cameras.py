@@ -1,5 +1,6 @@
 """Cameras of episodes: the scene's own, one beside the robot, and one for films."""
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,25 @@ _AZIMUTHS = tuple(np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 78.0, 
 _CLEAR_M = 0.05  # sufficient distance of the arm from the line of sight to the object at the end
 _PATH_MARGIN_M = 0.15  # table shown around the object's path
 _FRAMING_SAMPLES = 40  # arm configurations considered for framing
+
+
+@dataclass(frozen=True, slots=True)
+class CameraShift:
+    """Small displacement of a camera in its own frame: shift [m], rotation vector [rad], factor of the focal length."""
+
+    shift_m: tuple[float, ...]  # x, y, z
+    turn_rad: tuple[float, ...]
+    zoom: float
+
+    @property
+    def pose(self) -> Pose:
+        """The displaced camera in the frame of the camera before."""
+        return Pose(np.array(self.shift_m), normalize_quaternion(np.array([1.0, *(np.array(self.turn_rad) / 2)])))
+
+    def displace(self, eye: PosedCamera) -> PosedCamera:
+        """Displace a camera that stands in the table frame."""
+        camera = replace(eye.camera, fx=self.zoom * eye.camera.fx, fy=self.zoom * eye.camera.fy)
+        return PosedCamera(camera, compose_poses(eye.camera_to_table, self.pose))
 
 
 def place_robot_camera(base: Pose, width: int, height: int) -> PosedCamera:

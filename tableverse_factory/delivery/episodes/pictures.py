@@ -10,6 +10,7 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.episodes.actors import ArmMeshes, RenderScene, build_render_scene
 from tableverse_factory.delivery.episodes.cameras import (
+    CameraShift,
     load_scene_camera,
     mount_wrist_camera,
     place_robot_camera,
@@ -57,19 +58,22 @@ class CameraRig:
         object_ids: Sequence[str],
         size: tuple[int, int],
         lighting: Lighting | None = None,
+        shift: CameraShift | None = None,
     ) -> None:
         """Render the still parts for each camera that `pictures` names.
 
         `base` is the arm's in the table frame, `object_ids` in the order of the states of objects, `size` height and
-        width [px].
+        width [px]; `shift` displaces each camera.
         """
         self._pictures, self._mount = tuple(pictures), mount_wrist_camera(arm)
+        if shift is not None:
+            self._mount = compose_poses(self._mount, shift.pose)
         self._ids = _number_parts(cast, object_ids)
         self._renderers = {
             name: IncrementalRenderer(
                 cast.still,
                 cast.moving,
-                _place(name, scene, arm, base, size),
+                _place(name, scene, arm, base, size, shift),
                 lighting,
                 *_MOVING_QUALITY if name == "wrist" else (),
             )
@@ -92,7 +96,14 @@ class CameraRig:
         return {name: view.color, name + DEPTH: depth, name + INSTANCES: instances}
 
 
-def _place(name: str, scene: Scene, arm: Arm, base: Pose, size: tuple[int, int]) -> PosedCamera:
+def _place(
+    name: str, scene: Scene, arm: Arm, base: Pose, size: tuple[int, int], shift: CameraShift | None
+) -> PosedCamera:
+    eye = _place_unshifted(name, scene, arm, base, size)
+    return eye if shift is None else shift.displace(eye)
+
+
+def _place_unshifted(name: str, scene: Scene, arm: Arm, base: Pose, size: tuple[int, int]) -> PosedCamera:
     height, width = size
     if name == "front":
         return place_robot_camera(base, width, height)

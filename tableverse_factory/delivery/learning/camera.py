@@ -8,6 +8,7 @@ import numpy as np
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.episodes.actors import ArmMeshes, build_render_scene
+from tableverse_factory.delivery.episodes.cameras import CameraShift
 from tableverse_factory.delivery.episodes.incremental_renderer import PaintedMeshes
 from tableverse_factory.delivery.episodes.pictures import CameraRig, join_poses
 from tableverse_factory.physics.mjcf.scene_objects import read_slab
@@ -30,16 +31,18 @@ class SceneCameras:
         size: tuple[int, int],
         table: int | None = None,
         lighting: Lighting | None = None,
+        shift: CameraShift | None = None,
     ) -> None:
         """Render the still parts.
 
         `object_ids` are in the order of the states of objects, `pictures` as in `episodes.pictures.PICTURES`, `size` is
-        height and width [px], and `table` the seed of a texture for the table; None keeps its own.
+        height and width [px], and `table` the seed of a texture for the table; None keeps its own. `shift` displaces
+        each camera.
         """
         self._figure, self._base = ArmMeshes(station.arm), station.base
         cast = build_render_scene(scene, set(object_ids), self._figure, self._base)
         self._cast = cast if table is None else replace(cast, still=_retexture_table(cast.still, scene, table))
-        self._rig = CameraRig(pictures, scene, self._cast, station.arm, self._base, object_ids, size, lighting)
+        self._rig = CameraRig(pictures, scene, self._cast, station.arm, self._base, object_ids, size, lighting, shift)
 
     def take(self, poses: Mapping[str, np.ndarray], positions: np.ndarray, tcp: np.ndarray) -> dict[str, np.ndarray]:
         """Take the pictures at poses of the objects and the gripper, and positions of joints and fingers.

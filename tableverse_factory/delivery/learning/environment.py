@@ -11,12 +11,18 @@ from schemas.geometry import Picture, Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.episodes.cameras import CameraShift
 from tableverse_factory.delivery.episodes.instructions import paraphrase_instruction
 from tableverse_factory.delivery.episodes.observation import build_state, pad_objects
 from tableverse_factory.delivery.episodes.pictures import DEPTH, INSTANCES, MAX_DEPTH_M, check_pictures
 from tableverse_factory.delivery.learning.camera import SceneCameras
 from tableverse_factory.delivery.learning.pick_place_sim import PickPlaceSim, SimState
-from tableverse_factory.delivery.learning.variation import Variation, draw_lighting, draw_table_seed
+from tableverse_factory.delivery.learning.variation import (
+    Variation,
+    draw_camera_shift,
+    draw_lighting,
+    draw_table_seed,
+)
 from tableverse_factory.physics.render.render import Lighting
 
 ENVIRONMENT_ID = "TableVerse/PickPlace-v0"
@@ -86,7 +92,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             )
         self.render_mode = render_mode
         self.sim = PickPlaceSim(scene, task, robot, base, 1.0 / FPS, max_disturbed_m)
-        self._scene, self._reward = scene, reward
+        self.scene, self._reward = scene, reward
         self._max_steps = None if max_steps is None else _check_count("max_steps", max_steps, 1)
         self._variation = _check_variation(Variation() if variation is None else variation)
         self._pictures = check_pictures(pictures)
@@ -95,7 +101,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         objects = len(self.sim.object_ids)
         self._rows = objects if max_objects is None else _check_count("max_objects", max_objects, objects)
         self._cameras: dict[str, SceneCameras] = {}
-        self._look: tuple[int | None, Lighting | None] = (None, None)
+        self._look: tuple[int | None, Lighting | None, CameraShift | None] = (None, None, None)
         self._steps = 0
         self._state: SimState | None = None
         arm = self.sim.station.arm
@@ -127,8 +133,9 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         state = self._state = self.sim.reset(self.np_random, variation)
         table = draw_table_seed(self.np_random) if variation.table else None
         lighting = draw_lighting(self.np_random) if variation.lights else None
-        if (table, lighting) != self._look:
-            self._look, self._cameras = (table, lighting), {}
+        shift = draw_camera_shift(self.np_random) if variation.cameras else None
+        if (table, lighting, shift) != self._look:
+            self._look, self._cameras = (table, lighting, shift), {}
         self._steps = 0
         words = {"instruction": self.sim.instruction, "paraphrases": paraphrase_instruction(self.sim.instruction)}
         return self._observation(state), {**self._info(state), **words}
@@ -186,7 +193,7 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
         """Take pictures of the present state; cameras are kept by their use."""
         names, sample = self.sim.object_ids, self._now.sample
         if use not in self._cameras:
-            self._cameras[use] = SceneCameras(self._scene, self.sim.station, names, pictures, size, *self._look)
+            self._cameras[use] = SceneCameras(self.scene, self.sim.station, names, pictures, size, *self._look)
         return self._cameras[use].take(dict(zip(names, self.sim.poses(), strict=True)), sample.qpos, sample.tcp)
 
     @property

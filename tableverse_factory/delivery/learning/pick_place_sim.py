@@ -20,7 +20,7 @@ from tableverse_factory.delivery.episodes.instructions import read_instruction
 from tableverse_factory.delivery.episodes.observation import order_objects
 from tableverse_factory.delivery.episodes.subtasks import SUBTASKS, estimate_phase
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
-from tableverse_factory.delivery.learning.variation import Variation, displace_objects
+from tableverse_factory.delivery.learning.variation import Variation, displace_objects, vary_friction
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.simulate.at_rest import HOLD_S, SPEED_LIMIT
@@ -88,6 +88,7 @@ class PickPlaceSim:
             raise InputError(f"object {absent[0]!r} of scene {scene.scene_id} does not move", "bad_task")
         self.station.place_base(base or self._find_recorded_base(scene, row) or self._find_best_base())
         self._monitor = ExecutionMonitor(self.station, self.goal.x_id)
+        self._friction = self.station.model.geom_friction.copy()
         self.reset(np.random.default_rng(0), Variation())
 
     @property
@@ -102,8 +103,10 @@ class PickPlaceSim:
 
     def reset(self, rng: np.random.Generator, variation: Variation) -> SimState:
         """Restore the exported scene, varied by `variation`, with the arm at home and open fingers."""
+        self.station.model.geom_friction[:] = self._friction
         self._data = self.station.data()
         displace_objects(self.station, self._data, variation, rng)
+        vary_friction(self.station, self.goal.x_id, variation, rng)
         mujoco.mj_forward(self.station.model, self._data)
         self._allowed_m = compute_displacement_limits(
             self.goal, self._monitor.others, self._monitor.find_touching(self._data, self.goal.y_id)

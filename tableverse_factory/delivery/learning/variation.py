@@ -1,4 +1,4 @@
-"""Domain randomization of resets, drawn from the seed: object poses, table texture and light."""
+"""Domain randomization of resets, drawn from the seed: object poses, table texture, light, cameras and friction."""
 
 import copy
 from dataclasses import dataclass
@@ -8,14 +8,24 @@ import numpy as np
 
 from schemas.geometry import Vector3
 from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.delivery.episodes.cameras import CameraShift
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z
 from tableverse_factory.physics.mjcf.spec import TABLE
-from tableverse_factory.physics.render.domain_randomization import LIGHT_ELEVATION_RAD, LIGHT_STRENGTH, LIGHT_WARMTH
+from tableverse_factory.physics.render.domain_randomization import (
+    CAMERA_SHIFT_M,
+    CAMERA_TURN_RAD,
+    CAMERA_ZOOM,
+    LIGHT_ELEVATION_RAD,
+    LIGHT_STRENGTH,
+    LIGHT_WARMTH,
+)
 from tableverse_factory.physics.render.render import Lighting
+from tableverse_factory.robotics.execution.perturbations import scale_friction
 from tableverse_factory.robotics.robots.station import Station
 from tableverse_factory.sources.textures.catalogue import TEXTURE_COUNT
 
 _MAX_TRIES = 20
+MAX_FRICTION = 10.0
 _DEEPER_M = 2e-4  # allowed extra penetration of a moved object
 
 
@@ -29,16 +39,22 @@ class Variation:
         yaw_rad: Their rotation about the vertical, up to this [rad].
         table: Draw a table texture from the catalog; visible in pictures only.
         lights: Draw direction, strength and warmth of the light; visible in pictures only.
+        cameras: Draw a small displacement of every camera; visible in pictures only.
+        friction: Sliding and torsional friction of X and the fingers get a factor from 1/friction to friction.
     """
 
     position_m: float = 0.0
     yaw_rad: float = 0.0
     table: bool = False
     lights: bool = False
+    cameras: bool = False
+    friction: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.position_m <= 1.0 and 0.0 <= self.yaw_rad <= np.pi):
             raise ConfigError(f"position_m {self.position_m}, yaw_rad {self.yaw_rad}: from 0 to 1 m and to pi")
+        if not 1.0 <= self.friction <= MAX_FRICTION:
+            raise ConfigError(f"friction {self.friction}: give a factor from 1 to {MAX_FRICTION:g}")
 
 
 def displace_objects(station: Station, data: mujoco.MjData, variation: Variation, rng: np.random.Generator) -> None:
@@ -120,3 +136,18 @@ def draw_lighting(rng: np.random.Generator) -> Lighting:
     c, s = np.cos(elevation), np.sin(elevation)
     direction = (float(c * np.cos(azimuth)), float(c * np.sin(azimuth)), float(s))
     return Lighting(key_direction=direction, key=(float(red), float(green), float(blue)))
+
+
+def draw_camera_shift(rng: np.random.Generator) -> CameraShift:
+    """Draw a displacement of cameras, within the bounds of `physics.render.domain_randomization`."""
+    shift = rng.uniform(-CAMERA_SHIFT_M, CAMERA_SHIFT_M, 3)
+    turn = rng.uniform(-CAMERA_TURN_RAD, CAMERA_TURN_RAD, 3)
+    zoom = 1.0 + rng.uniform(-CAMERA_ZOOM, CAMERA_ZOOM)
+    return CameraShift(tuple(shift.tolist()), tuple(turn.tolist()), float(zoom))
+
+
+def vary_friction(station: Station, object_id: str, variation: Variation, rng: np.random.Generator) -> None:
+    """Scale the friction of the carried object and the fingers by a factor drawn as `variation` allows."""
+    if variation.friction != 1.0:
+        factor = float(variation.friction ** rng.uniform(-1.0, 1.0))
+        scale_friction(station, station.object_bodies[object_id], factor)

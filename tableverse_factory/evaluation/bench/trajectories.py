@@ -67,7 +67,7 @@ def bench_trajectories(
     costs = []
     for scene in scenes:
         for_things, for_tasks = make_rng(config.run.seed, scene.scene_id, "trajectories").spawn(2)
-        cell = WorkCell(scene, arm, config.trajectories, for_things, services)
+        cell = WorkCell(dict(scene.files), scene.object_rows, arm, config.trajectories, for_things, services)
         tasks = [row for row in scene.task_rows if row["accepted"]][: config.trajectories.max_tasks]
         for task, rng in list(zip(tasks, for_tasks.spawn(len(tasks)), strict=True))[:most]:
             costs.append(_measure_task(cell, task, config, rng))

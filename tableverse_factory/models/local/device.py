@@ -2,11 +2,13 @@
 
 import os
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from schemas.config import ModelsConfig
 from tableverse_factory.core.errors import InputError, WeightsError
 from tableverse_factory.core.optional_imports import import_extra
+
+if TYPE_CHECKING:  # where networks are trained, numpy and torch suffice
+    from schemas.config import ModelsConfig
 
 Tensor = Any  # A `torch.Tensor`; torch is an extra, and type checks must pass without it
 
@@ -29,7 +31,7 @@ class Device:
         return getattr(import_torch(), self.precision)
 
 
-def select_device(config: ModelsConfig, key: str = "models.device") -> Device:
+def select_device(config: "ModelsConfig", key: str = "models.device") -> Device:
     """Resolve `models.device` and `models.precision` on this machine; `key` is what sets the device, for the error.
 
     Raises:

@@ -14,7 +14,7 @@ from tableverse_factory.robotics.execution.goal import Goal
 from tableverse_factory.robotics.robots.station import Station
 
 
-def _scale_friction(station: Station, body: int, factor: float) -> None:
+def scale_friction(station: Station, body: int, factor: float) -> None:
     """Scale sliding and torsional friction of the carried object and the fingers.
 
     Rolling friction stays, as it keeps round objects still; friction of other objects stays, as leaning ones could
@@ -34,8 +34,8 @@ def _scale_mass(station: Station, body: int, factor: float) -> None:
 
 # Change and factor by name, as in the column `survives`
 PERTURBATIONS: Mapping[str, tuple[Callable[[Station, int, float], None], float]] = {
-    "friction_halved": (_scale_friction, 0.5),
-    "friction_doubled": (_scale_friction, 2.0),
+    "friction_halved": (scale_friction, 0.5),
+    "friction_doubled": (scale_friction, 2.0),
     "mass_minus_30": (_scale_mass, 0.7),
     "mass_plus_30": (_scale_mass, 1.3),
 }

@@ -165,6 +165,11 @@ def may_share_noun(a: str, b: str) -> bool:
     return a == b or any(a in group and b in group for group in _SYNONYMS)
 
 
+def unify_noun(noun: str) -> str:
+    """Replace a head noun by the first of those that may name the same thing."""
+    return min({noun}.union(*(group for group in _SYNONYMS if noun in group)))
+
+
 def find_color_words(label: str) -> frozenset[str]:
     """Find the colours that the label itself names."""
     return frozenset(COLORS) & frozenset("grey" if word == "gray" else word for word in split_label(label))

@@ -96,9 +96,18 @@ class _PlaceClearance:
 
 
 def search_trajectory(cell: WorkCell, task: Mapping[str, Any], rng: np.random.Generator) -> PlannedTask:
-    """Search a successful trajectory for a row of tasks/, or return how far it came."""
+    """Search a successful trajectory for a row of tasks/, and what it survives, or return how far it came."""
+    goal = load_goal(cell.files, task, cell.config.max_disturbed_m)
+    found = search_motion(cell, goal, rng)
+    best = found.attempt
+    if best is None or not best.success or best.motion is None:
+        return found
+    return replace(found, survives=find_survived_perturbations(cell.station, best.base, best.motion, goal))
+
+
+def search_motion(cell: WorkCell, goal: Goal, rng: np.random.Generator) -> PlannedTask:
+    """Search a motion that reaches a goal in simulation, or return how far it came."""
     config = cell.config
-    goal = load_goal(cell.files, task, config.max_disturbed_m)
     x, y = cell.objects[goal.x_id], cell.objects[goal.y_id]
     others = [scene_object for name, scene_object in cell.objects.items() if name not in (goal.x_id, goal.y_id)]
     places = sample_placements(Relation(goal.relation), x, y, others, cell.table, config, rng)
@@ -117,11 +126,8 @@ def search_trajectory(cell: WorkCell, task: Mapping[str, Any], rng: np.random.Ge
     if best is None:
         detail = "no base reaches both ends with a grasp that leaves the gripper room where the object is to go"
         return PlannedTask(reason="no_base_or_room", detail=detail, candidates=len(grasps))
-    survives: tuple[str, ...] = ()
-    if best.success and best.motion is not None:
-        survives = find_survived_perturbations(cell.station, best.base, best.motion, goal)
     tally = "" if best.success else format_tally(reasons)
-    return PlannedTask(best, detail=tally, candidates=len(grasps), tried=reasons.total(), survives=survives)
+    return PlannedTask(best, detail=tally, candidates=len(grasps), tried=reasons.total())
 
 
 def format_tally(reasons: Counter[str]) -> str:

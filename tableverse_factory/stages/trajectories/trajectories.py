@@ -35,7 +35,7 @@ def plan_trajectories(
         return Done(add_trajectories(scene, ()))
     arm = load_arm(settings.robot)
     compute_reach_map(arm)  # once, here, for all of the processes apart
-    cell = WorkCell(scene, arm, settings, for_things, services)
+    cell = WorkCell(dict(scene.files), scene.object_rows, arm, settings, for_things, services)
     streams = for_tasks.spawn(len(tasks))
 
     def work(index: int) -> bytes:

@@ -1,13 +1,13 @@
 """Work cell of one scene: its objects, the arm, and caches shared by its tasks."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from schemas.config import TrajectoriesConfig
 from schemas.geometry import Points, Pose
-from schemas.scene import ExportedScene
 from schemas.trajectories import Grasps
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.meshes import place_mesh
@@ -29,14 +29,24 @@ class WorkCell:
     """Objects, table and arm of a scene. Caches depend on the scene alone, never on the order of queries."""
 
     def __init__(
-        self, scene: ExportedScene, arm: Arm, config: TrajectoriesConfig, rng: np.random.Generator, services: Services
+        self,
+        files: Mapping[str, bytes],
+        object_rows: Iterable[Mapping[str, Any]],
+        arm: Arm,
+        config: TrajectoriesConfig,
+        rng: np.random.Generator,
+        services: Services,
+        base: Pose | None = None,
     ) -> None:
-        """Read the scene's files and compile them with the arm."""
-        self.files: Mapping[str, bytes] = dict(scene.files)
-        self.objects = load_scene_objects(self.files, scene.object_rows)
+        """Read the files and rows of objects/ of an exported scene, and compile it with the arm.
+
+        The arm stands at `base` in the table frame, or wherever a task is best done from.
+        """
+        self.files = files
+        self.objects = load_scene_objects(self.files, object_rows)
         self.table = read_slab(self.files)
         self.station = Station(self.files, arm)
-        self.config, self._services = config, services
+        self.config, self._services, self._base = config, services, base
         self._rngs = dict(zip(self.objects, rng.spawn(len(self.objects)), strict=True))
         placed = {name: [place_mesh(hull, o.pose) for hull in o.hulls] for name, o in self.objects.items()}
         self._pieces = {name: [(piece, aabb(piece.vertices)) for piece in pieces] for name, pieces in placed.items()}
@@ -66,6 +76,8 @@ class WorkCell:
 
     def bases(self, targets: Points) -> list[Pose]:
         """Find base poses that reach all targets of the table frame [m], first those that reach the whole scene."""
+        if self._base is not None:
+            return [self._base]
         everything = np.array([scene_object.body.center for scene_object in self.objects.values()])
         common = find_bases(self.station, np.concatenate([everything, targets]), 1)
         own = find_bases(self.station, targets, MAX_BASES)

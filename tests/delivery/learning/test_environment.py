@@ -178,6 +178,42 @@ def test_looks_change_pictures_and_nothing_else(scene):
     assert np.array_equal(env.reset(seed=1)[0]["front"], plain["front"])
 
 
+def test_displaced_cameras_change_all_pictures_a_little_and_nothing_else(scene):
+    env = TableEnv(scene, "task_000", pictures=("front", "wrist", "front_depth"), picture_size=(60, 80))
+    plain, _ = env.reset(seed=1)
+    seen = [env.reset(seed=s, options={"variation": Variation(cameras=True)})[0] for s in (1, 1, 2)]
+    for name in ("front", "wrist", "front_depth"):
+        assert np.array_equal(seen[0][name], seen[1][name])
+        assert not np.array_equal(seen[0][name], seen[2][name])
+        assert not np.array_equal(seen[0][name], plain[name])
+    for other in seen:
+        both = (plain["front_depth"] > 0) & (other["front_depth"] > 0)
+        assert 0.001 < np.abs(plain["front_depth"] - other["front_depth"])[both].mean() < 0.2
+        assert np.array_equal(plain["objects"], other["objects"])
+    assert np.array_equal(env.reset(seed=1)[0]["wrist"], plain["wrist"])
+
+
+def test_friction_changes_within_its_bounds_for_one_episode(scene):
+    env = TableEnv(scene, "task_000")
+    model, body = env.sim.station.model, env.sim.station.object_bodies[env.sim.goal.x_id]
+    touched = np.concatenate([np.flatnonzero(model.geom_bodyid == body), env.sim.station.finger_geoms])
+    own, factors = model.geom_friction.copy(), []
+    for seed in range(12):
+        env.reset(seed=seed, options={"variation": Variation(friction=2.0)})
+        factor = model.geom_friction / own
+        factors.append(factor[touched[0], 0])
+        assert np.allclose(factor[touched][:, :2], factors[-1])
+        assert np.allclose(factor[touched][:, 2], 1.0)
+        assert np.allclose(np.delete(factor, touched, axis=0), 1.0)
+    assert 0.5 <= min(factors) < 0.8
+    assert 1.25 < max(factors) <= 2.0
+    env.reset(seed=0)
+    assert np.array_equal(model.geom_friction, own)
+    for factor in (0.5, 11.0, float("nan")):
+        with pytest.raises(ConfigError, match="friction"):
+            Variation(friction=factor)
+
+
 def test_pictures_follow_what_happens(scene):
     env = TableEnv(scene, "task_000", render_mode="rgb_array", render_size=(60, 80))
     with pytest.raises(gymnasium.error.ResetNeeded):

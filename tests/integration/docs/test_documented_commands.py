@@ -41,7 +41,7 @@ PYTHON_CANNOT = (
     (r"mujoco_warp|WarpBatch", "mujoco-warp compiles for minutes; tests/delivery/learning has a test for it"),
     (r"from dm_control", "dm_control wants a MuJoCo of its own; tests/delivery/learning has a test for it"),
     (r"import pybullet", "pybullet compiles for minutes; tests/delivery/formats has a test for it"),
-    (r"serve_forever", "serves until it is stopped"),
+    (r"serve_forever|serve_policy", "serves until it is stopped"),
     (r"open_library", "needs textures that somebody photographed"),
     (r"(hf|s3|https?)://", "needs a server"),
     (r"\btargets\b", "a fragment: the reader has the targets"),

@@ -57,7 +57,8 @@ def scene() -> ExportedScene:
 
 
 def cell() -> WorkCell:
-    return WorkCell(scene(), load_arm("panda"), CONFIG.trajectories, np.random.default_rng(0), SERVICES)
+    made, rng = scene(), np.random.default_rng(0)
+    return WorkCell(dict(made.files), made.object_rows, load_arm("panda"), CONFIG.trajectories, rng, SERVICES)
 
 
 def row_of(found: PlannedTask) -> dict:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tableverse_factory.core.errors import ModelError
 from tableverse_factory.core.optional_imports import import_extra
-from tableverse_factory.evaluation.training.picture.checkpoint import WEIGHTS, read_weights
+from tableverse_factory.evaluation.training.checkpoint import WEIGHTS, read_weights
 from tableverse_factory.evaluation.training.picture.network import make_network
 from tableverse_factory.models.local.device import import_torch
 from tableverse_factory.models.picture.net import INPUTS, MAPS, VECTORS, PictureNet

@@ -8,7 +8,7 @@ import numpy as np
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
-from tableverse_factory.evaluation.training.picture.checkpoint import read_weights
+from tableverse_factory.evaluation.training.checkpoint import read_weights
 from tableverse_factory.evaluation.training.picture.network import Convolution
 from tableverse_factory.evaluation.training.picture.samples import Sample
 from tableverse_factory.models.local.device import Tensor, import_torch

@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelError
-from tableverse_factory.evaluation.training.picture.checkpoint import (
-    PictureSettings,
-    TrainPosition,
+from tableverse_factory.evaluation.training.checkpoint import (
     load_checkpoint,
     save_checkpoint,
     write_weights,
@@ -23,6 +21,7 @@ from tableverse_factory.evaluation.training.picture.network import make_network
 from tableverse_factory.evaluation.training.picture.ranks import Ranks, start_ranks
 from tableverse_factory.evaluation.training.picture.ring import ViewRing
 from tableverse_factory.evaluation.training.picture.samples import Sample, make_sample
+from tableverse_factory.evaluation.training.picture.settings import PictureSettings, TrainPosition
 from tableverse_factory.evaluation.training.picture.start import measure_norms, read_start
 from tableverse_factory.evaluation.training.picture.validate import validate_network
 from tableverse_factory.evaluation.training.picture.world import World, make_world
@@ -108,7 +107,9 @@ class _Trainer:
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
         restored = self._network, self._average, self._optimizer
-        position = load_checkpoint(run.folder, *restored, settings, run.device, ranks.rank)
+        position = load_checkpoint(
+            run.folder, *restored, settings, TrainPosition(), run.device, ranks.rank, settings.gpus
+        )
         self._pool = hash_file(run.pool)
         if position.step and position.pool != self._pool:
             raise InputError(f"{run.pool} holds other meshes than those that the checkpoint was trained on")

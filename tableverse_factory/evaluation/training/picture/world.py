@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from tableverse_factory.core.process_pool import parallel_map
-from tableverse_factory.evaluation.training.picture.checkpoint import PictureSettings
 from tableverse_factory.evaluation.training.picture.exposure import Renderer
 from tableverse_factory.evaluation.training.picture.flat_pictures import draw_flat_block
 from tableverse_factory.evaluation.training.picture.materials import TextureBook
 from tableverse_factory.evaluation.training.picture.patterns import BLOCKS, Textures, draw_block
 from tableverse_factory.evaluation.training.picture.pool import MeshPool
 from tableverse_factory.evaluation.training.picture.scenes import SceneMaker
+from tableverse_factory.evaluation.training.picture.settings import PictureSettings
 from tableverse_factory.evaluation.training.picture.tables import MeshTables, make_tables
 
 MESHES_AT_A_TIME = 64

@@ -29,7 +29,7 @@ def pool_file(pool: MeshPool, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def world(pool_file: Path) -> Any:
     """What a training of 96 x 80 pixels reads."""
     pytest.importorskip("torch", reason="the extra `models` is not installed")
-    from tableverse_factory.evaluation.training.picture.checkpoint import PictureSettings
+    from tableverse_factory.evaluation.training.picture.settings import PictureSettings
     from tableverse_factory.evaluation.training.picture.world import make_world
 
     return make_world(pool_file, PictureSettings(1, **SMALL | {"width": 96, "height": 80}), 0)

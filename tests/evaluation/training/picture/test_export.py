@@ -8,8 +8,8 @@ import pytest
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
 onnx = pytest.importorskip("onnx", reason="the extra `models` is not installed")
 from tableverse_factory.core.errors import ModelError  # noqa: E402
+from tableverse_factory.evaluation.training.checkpoint import WEIGHTS, read_weights, write_weights  # noqa: E402
 from tableverse_factory.evaluation.training.picture import export as export_module  # noqa: E402
-from tableverse_factory.evaluation.training.picture.checkpoint import WEIGHTS, read_weights, write_weights  # noqa: E402
 from tableverse_factory.evaluation.training.picture.export import export_network  # noqa: E402
 from tableverse_factory.evaluation.training.picture.network import make_network  # noqa: E402
 from tableverse_factory.models.picture.net import INPUTS, MAPS, VECTORS, load_picture_net  # noqa: E402

@@ -14,10 +14,11 @@ torch = pytest.importorskip("torch", reason="the extra `models` is not installed
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
 
+from tableverse_factory.evaluation.training.checkpoint import CHECKPOINT  # noqa: E402
 from tableverse_factory.evaluation.training.picture import network  # noqa: E402
 from tableverse_factory.evaluation.training.picture import train as train_module  # noqa: E402
-from tableverse_factory.evaluation.training.picture.checkpoint import CHECKPOINT, PictureSettings  # noqa: E402
 from tableverse_factory.evaluation.training.picture.ranks import Ranks, start_ranks  # noqa: E402
+from tableverse_factory.evaluation.training.picture.settings import PictureSettings  # noqa: E402
 from tableverse_factory.evaluation.training.picture.train import TrainRun, train_pictures  # noqa: E402
 
 pytestmark = pytest.mark.heavy

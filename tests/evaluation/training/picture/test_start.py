@@ -9,7 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
 onnx = pytest.importorskip("onnx", reason="the extra `models` is not installed")
 from tableverse_factory.core.errors import InputError  # noqa: E402
-from tableverse_factory.evaluation.training.picture.checkpoint import WEIGHTS  # noqa: E402
+from tableverse_factory.evaluation.training.checkpoint import WEIGHTS  # noqa: E402
 from tableverse_factory.evaluation.training.picture.network import Convolution, make_network  # noqa: E402
 from tableverse_factory.evaluation.training.picture.samples import Sample  # noqa: E402
 from tableverse_factory.evaluation.training.picture.start import measure_norms, read_start  # noqa: E402

@@ -21,14 +21,10 @@ torch = pytest.importorskip("torch", reason="the extra `models` is not installed
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
 
+from tableverse_factory.evaluation.training.checkpoint import CHECKPOINT, WEIGHTS, read_weights  # noqa: E402
 from tableverse_factory.evaluation.training.picture import train as train_module  # noqa: E402
-from tableverse_factory.evaluation.training.picture.checkpoint import (  # noqa: E402
-    CHECKPOINT,
-    WEIGHTS,
-    PictureSettings,
-    read_weights,
-)
 from tableverse_factory.evaluation.training.picture.network import make_network  # noqa: E402
+from tableverse_factory.evaluation.training.picture.settings import PictureSettings  # noqa: E402
 from tableverse_factory.evaluation.training.picture.train import TrainRun, compute_rate, train_pictures  # noqa: E402
 from tableverse_factory.evaluation.training.picture.world import World  # noqa: E402
 
@@ -189,7 +185,7 @@ def test_the_rate_rises_stays_and_falls() -> None:
 
 def test_the_command_trains_exports_and_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {name: SMALL[name] for name in ("width", "height", "packages", "patterns", "flat", "fresh")}
-    where = "tableverse_factory.evaluation.training.picture.checkpoint.PictureSettings"
+    where = "tableverse_factory.evaluation.training.picture.settings.PictureSettings"
     monkeypatch.setattr(where, partial(PictureSettings, **small))
     monkeypatch.setattr(train_module, "VALIDATION_VIEWS", 8)
     options, folder = "--scenes 2 --batch 2 --views 64 --device cpu --jobs 0", tmp_path / "net"

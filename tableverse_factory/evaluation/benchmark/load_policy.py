@@ -1,0 +1,111 @@
+"""Policies by name: baselines, classes of modules and files, and processes behind an HTTP address."""
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from schemas.identity import content_hash
+from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.evaluation.benchmark.http_policy import HttpPolicy
+from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
+
+_ROOM = "tableverse_factory.evaluation.benchmark"
+BASELINES: Mapping[str, str] = {  # imported when they are asked for, as the planner takes a second
+    "planner": f"{_ROOM}.planner:PlannerPolicy",
+    "replay": f"{_ROOM}.replay:ReplayPolicy",
+    "random": f"{_ROOM}.random_policy:RandomPolicy",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyName:
+    """Name of a policy as on the command line, the weights that its class is called with, and its title in tables.
+
+    A name is a baseline (`BASELINES`), `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
+    """
+
+    name: str
+    weights: str | None = None
+    title: str | None = None
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the name, the file of the class and that of the weights, so that other weights are another run."""
+        files = [self.name.rpartition(":")[0], self.weights or ""]
+        return content_hash(self.name.encode(), *(_read_if_file(file) for file in files))
+
+    @property
+    def shown(self) -> str:
+        """Title, else the name without folders."""
+        if self.title is not None:
+            return sanitize_line(self.title, 300)
+        return sanitize_line(self.name.rpartition("/")[2] if not self.name.startswith("http") else self.name, 300)
+
+
+def _read_if_file(path: str) -> bytes:
+    return Path(path).read_bytes() if path and Path(path).is_file() else path.encode()
+
+
+def load_policy(name: PolicyName) -> Policy:
+    """Load a policy; its code runs in this process.
+
+    Raises:
+        ConfigError: for a name that is none of the four kinds, or names no class.
+        InputError: `bad_policy` if it does not load, or is no policy.
+    """
+    if name.name.startswith(("http://", "https://")):
+        if name.weights is not None:
+            raise ConfigError("--weights: a process behind an address loads its own weights; leave them out")
+        return HttpPolicy(name.name)
+    make = _find_class(BASELINES.get(name.name, name.name))
+    try:
+        policy = make() if name.weights is None else make(name.weights)
+    except (ConfigError, InputError):
+        raise
+    except Exception as error:
+        raise _load_error(name.name, error) from error
+    return check_policy(policy, sanitize_line(name.name, 200))
+
+
+def _find_class(name: str) -> Callable[..., Any]:
+    source, colon, wanted = name.rpartition(":")
+    if not colon or not source or not wanted.isidentifier():
+        raise ConfigError(
+            f"policy {sanitize_line(name, 200)!r}: give {', '.join(BASELINES)}, module:Class, file.py:Class or "
+            "http://127.0.0.1:PORT"
+        )
+    try:
+        module = _load_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
+    except (ConfigError, InputError):
+        raise
+    except Exception as error:
+        raise _load_error(name, error) from error
+    found = getattr(module, wanted, None)
+    if not callable(found):
+        raise InputError(f"policy {sanitize_line(name, 200)}: there is no class {wanted}", "bad_policy")
+    return found
+
+
+def _load_file(path: Path) -> ModuleType:
+    """Load a file as a module; its folder is searched for what it imports."""
+    if not path.is_file():
+        raise InputError(f"policy: {path} is no file", "bad_policy")
+    sys.path.insert(0, str(path.absolute().parent))
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"policy: {path} is no file of Python", "bad_policy")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _load_error(name: str, error: Exception) -> InputError:
+    text = sanitize_line(f"{type(error).__name__}: {' '.join(str(error).split())}", 300)
+    return InputError(f"policy {sanitize_line(name, 200)} does not load: {text}", "bad_policy")

@@ -1,0 +1,236 @@
+"""Training of the policy on states from packed demonstrations; it needs numpy and torch alone."""
+
+import copy
+import hashlib
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tableverse_factory.core.errors import InputError, ModelError
+from tableverse_factory.evaluation.training.checkpoint import (
+    load_checkpoint,
+    read_weights,
+    save_checkpoint,
+    write_weights,
+)
+from tableverse_factory.evaluation.training.policy.demonstrations import Demonstrations
+from tableverse_factory.evaluation.training.policy.first_pictures import FirstPictures
+from tableverse_factory.evaluation.training.policy.lessons import Lesson, PictureLesson, StateLesson
+from tableverse_factory.evaluation.training.policy.network import make_network
+from tableverse_factory.evaluation.training.policy.settings import PolicyPosition, PolicySettings
+from tableverse_factory.evaluation.training.policy.tensors import DemonstrationTensors
+from tableverse_factory.evaluation.training.policy.validate import SEED
+from tableverse_factory.models.local.device import Tensor, import_torch
+
+torch = import_torch()
+
+WEIGHT_DECAY = 0.05
+BETAS = (0.9, 0.98)
+WARM_STEPS = 500
+DECAY_FROM = 0.4  # share of the steps after which the rate falls linearly
+MAX_NORM = 1.0
+AVERAGE = 0.999  # of the weights that are kept
+LOG_STEPS = 200
+
+Log = Callable[[str], object]
+
+
+@dataclass(frozen=True, slots=True)
+class TrainRun:
+    """How a training is run; of it, only demonstrations and device change the weights.
+
+    Attributes:
+        folder: Of the checkpoint and of the weights.
+        demonstrations: File of packed ones.
+        device: `cpu` or `cuda`.
+        minutes: After which to stop with a checkpoint.
+        save_minutes: Between checkpoints.
+        log_steps: Between lines of the log.
+        graph: Record the kernels of a step once, on a GPU, and replay them: launching them one by one takes longer than
+            computing. Each start then takes three steps more, unlogged.
+    """
+
+    folder: Path
+    demonstrations: Path
+    device: str = "cuda"
+    minutes: float = math.inf
+    save_minutes: float = 3.0
+    log_steps: int = LOG_STEPS
+    graph: bool = True
+
+
+def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int:
+    """Train on states until all steps are done or the minutes are over; return the last step.
+
+    A checkpoint in the folder is continued.
+    """
+    data = DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device)
+    return _train(data, StateLesson(data), settings, run, log, _hash_files(run.demonstrations))
+
+
+def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path, state: Path, log: Log) -> int:
+    """Train goals on the pictures of the same demonstrations, likewise; `state` are the weights of a policy on states.
+
+    Its motions are taken over: they find their way without objects, as they were trained to.
+    """
+    data, packed = (
+        DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device),
+        FirstPictures.read(pictures),
+    )
+    if len(packed.ends) != len(data.last):
+        raise InputError(f"{pictures} has pictures of {len(packed.ends)} demonstrations, not of {len(data.last)}")
+    teacher = make_network(0)
+    read_weights(state, teacher)
+    shown = torch.tensor(packed.decode(), device=run.device).permute(0, 1, 4, 2, 3).contiguous()
+    words = torch.tensor(packed.words.astype("int64"), device=run.device)
+    lesson = PictureLesson(data, shown, words, teacher.motion.state_dict())
+    return _train(data, lesson, settings, run, log, _hash_files(run.demonstrations, pictures, state))
+
+
+def _train(
+    data: DemonstrationTensors, lesson: Lesson, settings: PolicySettings, run: TrainRun, log: Log, digest: str
+) -> int:
+    try:
+        return _Trainer(data, lesson, settings, run, log, digest).train()
+    except torch.OutOfMemoryError as error:
+        raise InputError("the GPU's memory ran out: fewer goals or chunks per step need less") from error
+
+
+def _hash_files(*paths: Path) -> str:
+    return hashlib.sha256(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in paths)).hexdigest()
+
+
+class _Trainer:
+    """Networks and optimizer of a training."""
+
+    def __init__(
+        self,
+        data: DemonstrationTensors,
+        lesson: Lesson,
+        settings: PolicySettings,
+        run: TrainRun,
+        log: Log,
+        digest: str,
+    ) -> None:
+        self._started, self._settings, self._run, self._log = time.monotonic(), settings, run, log
+        self._data, self._lesson, self._digest = data, lesson, digest
+        run.folder.mkdir(parents=True, exist_ok=True)
+        self._network = lesson.make_network(settings.seed).to(run.device).train()
+        self._average = copy.deepcopy(self._network).eval()
+        self._optimizer = _make_optimizer(self._network, settings, run.device)
+        position = load_checkpoint(
+            run.folder, self._network, self._average, self._optimizer, settings, PolicyPosition(), run.device
+        )
+        if position.step and position.demonstrations != digest:
+            raise InputError(f"{run.demonstrations} holds other demonstrations than the checkpoint was trained on")
+        self._step = position.step
+        self._replay: tuple[Any, dict[str, Tensor]] | None = None
+        counts = [len(data.choices[held_out][0]) for held_out in (False, True)]
+        if not counts[0]:
+            raise InputError(f"{run.demonstrations} holds no demonstrations to train on")
+        self._say(f"{counts[0]} demonstrations, {counts[1]} held out, {settings.steps - self._step} steps are left")
+
+    def _say(self, text: str) -> None:
+        self._log(f"{time.monotonic() - self._started:7.1f} s  {text}")
+
+    def train(self) -> int:
+        """Take the steps that are left, or as many as the minutes allow, but one at least; return the last one."""
+        settings, run, first, saved = self._settings, self._run, self._step, time.monotonic()
+        while self._step < settings.steps:
+            self._step += 1
+            losses = self._take_step(self._step)
+            if self._step % run.log_steps == 0 or self._step == first + 1:
+                self._log_step(losses, self._step - first)
+            if time.monotonic() - self._started > 60 * run.minutes:
+                break
+            if time.monotonic() - saved > 60 * run.save_minutes and self._step < settings.steps:
+                self._save()
+                saved = time.monotonic()
+        if self._step > first:
+            self._save()
+        return self._step
+
+    def _take_step(self, step: int) -> dict[str, Tensor]:
+        torch.manual_seed(self._settings.seed * 100_000_007 + step)
+        for group in self._optimizer.param_groups:
+            group["lr"].fill_(compute_rate(step, self._settings))
+        if self._run.device != "cuda" or not self._run.graph:
+            losses = self._descend()
+        else:
+            if self._replay is None:
+                self._replay = self._record()
+            self._replay[0].replay()
+            losses = self._replay[1]
+        self._average_weights(step)
+        return losses
+
+    def _descend(self) -> dict[str, Tensor]:
+        """Compute losses and take a step down their gradient."""
+        losses = self._lesson.compute_losses(self._network, self._settings)
+        self._optimizer.zero_grad(set_to_none=True)
+        torch.stack([*losses.values()]).sum().backward()
+        for part in (self._network.goal, self._network.motion):
+            torch.nn.utils.clip_grad_norm_(part.parameters(), MAX_NORM)
+        self._optimizer.step()
+        return {name: each.detach() for name, each in losses.items()}
+
+    def _record(self) -> tuple[Any, dict[str, Tensor]]:
+        """Record the kernels of a step; return them, and where they leave the losses."""
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            for _ in range(3):
+                self._descend()
+        torch.cuda.current_stream().wait_stream(aside)
+        graph = torch.cuda.CUDAGraph()
+        self._optimizer.zero_grad(set_to_none=True)
+        with torch.cuda.graph(graph):
+            losses = self._descend()
+        return graph, losses
+
+    def _average_weights(self, step: int) -> None:
+        keep = min(AVERAGE, (step + 1) / (step + 20))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self._average.parameters()), list(self._network.parameters()), 1 - keep)
+
+    def _save(self) -> None:
+        """Save, and measure the held-out demonstrations; weights that are not finite are refused."""
+        if not all(torch.isfinite(each).all() for each in self._average.parameters()):
+            raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
+        position = PolicyPosition(self._step, self._digest)
+        save_checkpoint(self._run.folder, self._network, self._average, self._optimizer, self._settings, [position])
+        write_weights(self._average, self._run.folder)
+        for held_out in (False, True):
+            if len(self._data.choices[held_out][0]):
+                torch.manual_seed(SEED)
+                figures = self._lesson.measure(self._average, held_out)
+                kind = "held out" if held_out else "trained on"
+                self._say(f"step {self._step} {kind}: {' '.join(f'{name} {v:.4g}' for name, v in figures.items())}")
+
+    def _log_step(self, losses: dict[str, Tensor], done: int) -> None:
+        parts = {name: float(each) for name, each in losses.items()}
+        if not all(math.isfinite(each) for each in parts.values()):
+            raise ModelError(f"the loss of step {self._step} is not finite: {parts}; the last checkpoint is kept")
+        rate = done / max(time.monotonic() - self._started, 1e-6)
+        self._say(
+            f"step {self._step}: {' '.join(f'{name} {each:.4f}' for name, each in parts.items())}; {rate:.1f} steps/s"
+        )
+
+
+def compute_rate(step: int, settings: PolicySettings) -> float:
+    """Compute the learning rate: linear warm-up, constant, linear decay to nothing."""
+    warm = min(1.0, step / min(WARM_STEPS, max(1, settings.steps // 10)))
+    left = 1 - (step - 1) / settings.steps
+    return settings.rate * warm * min(1.0, left / (1 - DECAY_FROM))
+
+
+def _make_optimizer(network: Any, settings: PolicySettings, device: str) -> Any:
+    groups = [
+        {"params": [p for p in network.parameters() if p.ndim > 1], "weight_decay": WEIGHT_DECAY},
+        {"params": [p for p in network.parameters() if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+    rate, on_gpu = torch.tensor(settings.rate, device=device), device == "cuda"
+    return torch.optim.AdamW(groups, lr=rate, betas=BETAS, fused=on_gpu, capturable=on_gpu)

@@ -1,0 +1,166 @@
+"""Runs: the same bytes from any number of processes and after a kill; a policy's failures are rows."""
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tableverse_factory import open_dataset
+from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.evaluation.benchmark.benchmark import Benchmark
+from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
+from tableverse_factory.evaluation.benchmark.results import encode_results, read_results
+from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
+from tests.helpers.learnable_dataset import write_learnable_dataset
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.heavy
+
+POLICIES = """
+import os, time
+import numpy as np
+
+class Quick:
+    pictures, picture_size = (), (96, 128)
+
+    def reset(self, start):
+        self.start, self.rng, self.step = start, np.random.default_rng(start.seed), 0
+
+    def act(self, observation):
+        self.step += 1
+        if self.step == 5:
+            raise RuntimeError("five\\nsteps")
+        return self.rng.uniform(-0.1, 0.1, len(self.start.lower))
+
+class Unlucky(Quick):
+    def act(self, observation):
+        print("this is no output")
+        name = self.start.episode_id
+        if name == "test_0001":
+            return np.full(8, np.nan)
+        if name == "test_0000_start":
+            os.kill(os.getpid(), 9)
+        if name == "test_0000_light":
+            time.sleep(600)
+        if name == "test_0000_texture":
+            return [[0.0]]
+        if name == "test_0000_camera":
+            raise SystemExit(3)
+        return super().act(observation)
+
+class Slow(Quick):
+    def act(self, observation):
+        time.sleep(0.05)
+        return super().act(observation)
+
+class Absent(Quick):
+    def __init__(self):
+        raise OSError("no weights")
+"""
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policies") / "policies.py"
+    path.write_text(POLICIES)
+    return path
+
+
+def run(benchmark, dataset, policy, out, **settings):
+    return run_benchmark(benchmark, dataset, policy, out, RunSettings(**settings))[1]
+
+
+def test_a_killed_run_goes_on_and_the_number_of_processes_is_not_seen(benchmark, dataset, policies, tmp_path):
+    alone, killed = tmp_path / "alone.jsonl", tmp_path / "killed.jsonl"
+    name = PolicyName(f"{policies}:Slow")
+    run(benchmark, dataset, name, alone, jobs=1)
+    file = tmp_path / "benchmark.json"
+    file.write_bytes(benchmark.encode())
+    arguments = ["--dataset", dataset.path, "--policy", name.name, "--out", str(killed), "--jobs", "1"]
+    code = "from tableverse_factory.cli.main import main; main()"
+    journal = tmp_path / "killed.jsonl.journal"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, "benchmark", "run", str(file), *arguments],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as process:
+        until = time.monotonic() + 120.0
+        while time.monotonic() < until and (not journal.exists() or journal.read_bytes().count(b"\n") < 3):
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGKILL)
+    assert not killed.exists()
+    done = journal.read_bytes().count(b"\n")
+    assert 3 <= done <= len(benchmark.episodes)
+    with journal.open("ab") as torn:
+        torn.write(b'{"episode_id": "te')
+    run(benchmark, dataset, name, killed, jobs=2)
+    assert killed.read_bytes() == alone.read_bytes()
+    assert not journal.exists()
+
+
+def test_a_choice_is_run_and_a_wider_one_later_adds_to_it(benchmark, dataset, policies, tmp_path):
+    out, name = tmp_path / "some.jsonl", PolicyName(f"{policies}:Quick")
+    rows = run(benchmark, dataset, name, out, splits=("train",))
+    assert [row.episode_id for row in rows] == ["train_0000"]
+    before = out.read_bytes()
+    rows = run(benchmark, dataset, name, out, axes=("none",), jobs=2)
+    assert [row.episode_id for row in rows] == ["train_0000", "test_0000", "test_0001"]
+    assert out.read_bytes().startswith(before)
+    with pytest.raises(InputError, match="has no episodes of these splits"):
+        run(benchmark, dataset, name, out, splits=("validation",))
+
+
+def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies, tmp_path, capfd):
+    rows = run(benchmark, dataset, PolicyName(f"{policies}:Unlucky"), tmp_path / "u.jsonl", jobs=2, episode_s=15.0)
+    assert [row.episode_id for row in rows] == [episode.episode_id for episode in benchmark.episodes]
+    found = {row.episode_id: (row.reason, row.detail) for row in rows}
+    assert found["test_0000"] == ("policy_error", "RuntimeError: five steps")
+    assert found["test_0001"][0] == "bad_action"
+    assert "give 8 finite numbers" in found["test_0001"][1]
+    assert found["test_0000_texture"][0] == "bad_action"
+    assert found["test_0000_start"] == ("policy_crash", "its process was killed by SIGKILL")
+    assert found["test_0000_camera"] == ("policy_crash", "its process ended with 3")
+    assert found["test_0000_light"] == ("policy_timeout", "took longer than 15 s")
+    assert capfd.readouterr().out == ""
+
+
+def test_a_policy_that_does_not_load_ends_the_run_with_one_line(benchmark, dataset, policies, tmp_path):
+    out = tmp_path / "absent.jsonl"
+    with pytest.raises(InputError, match="Absent does not load: OSError: no weights") as caught:
+        run(benchmark, dataset, PolicyName(f"{policies}:Absent"), out, jobs=2)
+    assert caught.value.reason == "bad_policy"
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_scenes_are_refused_before_anything_is_played(benchmark, tmp_path):
+    other = write_learnable_dataset(tmp_path / "other", scenes=3, moved=0)
+    path = next((other / "mjcf").glob("*0.tar"))
+    path.write_bytes(path.read_bytes().replace(b'friction="0.8 0.01 0.004"', b'friction="0.9 0.01 0.004"'))
+    with pytest.raises(InputError, match=r"scene s-0 is not the one of the benchmark .* build that again") as caught:
+        run(benchmark, open_dataset(other), PolicyName("random"), tmp_path / "r.jsonl")
+    assert caught.value.reason == "other_scenes"
+    fewer = write_learnable_dataset(tmp_path / "fewer", scenes=2, moved=0)
+    with pytest.raises(InputError, match=r"lacks 1 of 3 scenes of the benchmark, e\.g\. s-2"):
+        run(benchmark, open_dataset(fewer), PolicyName("random"), tmp_path / "r.jsonl")
+
+
+def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, dataset, policies, tmp_path):
+    out = tmp_path / "r.jsonl"
+    run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+    with pytest.raises(InputError, match=r"another run \(policy, policy_digest differ\)"):
+        run(benchmark, dataset, PolicyName("random"), out, splits=("train",))
+    header, rows = read_results(out)
+    other = Benchmark.model_validate(benchmark.model_dump() | {"seed": 5})
+    out.write_bytes(encode_results(header.model_copy(update={"benchmark": other.digest}), rows.values()))
+    with pytest.raises(InputError, match=r"another run \(benchmark differ\)"):
+        run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+    with (tmp_path / "r.jsonl.journal").open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(BuildError, match="another process writes these results"):
+            run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
