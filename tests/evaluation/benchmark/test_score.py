@@ -5,6 +5,7 @@ import json
 import pytest
 
 from schemas.curation import Relation
+from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.benchmark.leaderboard import render_leaderboard
 from tableverse_factory.evaluation.benchmark.results import (
@@ -111,3 +112,18 @@ def test_the_page_escapes_names_and_tells_equal_ones_apart(tmp_path):
     assert "&lt;img src=x onerror=&#34;alert(1)&#34;&gt;&amp; aaaaaaaa" in page
     assert page.index("bbbbbbbb") < page.index("aaaaaaaa"), "the better one first"
     assert page == render_leaderboard(score_results([one, two])).decode()
+
+
+def test_the_command_prints_rates_and_writes_the_page(tmp_path, capsys):
+    rows = [row(k, k < 3) for k in range(4)]
+    files = [str(write(tmp_path / "a.jsonl", rows)), str(write(tmp_path / "b.jsonl", rows[3:], policy="random"))]
+    page = tmp_path / "leaderboard.html"
+    app(["benchmark", "score", *files, "--page", str(page)], standalone_mode=False)
+    printed = capsys.readouterr().out
+    assert "75.0 (30–95) of 4" in printed
+    assert "planner: 1 disturbed" in printed
+    assert "75.0" in page.read_text()
+    app(["benchmark", "score", *files, "--json"], standalone_mode=False)
+    told = json.loads(capsys.readouterr().out)
+    assert told["rows"][0]["rates"][0]["successes"] == 3
+    assert told["reasons"] == [{"disturbed": 1}, {"disturbed": 1}]

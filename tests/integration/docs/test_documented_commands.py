@@ -29,6 +29,7 @@ CANNOT = (
     (r".*judge=gemini", "needs a key for a model"),
     (r".*--max-usd", "needs a model that is paid"),
     (r"tableverse (bench|train) ", "takes minutes"),
+    (r"tableverse benchmark .*(--weights (net|pictures)/|state\.jsonl)", "needs a policy that was trained"),
     (r".*--config recipes/", "needs weights; tests/integration/builds has small ones"),
     (r"tableverse estimate ", "needs fifty scenes that were built"),
     (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluation has some"),
