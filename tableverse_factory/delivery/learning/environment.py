@@ -157,6 +157,11 @@ class TableEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ignor
             return None
         return self._take("render", ("front",), self._render_size)["front"]
 
+    def take_pictures(self, pictures: Sequence[str], size: tuple[int, int]) -> dict[str, np.ndarray]:
+        """Take pictures of the present state, of height and width `size`, without having them in observations."""
+        names, size = check_pictures(pictures), _check_size("size", size)
+        return self._take(f"{names} {size}", names, size)
+
     def _ends(self, state: SimState) -> tuple[bool, bool]:
         """Return whether the episode is terminated, or else truncated."""
         ended = state.success or bool(state.failure)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from tableverse_factory.dataset.dataset import Dataset, Scene
 from tableverse_factory.delivery.learning.environment import FPS, TableEnv
 from tableverse_factory.evaluation.benchmark.added_objects import add_objects
 from tableverse_factory.evaluation.benchmark.benchmark import Benchmark, Episode, digest_scene
+from tableverse_factory.evaluation.benchmark.observation import LazyObservation
 from tableverse_factory.evaluation.benchmark.policy import (
     POINTS_PER_OBJECT,
     EpisodeStart,
@@ -47,8 +49,8 @@ def check_scene(benchmark: Benchmark, scene: Scene) -> Scene:
     return scene
 
 
-def open_episode(benchmark: Benchmark, episode: Episode, dataset: Dataset, policy: Policy) -> TableEnv:
-    """Open the environment of an episode, with the pictures that the policy asks for."""
+def open_episode(benchmark: Benchmark, episode: Episode, dataset: Dataset) -> TableEnv:
+    """Open the environment of an episode, without pictures."""
     scene = check_scene(benchmark, dataset.scene(episode.scene_id))
     added = [(check_scene(benchmark, dataset.scene(t.scene_id)), t) for t in episode.perturbation.added]
     return TableEnv(
@@ -59,8 +61,6 @@ def open_episode(benchmark: Benchmark, episode: Episode, dataset: Dataset, polic
         max_steps=episode.limit_steps,
         max_disturbed_m=benchmark.max_disturbed_m,
         variation=episode.variation,
-        pictures=policy.pictures,
-        picture_size=policy.picture_size,
     )
 
 
@@ -88,7 +88,7 @@ def make_start(episode: Episode, env: TableEnv, *, privileged: bool) -> EpisodeS
 
 def play_episode(benchmark: Benchmark, episode: Episode, dataset: Dataset, policy: Policy) -> EpisodeResult:
     """Play an episode to its end; an error of the policy ends it, with its reason in the result."""
-    env = open_episode(benchmark, episode, dataset, policy)
+    env = open_episode(benchmark, episode, dataset)
     observation, info = env.reset(seed=episode.seed)
     reason, detail, steps = OUT_OF_TIME, "", 0
     try:
@@ -96,13 +96,19 @@ def play_episode(benchmark: Benchmark, episode: Episode, dataset: Dataset, polic
         _ask(policy.reset, start)
         done = False
         while not done:
-            action = check_action(_ask(policy.act, observation), len(start.lower))
+            seen = LazyObservation(observation, policy.pictures, partial(_take, env, policy))
+            action = check_action(_ask(policy.act, seen), len(start.lower))
+            seen.expire()
             observation, _, ended, truncated, info = env.step(action)
             steps, done = steps + 1, ended or truncated
         reason = "" if info["success"] else info["failure"] or OUT_OF_TIME
     except PolicyError as error:
         reason, detail = error.reason, str(error)
     return make_result(episode, reason, detail, steps, info)
+
+
+def _take(env: TableEnv, policy: Policy) -> dict[str, np.ndarray]:
+    return env.take_pictures(policy.pictures, policy.picture_size)
 
 
 def make_result(

@@ -76,7 +76,10 @@ class Policy(Protocol):
         """Begin an episode and forget the one before."""
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Choose the next action from an observation of `TableEnv`. Shape (j + 1,), each from −1 to 1."""
+        """Choose the next action from an observation of `TableEnv`. Shape (j + 1,), each from −1 to 1.
+
+        Pictures are drawn when they are looked at, within this call alone.
+        """
 
 
 class PolicyError(Exception):
