@@ -65,7 +65,10 @@ def run(
     dataset: Annotated[str, typer.Option("--dataset", metavar="OUT", help="The dataset that it was made of.")],
     policy: Annotated[
         str,
-        typer.Option(metavar="POLICY", help="planner, replay, random, module:Class, file.py:Class, or an address."),
+        typer.Option(
+            metavar="POLICY",
+            help="planner, replay, random, state, picture, module:Class, file.py:Class, or an address.",
+        ),
     ],
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE", callback=require_local_path, help="The results, lines of JSON.")

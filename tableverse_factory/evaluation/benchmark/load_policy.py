@@ -1,4 +1,4 @@
-"""Policies by name: baselines, classes of modules and files, and processes behind an HTTP address."""
+"""Policies by name: ours, classes of modules and files, and processes behind an HTTP address."""
 
 import importlib
 import importlib.util
@@ -16,10 +16,13 @@ from tableverse_factory.evaluation.benchmark.http_policy import HttpPolicy
 from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
 
 _ROOM = "tableverse_factory.evaluation.benchmark"
-BASELINES: Mapping[str, str] = {  # imported when they are asked for, as the planner takes a second
+_TRAINED = "tableverse_factory.evaluation.training.policy"
+SHORT_NAMES: Mapping[str, str] = {  # imported when they are asked for, as the planner takes a second
     "planner": f"{_ROOM}.planner:PlannerPolicy",
     "replay": f"{_ROOM}.replay:ReplayPolicy",
     "random": f"{_ROOM}.random_policy:RandomPolicy",
+    "state": f"{_TRAINED}.state_policy:StatePolicy",
+    "picture": f"{_TRAINED}.picture_policy:PicturePolicy",
 }
 
 
@@ -27,7 +30,7 @@ BASELINES: Mapping[str, str] = {  # imported when they are asked for, as the pla
 class PolicyName:
     """Name of a policy as on the command line, the weights that its class is called with, and its title in tables.
 
-    A name is a baseline (`BASELINES`), `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
+    A name is one of `SHORT_NAMES`, `module:Class`, `file.py:Class`, or the address of a process as `http://127.0.0.1:8000`.
     """
 
     name: str
@@ -63,7 +66,7 @@ def load_policy(name: PolicyName) -> Policy:
         if name.weights is not None:
             raise ConfigError("--weights: a process behind an address loads its own weights; leave them out")
         return HttpPolicy(name.name)
-    make = _find_class(BASELINES.get(name.name, name.name))
+    make = _find_class(SHORT_NAMES.get(name.name, name.name))
     try:
         policy = make() if name.weights is None else make(name.weights)
     except (ConfigError, InputError):
@@ -77,7 +80,7 @@ def _find_class(name: str) -> Callable[..., Any]:
     source, colon, wanted = name.rpartition(":")
     if not colon or not source or not wanted.isidentifier():
         raise ConfigError(
-            f"policy {sanitize_line(name, 200)!r}: give {', '.join(BASELINES)}, module:Class, file.py:Class or "
+            f"policy {sanitize_line(name, 200)!r}: give {', '.join(SHORT_NAMES)}, module:Class, file.py:Class or "
             "http://127.0.0.1:PORT"
         )
     try:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tableverse_factory.core.errors import ConfigError, InputError
-from tableverse_factory.evaluation.benchmark.load_policy import BASELINES, PolicyName, load_policy
+from tableverse_factory.evaluation.benchmark.load_policy import PolicyName, load_policy
 from tableverse_factory.evaluation.benchmark.policy import PolicyError, check_action, sample_points
 from tests.helpers.simple_scenes import box
 
@@ -40,9 +40,14 @@ def file(tmp_path):
 def test_a_class_of_a_file_gets_its_weights(file):
     assert load_policy(PolicyName(f"{file}:Good", "weights.pt")).weights == "weights.pt"
     assert load_policy(PolicyName(f"{file}:Good")).weights is None
-    assert set(BASELINES) == {"planner", "replay", "random"}
     module = "tableverse_factory.evaluation.benchmark.random_policy:RandomPolicy"
     assert load_policy(PolicyName(module)).pictures == ()
+
+
+@pytest.mark.parametrize("name", ["replay", "state", "picture"])
+def test_policies_of_ours_say_that_they_need_weights(name):
+    with pytest.raises(ConfigError, match="as --weights"):
+        load_policy(PolicyName(name))
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,16 @@
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from schemas.geometry import Pose
 from schemas.trajectories import JointVector
-from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.evaluation.benchmark.policy import EpisodeStart
+from tableverse_factory.evaluation.training.checkpoint import read_weights
 from tableverse_factory.evaluation.training.policy.chain import load_chain
 from tableverse_factory.evaluation.training.policy.demonstrations import STEP_S
 from tableverse_factory.evaluation.training.policy.motions import (
@@ -49,12 +51,17 @@ Observation = Mapping[str, np.ndarray]
 
 
 class ChunkPolicy(ABC):
-    """Policy that moves in chunks; `network` has the parts `goal` and `motion`."""
+    """Policy that moves in chunks; `network` has the parts `goal` and `motion`, and its weights are in a file."""
 
     pictures: tuple[str, ...] = ()
     picture_size = (96, 128)
 
-    def __init__(self, network: Any) -> None:
+    def __init__(self, network: Any, weights: str | Path | None) -> None:
+        if weights is None:
+            raise ConfigError(
+                "a trained policy needs its weights: give what `tableverse train policy` wrote as --weights"
+            )
+        read_weights(Path(weights), network)
         self._network = network.eval()
 
     def reset(self, start: EpisodeStart) -> None:

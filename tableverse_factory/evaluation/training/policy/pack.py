@@ -10,9 +10,9 @@ from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.dataset.dataset import Dataset, Scene
-from tableverse_factory.dataset.splits import get_split
 from tableverse_factory.delivery.learning.item_parts import PARTS
 from tableverse_factory.evaluation.benchmark.policy import sample_points
+from tableverse_factory.evaluation.benchmark.splits import list_split_tasks
 from tableverse_factory.evaluation.training.policy.chain import load_chain
 from tableverse_factory.evaluation.training.policy.demonstrations import (
     OPENING_M,
@@ -57,21 +57,19 @@ def pack_demonstrations(
 
 
 def list_motions(dataset: Dataset, splits: Sequence[str], robot: str) -> dict[str, tuple[list[Row], str]]:
-    """List the successful motions of an arm, and the split, of each scene of these splits that has any."""
-    split_of = {row["scene_id"]: get_split(row) for row in _list_scenes(dataset)}
+    """List the successful motions of an arm, and the split, of each scene of these splits that has any.
+
+    Tasks of nouns that the benchmark holds out are left out.
+    """
+    tasks = list_split_tasks(dataset, robot)
     found = dataset.trajectories.to_table(filter=pc.field("success") & (pc.field("robot") == robot)).to_pylist()
     motions: dict[str, tuple[list[Row], str]] = {}
     for row in sorted(found, key=lambda row: (row["scene_id"], row["task_id"])):
-        if (split := split_of[row["scene_id"]]) in splits:
+        if (split := tasks.get((row["scene_id"], row["task_id"]))) is not None and split in splits:
             motions.setdefault(row["scene_id"], ([], split))[0].append(row)
     if not motions:
         raise InputError(f"{dataset.path}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
     return motions
-
-
-def _list_scenes(dataset: Dataset) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = dataset.scenes.to_table(columns=["scene_id", "split"]).to_pylist()
-    return rows
 
 
 class _Packer:

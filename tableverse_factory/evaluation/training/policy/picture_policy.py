@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from tableverse_factory.evaluation.training.checkpoint import read_weights
 from tableverse_factory.evaluation.training.policy.chunk_policy import ChunkPolicy, Observation
 from tableverse_factory.evaluation.training.policy.demonstrations import ROWS
 from tableverse_factory.evaluation.training.policy.first_pictures import CAMERAS, SIZE, number_words
@@ -25,10 +24,8 @@ class PicturePolicy(ChunkPolicy):
     pictures = CAMERAS
     picture_size = SIZE
 
-    def __init__(self, weights: str | Path) -> None:
-        network = make_picture_network(0)
-        read_weights(Path(weights), network)
-        super().__init__(network)
+    def __init__(self, weights: str | Path | None = None) -> None:
+        super().__init__(make_picture_network(0), weights)
 
     def plan(self, observation: Observation) -> None:
         """Draw a grasp and a release from the pictures."""

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 
 from schemas.trajectories import Grasps
-from tableverse_factory.evaluation.training.checkpoint import read_weights
 from tableverse_factory.evaluation.training.policy.chunk_policy import ChunkPolicy, Observation, to_tensor
 from tableverse_factory.evaluation.training.policy.demonstrations import ROWS
 from tableverse_factory.evaluation.training.policy.goals import (
@@ -40,10 +39,8 @@ LEFT_BEHIND_M = 0.01  # rise of X below which it was not lifted
 class StatePolicy(ChunkPolicy):
     """Policy on states; `weights` is the file that training writes."""
 
-    def __init__(self, weights: str | Path) -> None:
-        network = make_network(0)
-        read_weights(Path(weights), network)
-        super().__init__(network)
+    def __init__(self, weights: str | Path | None = None) -> None:
+        super().__init__(make_network(0), weights)
 
     def plan(self, observation: Observation) -> None:
         """Draw a grasp and a release for the scene as it stands."""
