@@ -67,7 +67,7 @@ def test_what_is_no_policy_is_said(file, name, problem):
 
 @pytest.mark.parametrize("name", ["", "best", "a:b:", "module:not a name", ":Class"])
 def test_other_names_are_refused_with_those_that_there_are(name):
-    with pytest.raises(ConfigError, match="give planner, replay, random, module:Class"):
+    with pytest.raises(ConfigError, match="give planner, replay, random, state, picture, module:Class"):
         load_policy(PolicyName(name))
 
 
