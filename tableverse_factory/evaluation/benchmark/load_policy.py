@@ -25,6 +25,9 @@ SHORT_NAMES: Mapping[str, str] = {  # imported when they are asked for, as the p
     "picture": f"{_TRAINED}.picture_policy:PicturePolicy",
 }
 
+_SHIPPED = {"state": str(Path(__file__).parents[1] / "training" / "policy" / "state.safetensors")}
+"""Weights of the package, which a policy takes where it is given none."""
+
 
 @dataclass(frozen=True, slots=True)
 class PolicyName:
@@ -40,7 +43,7 @@ class PolicyName:
     @property
     def digest(self) -> str:
         """SHA-256 of the name, the file of the class and that of the weights, so that other weights are another run."""
-        files = [self.name.rpartition(":")[0], self.weights or ""]
+        files = [self.name.rpartition(":")[0], self.weights or _SHIPPED.get(self.name, "")]
         return content_hash(self.name.encode(), *(_read_if_file(file) for file in files))
 
     @property

@@ -1,6 +1,5 @@
 """The net of bare pictures: an ONNX file in this package, or one that a user trained, run on one CPU thread."""
 
-import hashlib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -11,6 +10,7 @@ from jaxtyping import Float32
 
 from tableverse_factory.core.errors import ModelError, WeightsError
 from tableverse_factory.models.local.onnx_session import open_onnx_session, shorten_onnx_error
+from tableverse_factory.models.local.shipped_weights import read_shipped
 
 SHIPPED = Path(__file__).with_name("picture.onnx")
 DIGEST = SHIPPED.with_suffix(".sha256")
@@ -95,24 +95,10 @@ def check_picture_net(weights: str, key: str) -> None:
 
 def _load(weights: str) -> PictureNet:
     if not weights:
-        return PictureNet(SHIPPED, _read_shipped(SHIPPED, DIGEST))
+        return PictureNet(SHIPPED, read_shipped(SHIPPED, DIGEST))
     path = Path(weights)
     if not path.is_file():
         raise WeightsError(f"{weights!r} is no file here: give the .onnx file of a net")
     if path.stat().st_size > MAX_BYTES:
         raise WeightsError(f"{weights!r} has {path.stat().st_size} bytes, and a net at most {MAX_BYTES}")
     return PictureNet(path, path.read_bytes())
-
-
-def _read_shipped(path: Path, digest: Path) -> bytes:
-    """Read a file whose SHA-256 stands in `digest`."""
-    try:
-        data, wanted = path.read_bytes(), digest.read_text().strip()
-    except OSError as error:
-        raise WeightsError(f"the net of bare pictures is missing: {error}; install the package again") from error
-    found = hashlib.sha256(data).hexdigest()
-    if found != wanted:
-        raise WeightsError(
-            f"{path} is damaged: its SHA-256 begins with {found[:12]}, not {wanted[:12]}; install the package again"
-        )
-    return data

@@ -44,7 +44,7 @@ def test_a_class_of_a_file_gets_its_weights(file):
     assert load_policy(PolicyName(module)).pictures == ()
 
 
-@pytest.mark.parametrize("name", ["replay", "state", "picture"])
+@pytest.mark.parametrize("name", ["replay", "picture"])
 def test_policies_of_ours_say_that_they_need_weights(name):
     with pytest.raises(ConfigError, match="as --weights"):
         load_policy(PolicyName(name))

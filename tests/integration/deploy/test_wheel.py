@@ -29,7 +29,20 @@ except Exception as error:
     print(error)
 """
 """Asks for a dataset's environment by its name alone; this dataset has no motions."""
-SUFFIXES = (".py", ".typed", ".html", ".css", ".js", ".svg", ".json", ".yaml", ".onnx", ".sha256", ".cu")
+SUFFIXES = (
+    ".py",
+    ".typed",
+    ".html",
+    ".css",
+    ".js",
+    ".svg",
+    ".json",
+    ".yaml",
+    ".onnx",
+    ".safetensors",
+    ".sha256",
+    ".cu",
+)
 ELSEWHERE = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
 
 
@@ -90,10 +103,12 @@ def test_it_holds_all_of_the_packages_and_nothing_else(names):
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
-def test_it_holds_the_net_of_bare_pictures_undamaged(wheel):
+@pytest.mark.parametrize("weights", ["models/picture/picture.onnx", "evaluation/training/policy/state.safetensors"])
+def test_it_holds_weights_undamaged(wheel, weights):
+    path = f"tableverse_factory/{weights}"
     with zipfile.ZipFile(wheel) as archive:
-        net, digest = (archive.read(f"tableverse_factory/models/picture/picture.{end}") for end in ("onnx", "sha256"))
-    assert hashlib.sha256(net).hexdigest() == digest.decode().strip()
+        data, digest = archive.read(path), archive.read(f"{path.rpartition('.')[0]}.sha256")
+    assert hashlib.sha256(data).hexdigest() == digest.decode().strip()
 
 
 def test_it_says_what_it_is(wheel):

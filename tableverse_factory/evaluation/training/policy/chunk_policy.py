@@ -10,7 +10,7 @@ import numpy as np
 
 from schemas.geometry import Pose
 from schemas.trajectories import JointVector
-from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.benchmark.policy import EpisodeStart
 from tableverse_factory.evaluation.training.checkpoint import read_weights
 from tableverse_factory.evaluation.training.policy.chain import load_chain
@@ -56,11 +56,7 @@ class ChunkPolicy(ABC):
     pictures: tuple[str, ...] = ()
     picture_size = (96, 128)
 
-    def __init__(self, network: Any, weights: str | Path | None) -> None:
-        if weights is None:
-            raise ConfigError(
-                "a trained policy needs its weights: give what `tableverse train policy` wrote as --weights"
-            )
+    def __init__(self, network: Any, weights: str | Path) -> None:
         read_weights(Path(weights), network)
         self._network = network.eval()
 

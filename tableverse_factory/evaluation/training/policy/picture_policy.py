@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.evaluation.training.policy.chunk_policy import ChunkPolicy, Observation
 from tableverse_factory.evaluation.training.policy.demonstrations import ROWS
 from tableverse_factory.evaluation.training.policy.first_pictures import CAMERAS, SIZE, number_words
@@ -25,6 +26,10 @@ class PicturePolicy(ChunkPolicy):
     picture_size = SIZE
 
     def __init__(self, weights: str | Path | None = None) -> None:
+        if weights is None:
+            raise ConfigError(
+                "the policy picture needs weights: give what `tableverse train policy` wrote as --weights"
+            )
         super().__init__(make_picture_network(0), weights)
 
     def plan(self, observation: Observation) -> None:

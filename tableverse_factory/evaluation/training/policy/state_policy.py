@@ -24,12 +24,15 @@ from tableverse_factory.evaluation.training.policy.network import make_network
 from tableverse_factory.evaluation.training.policy.rotations import apply, matrix_from_quaternion
 from tableverse_factory.evaluation.training.policy.tensors import describe_relations
 from tableverse_factory.models.local.device import Tensor, import_torch
+from tableverse_factory.models.local.shipped_weights import read_shipped
 from tableverse_factory.robotics.execution.goal import RESTING_RELATIONS
 from tableverse_factory.robotics.grasps.clearance import find_clear_grasps
 from tableverse_factory.robotics.robots.gripper_clearance import FINGER_CLEARANCE_M, LIFT_M, STANDOFF_M
 from tableverse_factory.robotics.robots.registry import load_arm
 
 torch = import_torch()
+
+SHIPPED = Path(__file__).with_name("state.safetensors")
 
 PLACED_POINTS = 96  # of X, that are kept away from others
 ROOM_M = 0.008  # between points of X and of others
@@ -40,7 +43,10 @@ class StatePolicy(ChunkPolicy):
     """Policy on states; `weights` is the file that training writes."""
 
     def __init__(self, weights: str | Path | None = None) -> None:
-        super().__init__(make_network(0), weights)
+        """Load weights from a file, or those of the package."""
+        if weights is None:
+            read_shipped(SHIPPED, SHIPPED.with_suffix(".sha256"))
+        super().__init__(make_network(0), weights or SHIPPED)
 
     def plan(self, observation: Observation) -> None:
         """Draw a grasp and a release for the scene as it stands."""
