@@ -1,15 +1,17 @@
-"""Rest of scenes in MuJoCo Warp, measured as the certificate measures it in MuJoCo."""
+"""Rest of scenes in MuJoCo and in MuJoCo Warp, measured as the certificate measures it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from schemas.geometry import Pose
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.learning.vector_sim import compile_scene
 from tableverse_factory.delivery.learning.warp import WarpBatch
 from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_angle, transform_points
-from tableverse_factory.physics.simulate.at_rest import NUDGE_INTERVAL_S, NUDGES
+from tableverse_factory.physics.simulate.at_rest import NUDGE_INTERVAL_S, NUDGES, make_quiet_data, measure_drift
 from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD, FALL_M
 
 
@@ -17,7 +19,8 @@ from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT
 class EngineDrift:
     """Largest motion of a scene's objects in an engine, and its contacts before the first step.
 
-    `overflowed` says that the engine lacked room for contacts or constraints, so that the rest is meaningless.
+    `overflowed` says that the engine lacked room for contacts or constraints or became unstable, so that the rest is
+    meaningless.
     """
 
     scene_id: str
@@ -33,6 +36,17 @@ class EngineDrift:
         """Whether nothing moved beyond the certificate's limits, or fell."""
         near = self.drift_m <= DRIFT_LIMIT_M and self.drift_rad <= DRIFT_LIMIT_RAD and self.sunk_m <= FALL_M
         return near and not self.overflowed
+
+
+def measure_mujoco_drift(scene: Scene, duration_s: float) -> EngineDrift:
+    """Step a scene in MuJoCo for `duration_s`, with the certificate's nudges, and measure it."""
+    model = compile_scene(scene, visuals=False)
+    data = make_quiet_data(model)
+    mujoco.mj_forward(model, data)
+    contacts, depth_m = int(data.ncon), float((-data.contact.dist).max(initial=0.0))
+    drift = measure_drift(model, duration_s)
+    worst = (float(values.max(initial=0.0)) for values in (drift.distance_m, drift.angle_rad, drift.sunk_m))
+    return EngineDrift(scene.scene_id, *worst, contacts, depth_m, overflowed=bool(drift.warnings))
 
 
 def measure_warp_drift(
