@@ -19,12 +19,12 @@ from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, make_quiet_data
 
 MAX_CONTACTS = 2000
-MAX_VERTICES = 16  # of a merged piece; the time of a pair grows with their product
+MAX_VERTICES = 16  # of a merged piece; the time to compile and to step grows with their product
 CONTACTS_PER_PAIR = 4
 DEPTH_M = 0.0005  # merged pieces of two things may overlap by this at most
 
 
-def load_mjx_spec(scene: Scene, max_contacts: int = MAX_CONTACTS) -> mujoco.MjSpec:
+def load_mjx_spec(scene: Scene, max_contacts: int = MAX_CONTACTS, max_vertices: int = MAX_VERTICES) -> mujoco.MjSpec:
     """Load a scene with few colliders: compile it, and give the model to `mjx.put_model`.
 
     A thing begins with one hull. Where two things overlap then, the one whose hull adds more gets twice the pieces,
@@ -33,6 +33,7 @@ def load_mjx_spec(scene: Scene, max_contacts: int = MAX_CONTACTS) -> mujoco.MjSp
     Args:
         scene: Of a dataset, without an arm.
         max_contacts: Most contacts that MJX may reserve; the time to compile and to step grows with them.
+        max_vertices: Most corners of a hull: with few, round things lose their rims and roll.
 
     Raises:
         InputError: `too_many_contacts` where things only fit together in their full shapes, as in a full bowl.
@@ -45,7 +46,7 @@ def load_mjx_spec(scene: Scene, max_contacts: int = MAX_CONTACTS) -> mujoco.MjSp
     merged = {name: merge_clusters(its, 1, 0.0) for name, its in pieces.items()}
     while True:
         _check_contacts(scene.scene_id, [len(its) for its in merged.values()], max_contacts)
-        candidate = _replace_colliders(spec, merged)
+        candidate = _replace_colliders(spec, merged, max_vertices)
         crowded = _find_crowded(candidate.compile(), pieces, merged)
         if not crowded:
             return candidate
@@ -80,7 +81,9 @@ def _read_points(model: mujoco.MjModel, geom: int) -> Points:
     return points @ rotation_matrix(model.geom_quat[geom]).T + model.geom_pos[geom]
 
 
-def _replace_colliders(spec: mujoco.MjSpec, merged: Mapping[str, Sequence[PieceCluster]]) -> mujoco.MjSpec:
+def _replace_colliders(
+    spec: mujoco.MjSpec, merged: Mapping[str, Sequence[PieceCluster]], max_vertices: int
+) -> mujoco.MjSpec:
     """Copy the specification with merged pieces in place of each body's own, with contact parameters of those."""
     copy = spec.copy()
     for name, clusters in merged.items():
@@ -88,7 +91,7 @@ def _replace_colliders(spec: mujoco.MjSpec, merged: Mapping[str, Sequence[PieceC
         for geom in geoms[len(clusters) :]:
             copy.delete(geom)
         for number, (geom, cluster) in enumerate(zip(geoms, clusters, strict=False)):
-            mesh = copy.add_mesh(name=f"{name}_merged_{number:02d}", maxhullvert=MAX_VERTICES)
+            mesh = copy.add_mesh(name=f"{name}_merged_{number:02d}", maxhullvert=max_vertices)
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
             mesh.uservert = cluster.points.ravel()
             geom.meshname = mesh.name
