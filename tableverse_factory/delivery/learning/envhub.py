@@ -22,7 +22,7 @@ class LeRobotObservation(gymnasium.ObservationWrapper[dict[str, Any], np.ndarray
     def __init__(self, env: gymnasium.Env[dict[str, np.ndarray], np.ndarray]) -> None:
         """Wrap an environment of `make_environment`."""
         super().__init__(env)
-        spaces = dict(env.observation_space.spaces)  # type: ignore[attr-defined]
+        spaces = dict(env.observation_space.spaces)
         objects = spaces.pop("objects")
         own = {"agent_pos": spaces.pop("state")}
         own["environment_state"] = Box(objects.low.ravel(), objects.high.ravel(), dtype=np.float32)
