@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from tableverse_factory.delivery.learning.environment import TableEnv
     from tableverse_factory.delivery.learning.grid import SceneGrid, build_scene_grid
     from tableverse_factory.delivery.learning.loader import SceneDataset
+    from tableverse_factory.delivery.learning.mjx import load_mjx_spec
+    from tableverse_factory.delivery.learning.newton import add_to_newton
+    from tableverse_factory.delivery.learning.sapien import add_to_sapien
     from tableverse_factory.delivery.learning.stream import SceneStream
     from tableverse_factory.delivery.learning.variation import Variation
     from tableverse_factory.delivery.learning.vector_sim import VectorSim
@@ -31,10 +34,13 @@ __all__ = [
     "VectorSim",
     "WarpBatch",
     "__version__",
+    "add_to_newton",
+    "add_to_sapien",
     "attach_scene",
     "attach_to_dm_control",
     "build_scene_grid",
     "find_unfit_settings",
+    "load_mjx_spec",
     "open_dataset",
 ]
 
@@ -49,6 +55,9 @@ _MODULES = {
     "Variation": "delivery.learning.variation",
     "VectorSim": "delivery.learning.vector_sim",
     "WarpBatch": "delivery.learning.warp",
+    "add_to_newton": "delivery.learning.newton",
+    "add_to_sapien": "delivery.learning.sapien",
+    "load_mjx_spec": "delivery.learning.mjx",
     "attach_scene": "delivery.learning.attach",
     "attach_to_dm_control": "delivery.learning.dm_control",
     "build_scene_grid": "delivery.learning.grid",

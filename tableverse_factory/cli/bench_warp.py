@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, ReadableOut
+from tableverse_factory.cli.options import AsJson, Jobs, ReadableOut
 from tableverse_factory.cli.tables import print_figures, print_json
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluation.bench.warp import WarpAgreement, WarpSpeed
+    from tableverse_factory.evaluation.bench.warp import EngineAgreement, WarpSpeed
 
 
 def bench_warp(
@@ -23,6 +23,7 @@ def bench_warp(
         bool, typer.Option("--exported", help="The scenes' own no-slip iterations and integrator, which cost more.")
     ] = False,
     device: Annotated[str | None, typer.Option(metavar="NAME", help="Of Warp: cuda:0, cpu, …")] = None,
+    jobs: Jobs = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure steps per second of MuJoCo Warp, and how far it agrees with MuJoCo: rest, drift and contacts.
@@ -35,6 +36,7 @@ def bench_warp(
     import pyarrow.compute as pc
 
     from tableverse_factory.core.errors import InputError
+    from tableverse_factory.core.process_pool import count_available_cpus
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.delivery.learning.warp import silence_warp
     from tableverse_factory.evaluation.bench.measurement import sample_evenly
@@ -48,38 +50,44 @@ def bench_warp(
     done = dataset.scenes.to_table(columns=["scene_id"], filter=pc.field("status") == "done")["scene_id"].to_pylist()
     if not done:
         raise InputError(f"{out}: no finished scene to step")
-    chosen = [dataset.scene(scene_id) for scene_id in sample_evenly(done, scenes)]
-    agreement = measure_agreement(chosen, seconds, device, exported)
-    speeds = list(measure_speed(chosen, counts, device, exported))
+    chosen = sample_evenly(done, scenes)
+    agreement = list(measure_agreement(out, chosen, seconds, device, exported, jobs or count_available_cpus()))
+    speeds = list(measure_speed([dataset.scene(name) for name in chosen] if counts else [], counts, device, exported))
     if as_json:
-        print_json({"agreement": asdict(agreement), "agreeing": agreement.agreeing, "speed": [*map(asdict, speeds)]})
+        agreeing = sum(its.agrees for its in agreement)
+        print_json({"agreement": [*map(asdict, agreement)], "agreeing": agreeing, "speed": [*map(asdict, speeds)]})
     else:
         _show_agreement(agreement)
         _show_speeds(speeds)
 
 
-def _show_agreement(agreement: "WarpAgreement") -> None:
-    theirs = zip(
-        agreement.warp, agreement.mujoco_drift_m, agreement.mujoco_contacts, agreement.mujoco_penetration_m, strict=True
-    )
+def _show_agreement(agreement: "list[EngineAgreement]") -> None:
     rows = [
         (
-            *(one.scene_id, "overflow" if one.overflowed else "rests" if one.at_rest else "moves"),
-            *(f"{1e3 * length:.4f}" for length in (one.drift_m, drift_m)),
-            *(one.contacts, contacts),
-            *(f"{1e3 * length:.4f}" for length in (one.penetration_m, depth_m)),
+            *(one.warp.scene_id, "overflow" if one.warp.overflowed else "rests" if one.warp.at_rest else "moves"),
+            *(f"{1e3 * its.drift_m:.4f}" for its in (one.warp, one.mujoco)),
+            *(its.contacts for its in (one.warp, one.mujoco)),
+            *(f"{1e3 * its.penetration_m:.4f}" for its in (one.warp, one.mujoco)),
         )
-        for one, drift_m, contacts, depth_m in theirs
+        for one in agreement
     ]
     columns = ("scene", "Warp", "drift mm", "MuJoCo", "contacts", "MuJoCo", "depth mm", "MuJoCo")
     print_figures(columns, rows)
-    print(f"both say the same about rest of {agreement.agreeing} of {len(rows)} scenes")
+    print(f"both say the same about rest of {sum(its.agrees for its in agreement)} of {len(rows)} scenes")
 
 
 def _show_speeds(speeds: "list[WarpSpeed]") -> None:
     rows = [
-        (speed.worlds, speed.different, speed.device, f"{speed.steps_per_s:.0f}", speed.nconmax, speed.njmax)
+        (
+            speed.worlds,
+            speed.different,
+            speed.device,
+            f"{speed.steps_per_s:.0f}",
+            speed.nconmax,
+            speed.njmax,
+            speed.overflowed,
+        )
         for speed in speeds
     ]
     if rows:
-        print_figures(("worlds", "scenes", "device", "steps/s", "nconmax", "njmax"), rows)
+        print_figures(("worlds", "scenes", "device", "steps/s", "nconmax", "njmax", "overflowed"), rows)

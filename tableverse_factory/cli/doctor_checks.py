@@ -38,6 +38,7 @@ EXTRAS = {  # of pyproject.toml, without `dev` and `docs`: packages and purpose
     "hub": (("huggingface_hub",), "tableverse publish, datasets by hf://"),
     "gym": (("gymnasium",), "a scene and a task as an environment"),
     "warp": (("mujoco-warp",), "thousands of scenes at once on a GPU, verify --engine warp"),
+    "newton": (("newton",), "verify --engine newton"),
     "usd": (("usd-core",), "tableverse extract --format usd"),
     "models": (
         ("torch", "transformers", "onnx"),

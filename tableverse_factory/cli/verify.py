@@ -44,7 +44,8 @@ def verify(
     ] = False,
     robot: Robot = None,
     engine: Annotated[
-        Literal["mujoco", "warp"], typer.Option(help="Of a dataset: measure rest and contacts in MuJoCo Warp instead.")
+        Literal["mujoco", "warp", "newton"],
+        typer.Option(help="Of a dataset: measure rest and contacts in MuJoCo Warp or Newton instead."),
     ] = "mujoco",
     jobs: Jobs = None,
     as_json: AsJson = False,
@@ -55,7 +56,7 @@ def verify(
     executed again in physics from its saved arrays: successes must succeed, all must move as recorded, and rows must
     match tasks and configuration.
 
-    With --engine warp scenes are stepped in MuJoCo Warp, on a GPU where there is one; files and meshes are not
+    With --engine warp or newton scenes are stepped there, on a GPU where there is one; files and meshes are not
     measured then.
 
     Exit code 0 only if every scene is whole, at rest, free of collisions and as certified, and every trajectory as
@@ -69,13 +70,16 @@ def verify(
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
     if epsilon_m is not None and _is_dataset(path):
         raise typer.BadParameter("--epsilon is for MJCF files: the certificates of a dataset state theirs")
-    if engine == "warp" and (trajectories or not _is_dataset(path)):
-        raise typer.BadParameter("--engine warp is for the scenes of a dataset, without --trajectories")
+    if engine != "mujoco" and (trajectories or not _is_dataset(path)):
+        raise typer.BadParameter("--engine is for the scenes of a dataset, without --trajectories")
     if trajectories and _is_dataset(path):
         check_robot_option(path, robot, needed=True)
     audits = []
     depth_m, processes = 0.001 if epsilon_m is None else epsilon_m, jobs or count_available_cpus()
-    run = _run_in_warp(path) if engine == "warp" else _run_audits(path, depth_m, root, processes, trajectories, robot)
+    if engine == "mujoco":
+        run = _run_audits(path, depth_m, root, processes, trajectories, robot)
+    else:
+        run = _run_in_engine(path, engine)
     for audit in run:
         audits.append(audit)
         if not as_json:
@@ -107,12 +111,12 @@ def _count_not_built(path: str) -> int:
     return max(0, planned - dataset.scenes.count_rows()) if isinstance(planned, int) else 0
 
 
-def _run_in_warp(path: str) -> Iterator["SceneAudit"]:
+def _run_in_engine(path: str, engine: str) -> Iterator["SceneAudit"]:
     from tableverse_factory.delivery.learning.warp import silence_warp
-    from tableverse_factory.evaluation.verify_engine import verify_in_warp
+    from tableverse_factory.evaluation.verify_engine import verify_in_engine
 
-    silence_warp()
-    return verify_in_warp(path)
+    silence_warp(engine)
+    return verify_in_engine(path, engine)
 
 
 def _run_audits(

@@ -130,7 +130,7 @@ def import_warp() -> tuple[ModuleType, ModuleType]:
     return warp, engine
 
 
-def silence_warp() -> None:
+def silence_warp(extra: str = "warp") -> None:
     """Keep Warp's news from standard output, for commands whose output programs read."""
-    warp = import_extra("warp", "WarpBatch", "warp")
+    warp = import_extra("warp", "this command", extra)
     warp.config.log_level = warp.LOG_WARNING

@@ -4,6 +4,7 @@ Objects of a scene take its slots, those with most convex pieces first. A slot h
 needs most; in other worlds the rest are absent, and so are the objects of unused slots.
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -24,12 +25,16 @@ _PARKED_M = 10.0  # absent objects float this far below the table, a metre apart
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedScene:
-    """A compiled scene: its table's geom, and its free bodies with their geoms, those with most geoms first."""
+    """A compiled scene: its table's geom, and its free bodies with their geoms, those with most geoms first.
+
+    `mesh_names` are the names of its meshes in the template.
+    """
 
     scene_id: str
     model: mujoco.MjModel
     table: int
     objects: tuple[tuple[int, tuple[int, ...]], ...]
+    mesh_names: Mapping[str, str]
     sizes: SimulationSizes
 
     @property
@@ -64,13 +69,13 @@ def build_template(scenes: Sequence[Scene]) -> WarpTemplate:
             raise InputError(
                 f"scene {scene.scene_id} has another timestep than the first: a batch has one", "bad_scene"
             )
-        _add_meshes(spec, child, f"{number}/", scene.files(), assets)
-        loaded.append(_load(scene.scene_id, child.compile()))
+        mesh_names = _add_meshes(spec, child, scene.files(), assets)
+        loaded.append(_load(scene.scene_id, child.compile(), mesh_names))
     room = [max(counts) for counts in _transpose([[len(geoms) for _, geoms in one.objects] for one in loaded])]
     _add_slots(spec, loaded[0], room, next(mesh.name for mesh in spec.meshes))
     spec.assets = assets
     model = spec.compile()
-    worlds = tuple(_fill(model, one, f"{number}/", len(room)) for number, one in enumerate(loaded))
+    worlds = tuple(_fill(model, one, len(room)) for one in loaded)
     return WarpTemplate(model, tuple(loaded), worlds)
 
 
@@ -81,16 +86,22 @@ def _transpose(rows: Sequence[Sequence[int]]) -> list[list[int]]:
 
 
 def _add_meshes(
-    spec: mujoco.MjSpec, child: mujoco.MjSpec, prefix: str, files: Mapping[str, bytes], assets: dict[str, bytes]
-) -> None:
+    spec: mujoco.MjSpec, child: mujoco.MjSpec, files: Mapping[str, bytes], assets: dict[str, bytes]
+) -> dict[str, str]:
+    """Add the meshes of a scene that the model does not have yet; return their names there by those of the scene."""
+    names = {}
     for mesh in child.meshes:
-        name = f"{prefix.replace('/', '_')}{mesh.file}"
-        assets[name] = files[f"assets/{mesh.file}"]
+        content = files[f"assets/{mesh.file}"]
+        name = hashlib.sha256(content).hexdigest()  # cousins share meshes with their parent and one another
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX  # the compiler makes hulls of unused meshes too then
-        spec.add_mesh(name=prefix + mesh.name, file=name, inertia=mesh.inertia)
+        if f"{name}.obj" not in assets:
+            assets[f"{name}.obj"] = content
+            spec.add_mesh(name=name, file=f"{name}.obj", inertia=mesh.inertia)
+        names[mesh.name] = name
+    return names
 
 
-def _load(scene_id: str, model: mujoco.MjModel) -> LoadedScene:
+def _load(scene_id: str, model: mujoco.MjModel, mesh_names: Mapping[str, str]) -> LoadedScene:
     free = find_free_bodies(model)
     still = [g for g in range(model.ngeom) if model.geom_bodyid[g] not in free]
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
@@ -102,7 +113,7 @@ def _load(scene_id: str, model: mujoco.MjModel) -> LoadedScene:
         )
     geoms = {body: tuple(np.flatnonzero(model.geom_bodyid == body).tolist()) for body in free}
     objects = tuple(sorted(geoms.items(), key=lambda item: (-len(item[1]), item[0])))
-    return LoadedScene(scene_id, model, still[0], objects, measure_sizes(model))
+    return LoadedScene(scene_id, model, still[0], objects, mesh_names, measure_sizes(model))
 
 
 def _add_slots(spec: mujoco.MjSpec, example: LoadedScene, room: Sequence[int], mesh: str) -> None:
@@ -129,7 +140,7 @@ def _copy_contact(geom: mujoco.MjsGeom, model: mujoco.MjModel, source: int) -> N
     )
 
 
-def _fill(model: mujoco.MjModel, scene: LoadedScene, prefix: str, slots: int) -> dict[str, np.ndarray]:
+def _fill(model: mujoco.MjModel, scene: LoadedScene, slots: int) -> dict[str, np.ndarray]:
     """Make the arrays of one world."""
     own = scene.model
     names = (*BODY_FIELDS, *GEOM_FIELDS, "body_pos", "body_quat", "body_gravcomp", "qpos0", "dof_invweight0")
@@ -151,7 +162,7 @@ def _fill(model: mujoco.MjModel, scene: LoadedScene, prefix: str, slots: int) ->
         for geom, source in enumerate(geoms, first):
             for name in GEOM_FIELDS:
                 arrays[name][geom] = getattr(own, name)[source]
-            arrays["geom_dataid"][geom] = model.mesh(prefix + own.mesh(int(own.geom_dataid[source])).name).id
+            arrays["geom_dataid"][geom] = model.mesh(scene.mesh_names[own.mesh(int(own.geom_dataid[source])).name]).id
     arrays["body_subtreemass"][0] = arrays["body_mass"].sum()
     arrays["body_pos"][2:], arrays["body_quat"][2:] = np.split(arrays["qpos0"].reshape(-1, 7), [3], axis=1)
     return arrays

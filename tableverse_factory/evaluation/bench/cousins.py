@@ -57,6 +57,7 @@ class CousinsScore:
     done: int
     of: int
     lost: tuple[tuple[str, int], ...]  # reasons of drops and kinds of failures, with their number
+    cpu_mean_s: float
     cpu_median_s: float
     cpu_p95_s: float
     cpu_max_s: float
@@ -85,6 +86,7 @@ def measure_cousins(out: str, most: int | None, jobs: int) -> CousinsScore:
         done=len(done),
         of=len(rows),
         lost=tuple(lost.most_common()),
+        cpu_mean_s=float(np.mean(seconds)),
         cpu_median_s=median,
         cpu_p95_s=high,
         cpu_max_s=most_s,

@@ -3,17 +3,14 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 
-import mujoco
-import numpy as np
-
-from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.learning.vector_sim import compile_scene
+from tableverse_factory.core.process_pool import parallel_map
+from tableverse_factory.dataset.dataset import Dataset, Scene, open_dataset
 from tableverse_factory.delivery.learning.warp import WarpBatch, import_warp
-from tableverse_factory.evaluation.engine_drift import EngineDrift, measure_warp_drift
-from tableverse_factory.physics.simulate.at_rest import measure_drift
-from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD
+from tableverse_factory.evaluation.engine_drift import EngineDrift, measure_mujoco_drift, measure_warp_drift
 
+SCENES_PER_BATCH = 128
 _TIMED_S = 3.0  # least time that is measured
 
 
@@ -27,22 +24,20 @@ class WarpSpeed:
     steps_per_s: float
     nconmax: int
     njmax: int
+    overflowed: int  # worlds that lacked room, whose steps are not those of the scene
 
 
 @dataclass(frozen=True, slots=True)
-class WarpAgreement:
-    """What Warp and MuJoCo say of the same scenes, over the same time."""
+class EngineAgreement:
+    """What Warp and MuJoCo say of the same scene, over the same time."""
 
-    warp: tuple[EngineDrift, ...]
-    mujoco_drift_m: tuple[float, ...]
-    mujoco_at_rest: tuple[bool, ...]
-    mujoco_contacts: tuple[int, ...]
-    mujoco_penetration_m: tuple[float, ...]
+    warp: EngineDrift
+    mujoco: EngineDrift
 
     @property
-    def agreeing(self) -> int:
-        """Count the scenes of which both say the same about rest."""
-        return sum(one.at_rest == rests for one, rests in zip(self.warp, self.mujoco_at_rest, strict=True))
+    def agrees(self) -> bool:
+        """Whether both say the same about rest."""
+        return self.warp.at_rest == self.mujoco.at_rest
 
 
 def measure_speed(
@@ -59,21 +54,34 @@ def measure_speed(
             batch.step(10)
             warp.synchronize()
             done += 10
-        place = str(batch.data.qpos.device)
-        yield WarpSpeed(count, min(count, len(scenes)), place, count * done / passed, batch.nconmax, batch.njmax)
+        place, full = str(batch.data.qpos.device), int(batch.overflowed().sum())
+        different = min(count, len(scenes))
+        yield WarpSpeed(count, different, place, count * done / passed, batch.nconmax, batch.njmax, full)
 
 
-def measure_agreement(scenes: Sequence[Scene], duration_s: float, device: str | None, exported: bool) -> WarpAgreement:
-    """Step each scene in both engines and compare; MuJoCo always has the scene's own settings."""
-    warp = measure_warp_drift(scenes, duration_s, device, exported)
-    drifts, rests, contacts, depths = [], [], [], []
-    for scene in scenes:
-        model = compile_scene(scene, visuals=False)
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        contacts.append(int(data.ncon))
-        depths.append(float((-data.contact.dist).max(initial=0.0)))
-        drift = measure_drift(model, duration_s)
-        drifts.append(float(drift.distance_m.max(initial=0.0)))
-        rests.append(bool(drifts[-1] <= DRIFT_LIMIT_M and np.max(drift.angle_rad, initial=0.0) <= DRIFT_LIMIT_RAD))
-    return WarpAgreement(tuple(warp), tuple(drifts), tuple(rests), tuple(contacts), tuple(depths))
+def measure_agreement(
+    path: str, scene_ids: Sequence[str], duration_s: float, device: str | None, exported: bool, jobs: int
+) -> Iterator[EngineAgreement]:
+    """Step each scene of a dataset in both engines; MuJoCo always has the scene's own settings.
+
+    Scenes of similar size share a batch, so they come in the order of their numbers of objects.
+    """
+    scenes = sorted(
+        (_open_dataset(path).scene(scene_id) for scene_id in scene_ids),
+        key=lambda scene: (scene.row["n_objects"], scene.scene_id),
+    )
+    for first in range(0, len(scenes), SCENES_PER_BATCH):
+        group = scenes[first : first + SCENES_PER_BATCH]
+        warp = measure_warp_drift(group, duration_s, device, exported)
+        work = partial(_measure_in_mujoco, path, duration_s)
+        mujoco = parallel_map(work, [scene.scene_id for scene in group], jobs, "simulates scenes")
+        yield from map(EngineAgreement, warp, mujoco)
+
+
+def _measure_in_mujoco(path: str, duration_s: float, scene_id: str) -> EngineDrift:
+    return measure_mujoco_drift(_open_dataset(path).scene(scene_id), duration_s)
+
+
+@lru_cache(maxsize=1)  # once per process
+def _open_dataset(path: str) -> Dataset:
+    return open_dataset(path)

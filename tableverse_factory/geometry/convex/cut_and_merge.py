@@ -60,7 +60,7 @@ def cut_and_merge(solid: manifold3d.Manifold, max_pieces: int, volume_error: flo
     volume, most = float(solid.volume()), int(OVERCUT * max_pieces)
     parts = _cut(solid, most, CUT_SHARE * volume_error * volume, NEGLIGIBLE_SHARE * volume)
     clusters = [make_cluster(points) for points in _group_parts([part.points for part in parts], most)]
-    return _merge(clusters, max_pieces, (1.0 + volume_error) * volume)
+    return merge_clusters(clusters, max_pieces, (1.0 + volume_error) * volume)
 
 
 def make_cluster(points: Points) -> PieceCluster:
@@ -149,7 +149,7 @@ def _weigh_cut(part: _Part, axis: Vector3, share: float) -> tuple[float, Vector3
     return compute_hull_volume(upper) + compute_hull_volume(lower), axis, offset
 
 
-def _merge(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[PieceCluster]:
+def merge_clusters(clusters: Sequence[PieceCluster], max_pieces: int, volume_allowed: float) -> list[PieceCluster]:
     """Merge the pair whose common hull adds least, again and again, within what is allowed."""
     alive = dict(enumerate(clusters))
     near = [(i, j) for i in alive for j in range(i) if _are_near(alive[i], alive[j])]
