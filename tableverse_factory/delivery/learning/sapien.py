@@ -14,7 +14,7 @@ from tableverse_factory.delivery.learning.vector_sim import compile_scene
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 
-# PhysX swells thin pieces where it makes hulls of them; at its default, things that fit closely fly off the table.
+# At the default of PhysX things that fit closely flew off the table.
 DEPENETRATION_M_S = 0.05
 
 
