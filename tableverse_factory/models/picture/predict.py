@@ -136,10 +136,12 @@ def _mirror(out: _Outputs) -> _Outputs:
 
 
 def _average(first: _Outputs, second: _Outputs) -> _Outputs:
-    """Average outputs of the net, maps at the size of the first; votes, in pixels, shrink with their map."""
+    """Average outputs of the net, maps at the size of the first, whose scale is kept; votes shrink with their map."""
     rows, columns = first["label"].shape[1:]
     moved = {name: part if part.ndim == 1 else _resize_map(part, rows, columns) for name, part in second.items()}
     moved["votes"] *= np.float32(columns / second["votes"].shape[2])
+    moved["log_depth"] += np.median(first["log_depth"]) - np.median(moved["log_depth"])
+    moved["plane"][3] = first["plane"][3]
     return {name: (part + moved[name]) / np.float32(2.0) for name, part in first.items()}
 
 
