@@ -1,7 +1,8 @@
 """Predictions of the net of pictures: depth, table, objects, and how sure it is."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -11,10 +12,12 @@ from scipy.special import expit, softmax
 from schemas.geometry import Camera, DepthImage, Frozen, Picture
 from schemas.identity import content_hash
 from tableverse_factory.geometry.math.camera import backproject, rescale_camera
-from tableverse_factory.models.picture.net import MULTIPLE, load_picture_net
+from tableverse_factory.models.picture.net import MULTIPLE, REACHES, load_picture_net
 
 LEAST_PIXELS, MOST_PIXELS = 76_800, 118_000  # of the net's input: it was trained at 320 x 240 and more
+MIRRORED_SCALE, STRIDE = 7 / 6, 16  # of a bare picture seen once more; the net takes sides that are multiples of 16
 OTHER, TABLE, OBJECT = range(3)
+_Outputs = dict[str, Float32[np.ndarray, "..."]]
 _MAX_LOG_DEPTH = 7.0  # a depth of a kilometre: what exceeds it is no room
 
 
@@ -55,6 +58,7 @@ def predict_picture(
 ) -> PicturePrediction:
     """Predict from a picture and its camera; with a sensor's `depth` [m], 0 where unknown, the net reads that too.
 
+    A bare picture is seen twice, the second time mirrored and larger, and what both say is averaged.
     The latest prediction is remembered: two stages ask the same of one picture.
 
     Raises:
@@ -91,14 +95,15 @@ def compute_rays(camera: Camera) -> Float32[np.ndarray, "3 h w"]:
 
 
 def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"], weights: str) -> PicturePrediction:
-    net = load_picture_net(weights)
     rows, columns = choose_working_size(*color.shape[:2])
-    small = rescale_camera(camera, columns, rows)
-    inputs = {"image": _resize_color(color, rows, columns), "rays": compute_rays(small)}
-    out = net({**inputs, "depth": _thin_depth(sensed, rows, columns)[None]})
+    out = _ask(color, camera, sensed, weights, (rows, columns))
+    if not sensed.any():  # the errors of the mirrored, larger picture are others: the mean of both is nearer
+        larger = round(MIRRORED_SCALE * rows / STRIDE) * STRIDE, round(MIRRORED_SCALE * columns / STRIDE) * STRIDE
+        turned = replace(camera, cx=camera.width - 1 - camera.cx)
+        out = _average(out, _mirror(_ask(np.ascontiguousarray(color[:, ::-1]), turned, sensed, weights, larger)))
     plane = out["plane"].astype(np.float64)
     return PicturePrediction(
-        small,
+        rescale_camera(camera, columns, rows),
         np.exp(np.minimum(out["log_depth"][0], _MAX_LOG_DEPTH)),
         softmax(out["label"], axis=0),
         out["votes"],
@@ -109,6 +114,41 @@ def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"],
         float(expit(float(out["table"][0]))),
         float(out["log_scale_sigma"][0]),
     )
+
+
+def _ask(
+    color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"], weights: str, size: tuple[int, int]
+) -> _Outputs:
+    """Ask the net about the picture at a size, rows and columns."""
+    rays = compute_rays(rescale_camera(camera, size[1], size[0]))
+    inputs = {"image": _resize_color(color, *size), "rays": rays, "depth": _thin_depth(sensed, *size)[None]}
+    return load_picture_net(weights)(inputs)
+
+
+def _mirror(out: _Outputs) -> _Outputs:
+    """Mirror the outputs of the net; what a pixel says of the one to its right, it then says of the one to its left."""
+    mirrored = {name: part[..., ::-1] if part.ndim == 3 else part.copy() for name, part in out.items()}
+    mirrored["votes"] = mirrored["votes"] * np.array([-1.0, 1.0], np.float32)[:, None, None]
+    mirrored["plane"][0] *= -1.0
+    pairs = zip(product(REACHES, (1, 0)), mirrored["affinity"], strict=True)
+    mirrored["affinity"] = np.stack([np.roll(part, -reach, axis=1) if axis else part for (reach, axis), part in pairs])
+    return mirrored
+
+
+def _average(first: _Outputs, second: _Outputs) -> _Outputs:
+    """Average outputs of the net, maps at the size of the first, whose scale is kept; votes shrink with their map."""
+    rows, columns = first["label"].shape[1:]
+    moved = {name: part if part.ndim == 1 else _resize_map(part, rows, columns) for name, part in second.items()}
+    moved["votes"] *= np.float32(columns / second["votes"].shape[2])
+    moved["log_depth"] += np.median(first["log_depth"]) - np.median(moved["log_depth"])
+    moved["plane"][3] = first["plane"][3]
+    return {name: (part + moved[name]) / np.float32(2.0) for name, part in first.items()}
+
+
+def _resize_map(map_: Float32[np.ndarray, "c h w"], rows: int, columns: int) -> Float32[np.ndarray, "c h2 w2"]:
+    """Resize by the mean of the nearest pixels."""
+    wanted = (columns, rows), Image.Resampling.BILINEAR
+    return np.stack([np.asarray(Image.fromarray(np.ascontiguousarray(each)).resize(*wanted)) for each in map_])
 
 
 def _resize_color(color: Picture, rows: int, columns: int) -> Float32[np.ndarray, "3 h w"]:

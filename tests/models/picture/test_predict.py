@@ -4,12 +4,15 @@ import hashlib
 import subprocess
 import sys
 from dataclasses import fields
+from itertools import product
 
 import numpy as np
 import pytest
 
 from schemas.geometry import Camera
+from tableverse_factory.models.picture import predict as predict_module
 from tableverse_factory.models.picture.instances import upsample_ids
+from tableverse_factory.models.picture.net import REACHES
 from tableverse_factory.models.picture.predict import (
     LEAST_PIXELS,
     MOST_PIXELS,
@@ -118,6 +121,34 @@ def test_the_mirrored_picture_has_the_mirrored_depth_and_things() -> None:
     assert (things & true).sum() > 0.8 * (things | true).sum()
     assert (things & (mirrored.label.argmax(axis=0) == OBJECT)).sum() < 0.5 * things.sum()
     np.testing.assert_allclose(mirrored.normal * [-1, 1, 1], found.normal, atol=0.05)
+
+
+def answer(ids: np.ndarray) -> dict[str, np.ndarray]:
+    """What a faultless net would say of things with these ids, (h, w): of their pairs, votes and the plane."""
+    height, width = ids.shape
+    votes, affinity = np.zeros((2, height, width), np.float32), np.zeros((6, height, width), np.float32)
+    for thing in np.unique(ids[ids > 0]):
+        at = np.argwhere(ids == thing)
+        votes[:, *at.T] = (at.mean(axis=0) - at).T[::-1]
+    for own, (reach, axis) in zip(affinity, product(REACHES, (1, 0)), strict=True):
+        ends = (
+            np.moveaxis(own, axis, 0)[:-reach],
+            *(np.moveaxis(ids, axis, 0)[part] for part in (np.s_[:-reach], np.s_[reach:])),
+        )
+        ends[0][...] = np.where(ends[1] == ends[2], 1.0, -1.0)
+    return {"votes": votes, "affinity": affinity, "plane": np.array([0.6, 0.0, -0.8, 1.0], np.float32)}
+
+
+def test_answers_about_the_mirrored_picture_are_turned_back() -> None:
+    ids = np.zeros((40, 60), np.int32)
+    ids[5:20, 8:30], ids[12:35, 30:41] = 1, 2
+    true, about_mirrored = answer(ids), answer(ids[:, ::-1])
+    about_mirrored["plane"][0] *= -1.0
+    found = predict_module._mirror(about_mirrored)
+    np.testing.assert_allclose(found["votes"], true["votes"], atol=1e-5)
+    np.testing.assert_array_equal(found["plane"], true["plane"])
+    inside = 60 - max(REACHES)  # pairs beyond the right edge mean nothing
+    np.testing.assert_array_equal(found["affinity"][:, :, :inside], true["affinity"][:, :, :inside])
 
 
 @pytest.mark.heavy

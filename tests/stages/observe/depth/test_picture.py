@@ -79,7 +79,7 @@ def test_a_photograph_without_a_table_is_dropped(name: str) -> None:
     outcome = see(DATA / name)
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "no_table"
-    assert "observe.min_table_probability = 0.9" in outcome.detail
+    assert "observe.min_table_probability = 0.95" in outcome.detail
     with Image.open(DATA / name) as file:
         assert predict(np.asarray(file.convert("RGB"))).table_probability < 0.25
 
