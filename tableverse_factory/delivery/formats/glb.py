@@ -11,6 +11,7 @@ from trimesh.visual.material import PBRMaterial
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP, homogeneous_matrix, matrix_from_pose
+from tableverse_factory.geometry.mesh.distinct_rows import find_distinct_rows
 from tableverse_factory.physics.render.normals import compute_corner_normals
 
 ROUGHNESS = 0.8
@@ -66,7 +67,7 @@ def split_corners(
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)  # of faces without area
     uv = np.zeros((len(normals), 0)) if texture is None else texture.corner_uv.reshape(-1, 2)
     corners = np.column_stack([mesh.faces.reshape(-1), normals, uv])
-    distinct, index = np.unique(corners, axis=0, return_inverse=True)
+    distinct, index = find_distinct_rows(corners)
     vertices, sides = mesh.vertices[distinct[:, 0].astype(np.int64)], distinct[:, 1:4]
     sides = sides / np.linalg.norm(sides, axis=1, keepdims=True)
-    return vertices, index.reshape(-1, 3).astype(np.int64), sides, None if texture is None else distinct[:, 4:]
+    return vertices, index.reshape(-1, 3), sides, None if texture is None else distinct[:, 4:]
