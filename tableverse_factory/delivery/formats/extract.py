@@ -48,6 +48,6 @@ FORMATS: dict[str, Callable[[Scene, ModelContents, Mapping[str, str]], dict[str,
     "urdf": lambda _, contents, labels: encode_urdf(contents, labels),
     "usd": lambda _, contents, labels: encode_usd(contents, labels),
 }
-WITH_COLLIDERS = frozenset({"urdf", "usd"})
+WITH_COLLIDERS = frozenset({"urdf", "usd"})  # the others draw, and need no hulls
 MAIN_FILES = {"mjcf": SCENE_XML, "glb": SCENE_GLB, "urdf": "scene.urdf", "usd": "scene.usd"}
 """The file of each format that refers to all others."""

@@ -5,7 +5,7 @@ from jaxtyping import Int64
 
 
 def find_distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, Int64[np.ndarray, " n"]]:
-    """Return the distinct rows of shape (n, k), sorted by the first column, then by the next, and the index of each row."""
+    """Return the distinct rows of (n, k), sorted by the first column, then the next, and each row's index in them."""
     order = np.lexsort(rows.T[::-1])
     in_order = rows[order]
     first = np.ones(len(rows), dtype=bool)
