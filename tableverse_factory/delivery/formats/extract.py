@@ -21,7 +21,7 @@ def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[
         raise InputError(f"format {file_format!r:.40}: give one of {', '.join(FORMATS)}")
     if dest.exists() and (not dest.is_dir() or any(dest.iterdir())):
         raise InputError(f"{dest}: already there; give a new or an empty folder")
-    contents = read_model_contents(scene.model())
+    contents = read_model_contents(scene.model(), colliders=file_format in WITH_COLLIDERS)
     for content in (*contents.objects, *contents.still):
         try:
             check_id(content.name)  # foreign scenes may hold anything
@@ -48,5 +48,6 @@ FORMATS: dict[str, Callable[[Scene, ModelContents, Mapping[str, str]], dict[str,
     "urdf": lambda _, contents, labels: encode_urdf(contents, labels),
     "usd": lambda _, contents, labels: encode_usd(contents, labels),
 }
+WITH_COLLIDERS = frozenset({"urdf", "usd"})  # the others draw, and need no hulls
 MAIN_FILES = {"mjcf": SCENE_XML, "glb": SCENE_GLB, "urdf": "scene.urdf", "usd": "scene.usd"}
 """The file of each format that refers to all others."""

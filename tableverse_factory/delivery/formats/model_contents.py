@@ -62,8 +62,8 @@ class ModelContents(Frozen):
     cameras: tuple[ModelCamera, ...]
 
 
-def read_model_contents(model: mujoco.MjModel) -> ModelContents:
-    """Read a model in its initial state."""
+def read_model_contents(model: mujoco.MjModel, colliders: bool = True) -> ModelContents:
+    """Read a model in its initial state; without its colliders, `hulls` and `unseen` are empty."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -72,8 +72,8 @@ def read_model_contents(model: mujoco.MjModel) -> ModelContents:
     moving = {int(root) for root in np.unique(model.body_rootid[model.jnt_bodyid])}
     chosen = moving or {root for root in roots if root > 0 and not is_table(body_name(model, root))}
     return ModelContents(
-        tuple(_read_object(model, data, root) for root in roots if root in chosen),
-        tuple(_read_object(model, data, root) for root in roots if root not in chosen),
+        tuple(_read_object(model, data, root, colliders) for root in roots if root in chosen),
+        tuple(_read_object(model, data, root, colliders) for root in roots if root not in chosen),
         read_lights(model, data),
         read_ambient(model),
         read_cameras(model, data),
@@ -85,15 +85,15 @@ def is_table(name: str) -> bool:
     return name.strip().lower() in TABLE_NAMES
 
 
-def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> ModelObject:
+def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int, colliders: bool) -> ModelObject:
     pose = pose_from_rotation(data.xpos[root], data.xmat[root].reshape(3, 3))
     geoms = [int(geom) for geom in np.flatnonzero(model.body_rootid[model.geom_bodyid] == root)]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
     seen = _list_visual_geoms(model, geoms)
     looks = [look for geom in seen if (look := _load_visual(model, data, geom, pose))]
-    undrawn = find_undrawn_geoms(model, data, seen, solid)
+    undrawn = find_undrawn_geoms(model, data, seen, solid) if colliders else []
     unseen = [look.mesh for geom in undrawn if (look := _load_visual(model, data, geom, pose))]
-    hulls = [hull for geom in solid if (hull := _compute_hull(model, data, geom, pose))]
+    hulls = [hull for geom in solid if colliders and (hull := _compute_hull(model, data, geom, pose))]
     friction, spin, roll = model.geom_friction[solid].max(axis=0).tolist() if solid else (1.0, 0.0, 0.0)
     properties = _compute_mass_properties(model, data, root, pose)
     shapes = tuple(looks), tuple(unseen), tuple(hulls)

@@ -18,6 +18,7 @@ from tableverse_factory.core.png import encode_png
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.delivery.formats.usd_views import add_cameras, add_lights
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
+from tableverse_factory.geometry.mesh.distinct_rows import find_distinct_rows
 from tableverse_factory.physics.render.normals import compute_corner_normals
 
 if TYPE_CHECKING:
@@ -184,8 +185,8 @@ def _set_at_corners(
     """Set a primvar at each face's corners, its distinct values indexed."""
     from pxr import UsdGeom, Vt
 
-    distinct, index = np.unique(values.reshape(-1, values.shape[2]).astype(np.float32), axis=0, return_inverse=True)
+    distinct, index = find_distinct_rows(values.reshape(-1, values.shape[2]).astype(np.float32))
     array = Vt.Vec3fArray if values.shape[2] == 3 else Vt.Vec2fArray
     primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(name, kind, UsdGeom.Tokens.faceVarying)
     primvar.Set(array.FromNumpy(np.ascontiguousarray(distinct)))
-    primvar.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(index.reshape(-1), dtype=np.int32)))
+    primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from schemas.geometry import TriangleMesh
+from tableverse_factory.geometry.mesh.distinct_rows import find_distinct_rows
 
 CREASE_COS = float(np.cos(np.deg2rad(42.0)))
 MAX_VALENCE = 256
@@ -28,8 +29,8 @@ def compute_corner_normals(mesh: TriangleMesh) -> Float32[np.ndarray, "m 3 3"]:
 
 def _pair_corners(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
     """List pairs of corners (3 * face + k) at one position, each with itself too, but not those of large fans."""
-    _, welded = np.unique(np.round(mesh.vertices, WELD_DECIMALS), axis=0, return_inverse=True)
-    position = welded.reshape(-1)[mesh.faces].reshape(-1)
+    _, welded = find_distinct_rows(np.round(mesh.vertices, WELD_DECIMALS))
+    position = welded[mesh.faces].reshape(-1)
     order = np.argsort(position, kind="stable")
     starts = np.flatnonzero(np.diff(position[order], prepend=-1))
     valence = np.diff(np.append(starts, len(order)))

@@ -1,5 +1,6 @@
 """Every format, read back by somebody else's reader: the same shapes at the same places, the same masses, any label."""
 
+import io
 import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -8,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from schemas.geometry import Camera, Pose
 from tableverse_factory.core.errors import InputError
@@ -82,6 +84,14 @@ def test_glb_keeps_colours_and_labels(scene, tmp_path):
     assert len(np.unique(grey)) > 1, "untextured objects keep the colour that the scene gave them"
     labels = {edge[1]: its["metadata"]["label"] for edge, its in _edges(read).items() if "metadata" in its}
     assert labels == {"obj_000": HOSTILE, "obj_001": "can", "obj_002": "cheese"}
+
+
+def test_glb_has_the_pictures_of_the_scene_pixel_for_pixel(scene, tmp_path):
+    extract_scene(scene, tmp_path / "glb", "glb")
+    read = trimesh.load_scene(tmp_path / "glb" / "scene.glb", process=False)
+    texture = read.geometry[read.graph.get("obj_000")[1]].visual.material.baseColorTexture
+    with Image.open(io.BytesIO(scene.files()["assets/obj_000.png"])) as picture:
+        assert texture.tobytes() == picture.convert("RGB").tobytes()
 
 
 def test_glb_shades_round_things_smoothly_and_boxes_sharply(scene, tmp_path):
