@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 import hypothesis
 import pytest
 
+import tests.helpers.blas_kernels  # noqa: F401 - before anything imports numpy
 from tests.helpers.model_server import ModelServer, model_server
 from tests.helpers.paths import SHARED
 
