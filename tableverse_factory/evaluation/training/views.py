@@ -14,6 +14,7 @@ from schemas.geometry import Camera, Frozen, Pose, TriangleMesh
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.training.packed_arrays import write_arrays
 from tableverse_factory.geometry.math.transforms import matrix_from_pose
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.render.raycast import Raycaster, compute_camera_rays
@@ -50,10 +51,7 @@ class TrainingView(Frozen):
 
     def write(self, path: Path) -> None:
         """Write the view atomically."""
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
-        partial.rename(path)
+        write_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def read(cls, path: Path) -> Self:

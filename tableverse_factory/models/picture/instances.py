@@ -34,7 +34,7 @@ class _Border:
         bend: Median distance of one surface out of the other's tangent plane, as a share of that across the line of
             sight.
         boundary: Median probability of an edge.
-        affinity: Mean logit that pixels on either side are of one object; 0 if the net does not say.
+        affinity: Mean logit that pixels on either side are of one object.
     """
 
     pieces: tuple[int, int]

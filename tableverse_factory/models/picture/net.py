@@ -17,7 +17,6 @@ DIGEST = SHIPPED.with_suffix(".sha256")
 MULTIPLE: Final = 32  # height and width of the input are multiples of it
 INPUTS: Final = {"image": 3, "rays": 3, "depth": 1}  # channels of (1, c, h, w)
 MAPS: Final = {"label": 3, "log_depth": 1, "height": 1, "center": 1, "votes": 2, "boundary": 1, "affinity": 6}
-LATER: Final = frozenset({"affinity"})  # maps that the first nets lack: they are 0
 REACHES: Final = (2, 8, 16)  # of affinities [px]
 VECTORS: Final = {"plane": 4, "table": 1, "log_scale_sigma": 1}  # lengths of (1, n)
 MAX_BYTES = 256 * 1024 * 1024
@@ -45,12 +44,11 @@ class PictureNet:
         inputs, outputs = (
             {one.name for one in ends} for ends in (self._session.get_inputs(), self._session.get_outputs())
         )
-        if inputs != {*INPUTS} or not outputs >= {*MAPS, *VECTORS} - LATER:
+        if inputs != {*INPUTS} or not outputs >= {*MAPS, *VECTORS}:
             raise WeightsError(
                 f"{str(path)!r} is another net: it takes {', '.join(sorted(inputs))} and gives "
                 f"{', '.join(sorted(outputs))}; one of {', '.join(INPUTS)} to {', '.join([*MAPS, *VECTORS])} is wanted"
             )
-        self._outputs = [name for name in (*MAPS, *VECTORS) if name in outputs]
 
     def __call__(self, inputs: _Arrays) -> dict[str, Float32[np.ndarray, "..."]]:
         """Run the net on maps of shape (c, h, w); the outputs come without their first axis.
@@ -58,17 +56,17 @@ class PictureNet:
         Raises:
             ModelError: if it cannot be run, or an output has another shape or is not finite.
         """
+        names = [*MAPS, *VECTORS]
         try:
-            found = self._session.run(self._outputs, {name: inputs[name][None] for name in INPUTS})
+            found = self._session.run(names, {name: inputs[name][None] for name in INPUTS})
         except Exception as error:  # onnxruntime's errors have no common base
             raise ModelError(f"{self._name} cannot be run: {shorten_onnx_error(error)}") from error
         size = inputs["image"].shape[1:]
         shapes = {name: (1, count, *size) for name, count in MAPS.items()} | {n: (1, c) for n, c in VECTORS.items()}
-        for name, array in zip(self._outputs, found, strict=True):
+        for name, array in zip(names, found, strict=True):
             if array.shape != shapes[name] or not np.isfinite(array).all():
                 raise ModelError(f"{self._name} answers {name} of shape {array.shape}; finite {shapes[name]} is wanted")
-        unknown = {name: np.zeros(shapes[name][1:], np.float32) for name in LATER}
-        return unknown | {name: a[0].astype(np.float32) for name, a in zip(self._outputs, found, strict=True)}
+        return {name: array[0].astype(np.float32) for name, array in zip(names, found, strict=True)}
 
 
 @cache

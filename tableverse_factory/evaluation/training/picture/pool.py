@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, Int32, UInt8, UInt16
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.training.packed_arrays import write_arrays
 
 STEPS = 65535  # of a coordinate across its mesh
 SCENES_AT_A_TIME = 2
@@ -56,10 +57,7 @@ class MeshPool:
 
     def write(self, path: Path) -> None:
         """Write the pool, at once or not at all."""
-        partial_path = path.with_suffix(".partial")
-        with partial_path.open("wb") as file:
-            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
-        partial_path.rename(path)
+        write_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def read(cls, path: Path) -> Self:

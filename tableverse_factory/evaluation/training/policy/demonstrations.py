@@ -11,6 +11,7 @@ from jaxtyping import Float32, Int16, Int32, UInt8
 
 from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.training.packed_arrays import write_arrays
 
 POINTS = 192  # on the surface of each object
 POINT_M = 1e-4  # unit of their coordinates
@@ -57,13 +58,10 @@ class Demonstrations(Frozen):
 
     def write(self, path: Path) -> None:
         """Write the file, at once or not at all; equal demonstrations give equal bytes."""
-        partial = path.with_suffix(".partial")
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         for name in _ALONG_TIME:  # differences compress to half
             arrays[name] = np.diff(arrays[name].view(np.uint16), axis=0, prepend=np.uint16(0))
-        with partial.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-        partial.rename(path)
+        write_arrays(path, arrays)
 
     @classmethod
     def read(cls, path: Path) -> Self:

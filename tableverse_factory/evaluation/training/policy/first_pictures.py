@@ -15,6 +15,7 @@ from jaxtyping import Int16, Int64, UInt8
 from schemas.geometry import Frozen
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.evaluation.training.packed_arrays import write_arrays
 
 CAMERAS = ("front", "wrist")
 SIZE = (96, 128)  # height and width [px]
@@ -35,10 +36,7 @@ class FirstPictures(Frozen):
 
     def write(self, path: Path) -> None:
         """Write the file, at once or not at all."""
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as file:
-            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
-        partial.rename(path)
+        write_arrays(path, {field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def read(cls, path: Path) -> Self:
