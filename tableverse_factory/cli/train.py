@@ -157,6 +157,12 @@ def train_policy(
     minutes: TrainMinutes = None,
     goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 256,
     chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 1_024,
+    scenes: Annotated[
+        int | None, typer.Option(min=1, help="Learn the motions of so many scenes; of all without.")
+    ] = None,
+    motions: Annotated[
+        int | None, typer.Option(min=1, help="Learn so many motions, of each scene as many; all without.")
+    ] = None,
     state: Annotated[
         Path | None,
         typer.Option("--pictures-from", metavar="WEIGHTS", dir_okay=False, exists=True, help=_PICTURES_FROM),
@@ -183,7 +189,7 @@ def train_policy(
 
     demonstrations = _provide_packed(folder / "demonstrations.npz", dataset, pictures=False)
     run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
-    settings = PolicySettings(steps, seed, goals, chunks=chunks)
+    settings = PolicySettings(steps, seed, goals, chunks=chunks, scenes=scenes, motions=motions)
     if state is None:
         done = train_state_policy(settings, run, say)
     else:
