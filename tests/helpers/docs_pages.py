@@ -104,3 +104,11 @@ def mentioned(page: Path) -> Iterator[str]:
     prose = "\n".join(line for line in page.read_text().splitlines() if line not in fenced)
     for match in _INLINE.finditer(prose):
         yield " ".join(match[1].split())
+
+
+def run_example(page: str, words: str, **names: object) -> dict[str, object]:
+    """Run the one Python block of a page of docs/ that has these words, with names that the reader has; return all."""
+    path = ROOT / "docs" / page
+    (block,) = (block for block in blocks(path) if block.language == "python" and words in block.text)
+    exec(compile("\n" * (block.line - 1) + block.text, str(path), "exec"), names)  # noqa: S102 - our own pages
+    return names
