@@ -106,9 +106,14 @@ def mentioned(page: Path) -> Iterator[str]:
         yield " ".join(match[1].split())
 
 
+def find_example(page: str, words: str) -> Block:
+    """The one Python block of a page of docs/ that has these words."""
+    (block,) = (its for its in blocks(ROOT / "docs" / page) if its.language == "python" and words in its.text)
+    return block
+
+
 def run_example(page: str, words: str, **names: object) -> dict[str, object]:
-    """Run the one Python block of a page of docs/ that has these words, with names that the reader has; return all."""
-    path = ROOT / "docs" / page
-    (block,) = (block for block in blocks(path) if block.language == "python" and words in block.text)
-    exec(compile("\n" * (block.line - 1) + block.text, str(path), "exec"), names)  # noqa: S102 - our own pages
+    """Run such a block with names that the reader has; return all that it has then."""
+    block = find_example(page, words)
+    exec(compile("\n" * (block.line - 1) + block.text, page, "exec"), names)  # noqa: S102 - our own pages
     return names
