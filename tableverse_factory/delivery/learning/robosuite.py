@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Vector3
-from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.storage.files import write_atomic
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z, rotation_matrix
 from tableverse_factory.physics.mjcf.load import parse_document
@@ -30,8 +31,8 @@ def add_to_robosuite(
 ) -> dict[str, Any]:
     """Add a scene to a robosuite `Task`, with the settings with which it rests: in `_load_model` of an environment.
 
-    Integrator, cone, impratio and no-slip iterations of the task become the scene's. The timestep is robosuite's
-    (`macros.SIMULATION_TIMESTEP`, 0.002 s), as the scene's is by default.
+    Integrator, cone, impratio and no-slip iterations of the task become the scene's, and several contacts per pair are
+    enabled. The timestep is robosuite's (`macros.SIMULATION_TIMESTEP`, 0.002 s), as the scene's is by default.
 
     Args:
         task: To add to, of an arena without a table.
@@ -46,6 +47,7 @@ def add_to_robosuite(
 
     Raises:
         ConfigError: if robosuite is not installed.
+        InputError: `bad_mjcf` if the scene names files that are not its own.
     """
     try:
         from robosuite.models.objects import MujocoXMLObject
@@ -62,8 +64,7 @@ def add_to_robosuite(
         objects[name] = added
     task.merge_objects(list(objects.values()))
     task.mujoco_objects.extend(objects.values())
-    options = {name: value for its in document.findall("option") for name, value in its.attrib.items()}
-    task.root.find("option").attrib.update({name: options[name] for name in _OPTIONS if name in options})
+    _copy_options(document, task.root.find("option"))
     return objects
 
 
@@ -98,9 +99,21 @@ def _make_sensors(env: Any, body: str) -> dict[str, Any]:
     return {"pos": as_object(read_position), "quat": as_object(read_quaternion)}
 
 
+def _copy_options(document: ET.Element, option: ET.Element) -> None:
+    """Copy what lets a scene rest into the options of a task."""
+    own = {name: value for its in document.findall("option") for name, value in its.attrib.items()}
+    option.attrib.update({name: own[name] for name in _OPTIONS if name in own})
+    for flag in option.findall("flag") or [ET.SubElement(option, "flag")]:
+        flag.set("multiccd", "enable")
+
+
 def _write_objects(document: ET.Element, scene: Scene, folder: Path) -> dict[str, Path]:
     """Write a file per body and all assets, where they are not there yet. Returns the paths by the bodies' names."""
     files = scene.files()
+    for name in (value for its in document.iter() for key, value in its.attrib.items() if key.startswith("file")):
+        if f"assets/{name}" not in files:  # MuJoCo would look for it on the disk
+            called = sanitize_line(name, 80)
+            raise InputError(f"scene {scene.scene_id}: it names {called!r}, which is none of its files", "bad_mjcf")
     paths = {body.attrib["name"]: folder / f"{body.attrib['name']}.xml" for body in document.findall("worldbody/body")}
     written = {folder / name: data for name, data in files.items() if name.startswith("assets/")}
     for body in document.findall("worldbody/body"):

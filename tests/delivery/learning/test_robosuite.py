@@ -5,7 +5,9 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from tableverse_factory import find_unfit_settings
+from tableverse_factory import add_to_robosuite, find_unfit_settings
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.scene import Scene
 from tests.helpers.docs_pages import run_example
 from tests.helpers.exported_scenes import exported
 
@@ -41,3 +43,14 @@ def test_the_documented_environment_resets_steps_and_rests(tmp_path, monkeypatch
         assert env.check_contact(env.things[name], env.things["table"])
     known = set(env.model.geom_ids_to_instances.values())
     assert {"table", *THINGS} < known, "segmentation of instances"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_scene_that_names_other_files_is_refused(tmp_path):
+    pytest.importorskip("robosuite", reason="installed where it is tested, with an older MuJoCo")
+    own = exported()
+    files = own.files() | {"scene.xml": own.xml.replace('"obj_000.png"', '"../../own.png"').encode()}
+    with pytest.raises(InputError, match=r"it names '\.\./\.\./own\.png', which is none of its files"):
+        add_to_robosuite(None, Scene(own.scene_id, {}, files), tmp_path / "made")
+    assert not (tmp_path / "made").exists()
