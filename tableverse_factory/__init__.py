@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tableverse_factory.delivery.learning.loader import SceneDataset
     from tableverse_factory.delivery.learning.mjx import load_mjx_spec
     from tableverse_factory.delivery.learning.newton import add_to_newton
+    from tableverse_factory.delivery.learning.robosuite import add_to_robosuite
     from tableverse_factory.delivery.learning.sapien import add_to_sapien
     from tableverse_factory.delivery.learning.stream import SceneStream
     from tableverse_factory.delivery.learning.variation import Variation
@@ -35,6 +36,7 @@ __all__ = [
     "WarpBatch",
     "__version__",
     "add_to_newton",
+    "add_to_robosuite",
     "add_to_sapien",
     "attach_scene",
     "attach_to_dm_control",
@@ -56,6 +58,7 @@ _MODULES = {
     "VectorSim": "delivery.learning.vector_sim",
     "WarpBatch": "delivery.learning.warp",
     "add_to_newton": "delivery.learning.newton",
+    "add_to_robosuite": "delivery.learning.robosuite",
     "add_to_sapien": "delivery.learning.sapien",
     "load_mjx_spec": "delivery.learning.mjx",
     "attach_scene": "delivery.learning.attach",

@@ -104,3 +104,16 @@ def mentioned(page: Path) -> Iterator[str]:
     prose = "\n".join(line for line in page.read_text().splitlines() if line not in fenced)
     for match in _INLINE.finditer(prose):
         yield " ".join(match[1].split())
+
+
+def find_example(page: str, words: str) -> Block:
+    """The one Python block of a page of docs/ that has these words."""
+    (block,) = (its for its in blocks(ROOT / "docs" / page) if its.language == "python" and words in its.text)
+    return block
+
+
+def run_example(page: str, words: str, **names: object) -> dict[str, object]:
+    """Run such a block with names that the reader has; return all that it has then."""
+    block = find_example(page, words)
+    exec(compile("\n" * (block.line - 1) + block.text, page, "exec"), names)  # noqa: S102 - our own pages
+    return names

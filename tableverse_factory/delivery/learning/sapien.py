@@ -1,4 +1,4 @@
-"""Scenes in SAPIEN, and so in ManiSkill, whose scenes make actors in the same way."""
+"""Scenes in SAPIEN and in ManiSkill, whose scenes make actors in the same way."""
 
 import tempfile
 from pathlib import Path
@@ -11,6 +11,7 @@ from schemas.geometry import TriangleMesh
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.learning.vector_sim import compile_scene
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 
@@ -18,13 +19,26 @@ from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 DEPENETRATION_M_S = 0.05
 
 
-def add_to_sapien(world: Any, scene: Scene) -> dict[str, Any]:
-    """Add table and objects to a `sapien.Scene` or a `ManiSkillScene`, the table frame in its origin, without visuals.
+def add_to_sapien(
+    world: Any,
+    scene: Scene,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    yaw_rad: float = 0.0,
+    prefix: str = "",
+) -> dict[str, Any]:
+    """Add table and objects to a `sapien.Scene` or a `ManiSkillScene`, without visuals.
 
     Sliding friction, masses and inertia are the scene's; PhysX has no rolling friction.
 
+    Args:
+        world: To add to; every parallel scene of a `ManiSkillScene` gets the same bodies.
+        scene: Of a dataset.
+        position: Of the table frame in the world, z up [m].
+        yaw_rad: Turn of the table frame about the vertical [rad].
+        prefix: Of the actors' names, which ManiSkill wants to be unique.
+
     Returns:
-        The actor of each body, by the body's name.
+        The actor of each body, by the body's name. Those of ManiSkill have their pose in `initial_pose`.
 
     Raises:
         ConfigError: if SAPIEN is not installed.
@@ -36,19 +50,20 @@ def add_to_sapien(world: Any, scene: Scene) -> dict[str, Any]:
     model = compile_scene(scene, visuals=False)
     data = make_quiet_data(model)
     mujoco.mj_kinematics(model, data)
+    frame = sapien.Pose(position, quaternion_about_z(yaw_rad))
     actors = {}
     with tempfile.TemporaryDirectory() as folder:
         for body in range(1, model.nbody):
             name, builder = model.body(body).name, world.create_actor_builder()
             for geom in np.flatnonzero(model.geom_bodyid == body).tolist():
                 _add_collision(sapien, builder, model, geom, Path(folder))
-            builder.set_initial_pose(sapien.Pose(data.xpos[body], data.xquat[body]))
+            builder.set_initial_pose(frame * sapien.Pose(data.xpos[body], data.xquat[body]))
             if not model.body_jntnum[body]:
-                actors[name] = builder.build_static(name=name)
+                actors[name] = builder.build_static(name=prefix + name)
                 continue
             center = sapien.Pose(model.body_ipos[body], model.body_iquat[body])
             builder.set_mass_and_inertia(float(model.body_mass[body]), center, model.body_inertia[body])
-            actors[name] = builder.build(name=name)
+            actors[name] = builder.build(name=prefix + name)
             for part in _list_dynamic_parts(sapien, actors[name]):
                 part.set_max_depenetration_velocity(DEPENETRATION_M_S)
     return actors

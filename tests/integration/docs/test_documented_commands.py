@@ -42,6 +42,8 @@ PYTHON_CANNOT = (
     (r"from lerobot\.", "lerobot brings a gigabyte"),
     (r"mujoco_warp|WarpBatch", "mujoco-warp compiles for minutes; tests/delivery/learning has a test for it"),
     (r"from dm_control", "dm_control wants a MuJoCo of its own; tests/delivery/learning has a test for it"),
+    (r"robosuite", "robosuite wants an older MuJoCo; tests/delivery/learning has a test for it"),
+    (r"mani_skill", "ManiSkill brings torch and SAPIEN; tests/delivery/learning has a test for it"),
     (r"import pybullet", "pybullet compiles for minutes; tests/delivery/formats has a test for it"),
     (r"serve_forever|serve_policy", "serves until it is stopped"),
     (r"open_library", "needs textures that somebody photographed"),
