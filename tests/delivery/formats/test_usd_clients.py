@@ -92,10 +92,26 @@ def test_usd_s_own_validators_find_nothing(folder):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_the_scene_rests_in_newton_s_importer_of_usd(folder):
-    """Run with newton 1.8.0 on Warp's CPU backend."""
+    """Run with newton 1.8.0 and usd-core 26.11 on Warp's CPU backend, as docs/simulators.md says."""
     newton = pytest.importorskip("newton", reason="installed where it is tested")
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     resolvers = [newton.usd.SchemaResolverNewton(), newton.usd.SchemaResolverMjc()]
-    builder.add_usd(str(folder / "scene.usd"), schema_resolvers=resolvers)
-    assert builder.body_count == 3
+    builder.add_usd(str(folder / "scene.usd"), schema_resolvers=resolvers, load_visual_shapes=False)
+    model, ours = builder.finalize(), exported().model()
+    masses = dict(zip(model.body_label, model.body_mass.numpy().tolist(), strict=True))
+    assert masses == pytest.approx({f"/World/{name}": ours.body(name).mass[0] for name in NAMES}, rel=1e-5)
+    state, after = model.state(), model.state()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    pipeline = newton.CollisionPipeline(model, broad_phase="explicit", reduce_contacts=False)
+    contacts = pipeline.contacts()
+    solver = newton.solvers.SolverMuJoCo(model, use_mujoco_contacts=False, nconmax=256, njmax=1536)
+    assert (solver.mj_model.opt.cone, solver.mj_model.opt.impratio) == (ours.opt.cone, ours.opt.impratio)
+    np.testing.assert_allclose(np.unique(solver.mj_model.geom_solref, axis=0), [ours.geom("obj_000_piece_00").solref])
+    start = state.body_q.numpy()
+    for _ in range(250):
+        state.clear_forces()
+        pipeline.collide(state, contacts)
+        solver.step(state, after, None, contacts, ours.opt.timestep)
+        state, after = after, state
+    assert np.abs(state.body_q.numpy() - start).max() < 1e-3
