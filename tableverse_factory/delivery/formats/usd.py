@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from schemas.identity import make_file_stem
-from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.delivery.formats.model_contents import ModelContents, ModelObject, VisualMesh
 from tableverse_factory.delivery.formats.usd_meshes import define_mesh, define_surface, set_at_corners
@@ -36,7 +35,6 @@ def encode_usd(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, 
     Prims are named after the objects as far as USD allows; object ids and `labels`, untrusted text, are in
     `customData`.
     """
-    import_extra("pxr", "USD", "usd")
     from pxr import Usd, UsdGeom, UsdPhysics
 
     files: dict[str, bytes] = {}
