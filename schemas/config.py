@@ -281,6 +281,10 @@ class ExportConfig(StageSection):
     """JPEG quality of `observation/color.jpg`, from which the textures are made too."""
     surroundings: Literal["plain", "photograph"] = "plain"
     """`photograph` shows the picture's table and background without its objects; `plain` a table of its colour."""
+    poses: Literal["settled", "rectified", "placed"] = "settled"
+    """Poses of the objects. `rectified` leaves out settling, `placed` rectification too; such scenes may collide and
+    move, as their certificate then says. For experiments (docs/policies.md).
+    """
 
 
 class TrajectoriesConfig(StageSection):

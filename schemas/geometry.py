@@ -5,6 +5,7 @@ the table frame has z up, its origin on the table plane, x to the camera's right
 """
 
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,18 +24,23 @@ IdImage = Int32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 
 
+@cache
+def _list_fields(kind: type[Any]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
+
+
 class Frozen:
     """Mixin that makes the arrays of frozen dataclasses read-only, which `frozen=True` alone does not."""
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for field in fields(self):  # type: ignore[arg-type]
-            value: Any = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
+        for name in _list_fields(type(self)):
+            value: Any = getattr(self, name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
                 view = value.view()
                 view.flags.writeable = False
-                object.__setattr__(self, field.name, view)
+                object.__setattr__(self, name, view)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -150,13 +150,20 @@ def _choose_gpus(device: str, wanted: int | None) -> int:
 @train.command("policy")
 def train_policy(
     folder: TrainFolder,
-    dataset: Annotated[
-        str | None, typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories, read the first time.")
+    datasets: Annotated[
+        list[str] | None,
+        typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories, read the first time; may repeat."),
     ] = None,
     steps: TrainSteps = 16_000,
     minutes: TrainMinutes = None,
     goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 256,
     chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 1_024,
+    scenes: Annotated[
+        int | None, typer.Option(min=1, help="Learn the motions of so many scenes; of all without.")
+    ] = None,
+    motions: Annotated[
+        int | None, typer.Option(min=1, help="Learn so many motions, of each scene as many; all without.")
+    ] = None,
     state: Annotated[
         Path | None,
         typer.Option("--pictures-from", metavar="WEIGHTS", dir_okay=False, exists=True, help=_PICTURES_FROM),
@@ -164,7 +171,7 @@ def train_policy(
     seed: TrainSeed = 0,
     device: TrainDevice = "auto",
 ) -> None:
-    """Train a policy on states from the successful motions of a dataset's splits train and validation.
+    """Train a policy on states from the successful motions of the splits train and validation.
 
     Writes DIR/demonstrations.npz (the motions, packed), DIR/checkpoint.safetensors and DIR/weights.safetensors, with
     which `tableverse benchmark run` plays it; with --pictures-from also DIR/pictures.npz. What is packed already is not
@@ -181,25 +188,25 @@ def train_policy(
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    demonstrations = _provide_packed(folder / "demonstrations.npz", dataset, pictures=False)
+    demonstrations = _provide_packed(folder / "demonstrations.npz", datasets or [], pictures=False)
     run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
-    settings = PolicySettings(steps, seed, goals, chunks=chunks)
+    settings = PolicySettings(steps, seed, goals, chunks=chunks, scenes=scenes, motions=motions)
     if state is None:
         done = train_state_policy(settings, run, say)
     else:
-        pictures = _provide_packed(folder / "pictures.npz", dataset, pictures=True)
+        pictures = _provide_packed(folder / "pictures.npz", datasets or [], pictures=True)
         done = train_picture_policy(settings, run, pictures, state, say)
     print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
     print(f"{folder / 'weights.safetensors'}: give it to `tableverse benchmark run --weights`")
 
 
-def _provide_packed(path: Path, dataset: str | None, pictures: bool) -> Path:
-    """Pack the dataset's motions, or their first pictures, unless an earlier command did, and return their file."""
+def _provide_packed(path: Path, datasets: list[str], pictures: bool) -> Path:
+    """Pack the datasets' motions, or their first pictures, unless an earlier command did, and return their file."""
     from tableverse_factory.core.errors import ConfigError
 
     if path.is_file():
         return path
-    if dataset is None:
+    if not datasets:
         raise ConfigError(f"{path} is not there: give --dataset, whose motions are packed into it")
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.process_pool import count_available_cpus
@@ -208,11 +215,12 @@ def _provide_packed(path: Path, dataset: str | None, pictures: bool) -> Path:
     from tableverse_factory.evaluation.training.policy.pack_pictures import pack_pictures
 
     path.parent.mkdir(parents=True, exist_ok=True)
+    opened = [open_dataset(dataset) for dataset in datasets]
     with count_progress("scenes") as done:
         if pictures:
-            pack_pictures(open_dataset(dataset), on_scene=done.update, jobs=count_available_cpus()).write(path)
+            pack_pictures(opened, on_scene=done.update, jobs=count_available_cpus()).write(path)
         else:
-            pack_demonstrations(open_dataset(dataset), on_scene=done.update).write(path)
+            pack_demonstrations(opened, on_scene=done.update).write(path)
     return path
 
 

@@ -4,7 +4,14 @@ Results that a test computes in its own process then have the last digits of tho
 """
 
 import os
+import sys
 from pathlib import Path
 
-if " avx2 " in Path("/proc/cpuinfo").read_text():
-    os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
+import pytest
+
+if "OPENBLAS_CORETYPE" not in os.environ and " avx2 " in Path("/proc/cpuinfo").read_text():
+    if "numpy" in sys.modules:
+        raise pytest.UsageError(
+            "a plugin of pytest imports numpy too early: name it in addopts (pyproject.toml) as `-p no:`"
+        )
+    os.environ["OPENBLAS_CORETYPE"] = "Haswell"

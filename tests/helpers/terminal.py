@@ -55,9 +55,10 @@ def watch(
             except OSError:  # Linux says so where others say end of file
                 break
             raw += data
-            stream.feed(data)
+            for line in data.splitlines(keepends=True):  # on a busy machine a read has several drawings
+                stream.feed(line)
+                looks.append(_look_at(screen))
             first = first or time.monotonic()
-        looks.append([line.rstrip() for line in screen.display if line.strip()])
         if first and at is not None and time.monotonic() - first > at:
             at = None
             if then is not None:
@@ -69,12 +70,16 @@ def watch(
     os.close(terminal)
     return Seen(
         code,
-        looks[-1],
+        _look_at(screen),
         [text_of(line, columns) for line in screen.history.top],
         raw,
         looks,
         pyte.modes.DECTCEM not in screen.mode,
     )
+
+
+def _look_at(screen: pyte.Screen) -> list[str]:
+    return [line.rstrip() for line in screen.display if line.strip()]
 
 
 def text_of(line: Mapping[int, pyte.screens.Char], columns: int) -> str:

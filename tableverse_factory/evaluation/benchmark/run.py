@@ -1,27 +1,18 @@
 """Run of a policy on a benchmark: in parallel, resumable, with the same results from any number of processes."""
 
-import fcntl
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
-from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.evaluation.benchmark.benchmark import AXES, SPLITS, Axis, Benchmark, Episode, Split
 from tableverse_factory.evaluation.benchmark.episode_processes import EpisodeProcesses, PlayPlan, PolicyDescription
+from tableverse_factory.evaluation.benchmark.journal import open_journal
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
 from tableverse_factory.evaluation.benchmark.play import check_scene
-from tableverse_factory.evaluation.benchmark.results import (
-    EpisodeResult,
-    ResultsHeader,
-    decode_results,
-    encode_line,
-    encode_results,
-    read_results,
-)
+from tableverse_factory.evaluation.benchmark.results import EpisodeResult, ResultsHeader, encode_line, encode_results
 
 EPISODE_S = 300.0
 
@@ -60,7 +51,7 @@ def run_benchmark(
     plan = PlayPlan(benchmark, dataset.path, policy)
     with EpisodeProcesses(plan, settings.episode_s) as processes:
         header = _make_header(benchmark, policy, processes.describe_policy())
-        with _open_journal(out, header) as (file, known):
+        with open_journal(out, header) as (file, known):
             left = [episode for episode in chosen if episode.episode_id not in known]
             total = len(known) + len(left)
             progress(len(known), total)
@@ -98,47 +89,3 @@ def check_scenes(benchmark: Benchmark, dataset: Dataset, episodes: Sequence[Epis
         )
     for scene in needed:
         check_scene(benchmark, dataset.scene(scene))
-
-
-@contextmanager
-def _open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
-    """Open the file that rows are appended to, locked, with the rows that it and `out` hold."""
-    path = out.with_name(f"{out.name}.journal")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+b") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise BuildError(
-                f"{out}: another process writes these results; wait for it, or give another --out"
-            ) from None
-        known = dict(read_results(out)[1]) if _is_of_run(out, header) else {}
-        file.seek(0)
-        data = file.read()
-        whole = data[: data.rfind(b"\n") + 1]  # a killed process may have torn its last line
-        file.truncate(len(whole))
-        if whole:
-            found, rows = decode_results(whole, str(path))
-            _check_header(path, found, header)
-            known |= rows
-        else:
-            file.write(encode_line(header))
-            file.flush()
-        yield file, known
-
-
-def _is_of_run(out: Path, header: ResultsHeader) -> bool:
-    if not out.exists():
-        return False
-    _check_header(out, read_results(out)[0], header)
-    return True
-
-
-def _check_header(path: Path, found: ResultsHeader, header: ResultsHeader) -> None:
-    if found == header:
-        return
-    names = [name for name in ResultsHeader.model_fields if getattr(found, name) != getattr(header, name)]
-    raise InputError(
-        f"{path} holds results of another run ({', '.join(names)} differ): give another --out, or remove it",
-        "other_results",
-    )

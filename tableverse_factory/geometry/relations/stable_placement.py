@@ -185,12 +185,12 @@ def drop_body(
 
 def is_stable(x: BodyFeatures, touching: CellMask) -> bool:
     """Whether the centre is over the `touching` cells of the map, with a margin, and most of the base is carried."""
-    i, j = np.nonzero(touching)
-    contacts = (np.stack([i, j], axis=1) + np.array(x.heights.corner) + 0.5) * x.heights.cell
-    reach = (contacts @ _DIRECTIONS).max(axis=0) + x.heights.cell / 2
     base = x.heights.bottom <= x.low[2] + CONTACT_M
-    carried = int((touching & base).sum()) >= _SUPPORT_SHARE * int(base.sum())
-    return carried and bool((x.center[:2] @ _DIRECTIONS + _STAND_MARGIN_M <= reach).all())
+    if np.count_nonzero(touching & base) < _SUPPORT_SHARE * np.count_nonzero(base):
+        return False
+    contacts = (np.argwhere(touching) + np.array(x.heights.corner) + 0.5) * x.heights.cell
+    reach = (contacts @ _DIRECTIONS).max(axis=0) + x.heights.cell / 2
+    return bool((x.center[:2] @ _DIRECTIONS + _STAND_MARGIN_M <= reach).all())
 
 
 def _fits_cavity(x: BodyFeatures, here: HeightMap, rise: float, y: BodyFeatures) -> bool:

@@ -18,7 +18,7 @@ from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.cousins.arrangement import Arrangement
 from tableverse_factory.stages.cousins.changes import Draft
-from tableverse_factory.stages.cousins.parent import read_parent, read_scene_object
+from tableverse_factory.stages.cousins.parent import ParentScene, read_parent, read_scene_object
 from tableverse_factory.stages.cousins.reflection import mirror_object
 
 Row = Mapping[str, Any]
@@ -41,11 +41,9 @@ def derive_cousin(
         return Dropped(item.rejected, item.rejected_detail)
     try:
         recipe = _read_recipe(item)
-        dataset = _open(item.uri)
-        scene = dataset.scene(item.parent)
-        _check_content(item.uri, item.content_sha256, scene.object_rows())
-        parent = read_parent(scene, config.observe)
-        draft = Draft(Arrangement(parent.objects, parent.table), rng, _list_donors(dataset, recipe, config.observe))
+        parent = _read_parent(item.uri, item.parent, item.content_sha256, config.observe)
+        donors = _list_donors(_open(item.uri), recipe, config.observe)
+        draft = Draft(Arrangement(parent.objects, parent.table), rng, donors)
         for change in recipe.changes:
             if change is not Change.MIRROR:
                 draft.make(change)
@@ -63,6 +61,13 @@ def derive_cousin(
     return Done(
         PlacedObjects(item.scene_id, parent.table, objects, perception=parent.perception, changes=tuple(draft.changes))
     )
+
+
+@lru_cache(2)  # a worker makes the cousins of a scene one after the other
+def _read_parent(uri: str, scene_id: str, digest: str, bounds: ObserveConfig) -> ParentScene:
+    scene = _open(uri).scene(scene_id)
+    _check_content(uri, digest, scene.object_rows())
+    return read_parent(scene, bounds)
 
 
 def _read_recipe(item: ImageRow) -> Recipe:

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from schemas.config import Config
+from schemas.config import Config, ExportConfig
+from schemas.geometry import Pose
 from schemas.objects import PlacedObject
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import Certificate, CuratedScene, ExportedScene, RectifiedLayout
@@ -24,6 +26,7 @@ from tableverse_factory.physics.mjcf.spec import (
     TableTexture,
     make_scene_body,
     make_scene_files,
+    quantize_pose,
 )
 from tableverse_factory.physics.simulate.certificate import Measurement, certify
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, increase_rolling_friction, move_bodies
@@ -51,18 +54,19 @@ def export(
 ) -> Outcome[ExportedScene]:
     """Write the scene with the judged masses, settle it with them, and certify the written files.
 
-    No scene with a penetration deeper than `export.epsilon_m` or with motion is exported. Drops: `unusable_mesh`,
-    `simulation_unstable`, `object_fell`, `not_at_rest`, `colliding`.
+    No scene with a penetration deeper than `export.epsilon_m` or with motion is exported, unless `export.poses` asks
+    for one that was not settled. Drops: `unusable_mesh`, `simulation_unstable`, `object_fell`, `not_at_rest`,
+    `colliding`.
     """
     layout = scene.settled.rectified
     try:
-        bodies = _build_bodies(scene)
+        bodies = _build_bodies(scene, config.export.poses)
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
     objects = layout.placed.objects
     slab = fit_slab(layout.placed.table, [o.mesh for o in objects], layout.poses, [o.scale for o in objects])
     written = _settle_and_certify(scene, bodies, slab, _dress(scene, slab, config, rng), config)
-    if (reason := _explain_refusal(written, config.export.epsilon_m)) is not None:
+    if (reason := _explain_refusal(written, config.export)) is not None:
         return reason
     return Done(_assemble(scene, written))
 
@@ -93,18 +97,29 @@ class _CertifiedFiles:
     sizes: SimulationSizes
 
 
-def _build_bodies(scene: CuratedScene) -> tuple[SceneBody, ...]:
+def _choose_poses(scene: CuratedScene, which: Literal["settled", "rectified", "placed"]) -> Sequence[Pose]:
+    """Choose the poses of `export.poses`; a copy, which no picture shows, is placed by rectification."""
+    layout = scene.settled.rectified
+    if which == "settled":
+        return scene.settled.poses
+    if which == "rectified":
+        return layout.poses
+    items = zip(layout.placed.objects, layout.poses, strict=True)
+    return [rectified if item.copy_of else item.pose for item, rectified in items]
+
+
+def _build_bodies(scene: CuratedScene, which: Literal["settled", "rectified", "placed"]) -> tuple[SceneBody, ...]:
     layout = scene.settled.rectified
     masses = {verdict.object_id: verdict.mass_kg for verdict in scene.assessment.objects}
     objects, evidence = layout.placed.objects, layout.placed.evidence
     pictures: Sequence[ColorProjector | None] = [None] * len(objects)
     if evidence is not None:
         pictures = load_projectors(evidence, [item.pose for item in objects], [item.scale for item in objects])
-    bodies = []
+    bodies, poses = [], _choose_poses(scene, which)
     for index, (item, pieces) in enumerate(zip(objects, layout.pieces, strict=True)):
         if item.object_id not in masses:
             raise TableverseError(f"{scene.scene_id}: the assessment has no mass for {item.object_id}")
-        pose = scene.settled.poses[index]
+        pose = quantize_pose(poses[index])
         body = make_scene_body(item.object_id, item.mesh, pieces.hulls, item.scale, masses[item.object_id], pose)
         looks = replace(body, color=PALETTE[index % len(PALETTE)], appearance=bake_texture(item.mesh, pictures[index]))
         bodies.append(apply_material_friction(item.label, looks))
@@ -118,7 +133,8 @@ def _settle_and_certify(
     layout, step, limit = scene.settled.rectified, config.settle.timestep_s, config.settle.max_time_s
     history, seen = _build_history(layout), layout.placed.evidence
     view = None if seen is None else PosedCamera(seen.camera, seen.camera_to_table)
-    rests = all(map(_has_settled_mass, layout.placed.objects, bodies))
+    settles = config.export.poses == "settled"
+    rests = not settles or all(map(_has_settled_mass, layout.placed.objects, bodies))
     for attempt in range(SETTLINGS):
         if not rests:
             bodies, _ = bring_to_rest(bodies, slab, timestep_s=step, max_time_s=limit, gentle=attempt > 0)
@@ -132,7 +148,7 @@ def _settle_and_certify(
         )
         model = files.model()
         certificate, measured = certify(model, history, config.export.epsilon_m)
-        if certificate.at_rest or certificate.fell or measured.warnings:
+        if not settles or certificate.at_rest or certificate.fell or measured.warnings:
             break
         bodies, rests = increase_rolling_friction(move_bodies(bodies, measured.end_poses), set(measured.moved)), False
     return _CertifiedFiles(tuple(bodies), files, certificate, measured, measure_sizes(model))
@@ -153,10 +169,12 @@ def _build_history(layout: RectifiedLayout) -> PoseHistory:
     )
 
 
-def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | None:
+def _explain_refusal(written: _CertifiedFiles, export: ExportConfig) -> Dropped | None:
     certificate, measured = written.certificate, written.measured
     if measured.warnings:
         return Dropped("simulation_unstable", f"MuJoCo warned of {', '.join(measured.warnings)}")
+    if export.poses != "settled":
+        return None
     if certificate.fell:
         return Dropped("object_fell", f"{', '.join(certificate.fell[:10])} fell")
     if not certificate.at_rest:
@@ -164,7 +182,7 @@ def _explain_refusal(written: _CertifiedFiles, epsilon_m: float) -> Dropped | No
         return Dropped("not_at_rest", f"{drift} in 5 s: {', '.join(measured.moved[:10])}")
     if certificate.colliding:
         pieces, meshes = (f"{depth * 1e3:.2f} mm ({pair})" for depth, pair in (measured.pieces, measured.meshes))
-        return Dropped("colliding", f"deeper than {epsilon_m * 1e3:g} mm: pieces {pieces}, meshes {meshes}")
+        return Dropped("colliding", f"deeper than {export.epsilon_m * 1e3:g} mm: pieces {pieces}, meshes {meshes}")
     return None
 
 

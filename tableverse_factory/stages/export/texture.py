@@ -11,7 +11,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float64
 
-from schemas.geometry import Points, TriangleMesh
+from schemas.geometry import Points, Texture, TriangleMesh
+from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.core.png import encode_png
 from tableverse_factory.physics.mjcf.obj_assets import Appearance
 from tableverse_factory.stages.export.atlas import Atlas, find_corner_texels, lay_out_atlas, list_triangle_texels
@@ -21,6 +22,8 @@ SMALL_SIDE, LARGE_SIDE = 256, 512
 COARSER = 0.8  # factor of the density after each try that does not fit
 SMALL_TRIES, LARGE_TRIES = 4, 24  # small: down to half the picture's density; large: until the atlas fits
 
+REMEMBERED_BYTES = 64 * 1024 * 1024  # textures of a hundred things
+
 # Maps faces and barycentric weights of points on them to sRGB.
 Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray, "n 3"]]
 
@@ -28,7 +31,7 @@ Painter = Callable[[np.ndarray, Float64[np.ndarray, "n 3"]], Float64[np.ndarray,
 def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -> Appearance | None:
     """Bake the mesh's own texture, else one from its vertex colours and the picture; None without colours."""
     if mesh.texture is not None:
-        return Appearance.at_corners(encode_png(np.asarray(mesh.texture.picture)), mesh.texture.corner_uv)
+        return _encode_texture(mesh.texture)
     if mesh.vertex_colors is None:
         return None
     photographed = None if photograph is None else PhotographedMesh(photograph, mesh)
@@ -36,6 +39,12 @@ def bake_texture(mesh: TriangleMesh, photograph: ColorProjector | None = None) -
     painter = partial(_paint, mesh, photographed, detail > 0.0)
     atlas = _choose_atlas(mesh, detail)
     return _bake_faces(len(mesh.faces), painter) if atlas is None else _bake_atlas(atlas, painter)
+
+
+@memoize_by_content(REMEMBERED_BYTES)
+def _encode_texture(texture: Texture) -> Appearance:
+    """Cached: layouts and cousins show the same things in scene after scene."""
+    return Appearance.at_corners(encode_png(np.asarray(texture.picture)), texture.corner_uv)
 
 
 def _measure_detail(mesh: TriangleMesh, photographed: PhotographedMesh | None) -> Float64[np.ndarray, " m"]:

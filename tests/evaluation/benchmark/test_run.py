@@ -5,15 +5,19 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.evaluation.benchmark.benchmark import Benchmark
+from tableverse_factory.evaluation.benchmark.journal import open_journal
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
-from tableverse_factory.evaluation.benchmark.results import encode_results, read_results
+from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_results, read_results
 from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
 from tests.helpers.learnable_dataset import write_learnable_dataset
 from tests.helpers.paths import ROOT
@@ -164,3 +168,29 @@ def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, datase
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(BuildError, match="another process writes these results"):
             run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+
+
+def test_only_one_run_at_a_time_has_the_journal(tmp_path):
+    """Also where one opens it while another ends and removes it."""
+    out, until = tmp_path / "r.jsonl", time.monotonic() + 1.0
+    header = ResultsHeader(
+        benchmark="0" * 64, policy="p", policy_digest="0" * 64, privileged=False, pictures=(), picture_size=(96, 128)
+    )
+    alone, runs = threading.Lock(), []
+
+    def run_again_and_again() -> None:
+        while time.monotonic() < until:
+            with suppress(BuildError), open_journal(out, header) as (file, _):
+                runs.append(is_alone := alone.acquire(blocking=False))
+                time.sleep(0.0005)
+                if is_alone:
+                    alone.release()
+                Path(file.name).unlink(missing_ok=True)
+
+    threads = [threading.Thread(target=run_again_and_again) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(runs) > 10
+    assert all(runs)

@@ -35,8 +35,9 @@ SOLIDS = [
 ]
 
 
-def run(scene: CuratedScene) -> Outcome[ExportedScene]:
-    return export(scene, Config(), np.random.default_rng(0), Services(Path("unused")))
+def run(scene: CuratedScene, poses: str = "settled") -> Outcome[ExportedScene]:
+    config = Config.model_validate({"export": {"poses": poses}})
+    return export(scene, config, np.random.default_rng(0), Services(Path("unused")))
 
 
 def exported(scene: CuratedScene) -> ExportedScene:
@@ -140,6 +141,20 @@ def test_a_planted_collision_of_meshes_never_leaves() -> None:
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "colliding"
     assert "3.00 mm (obj_000 & obj_001)" in outcome.detail
+
+
+@pytest.mark.parametrize(("poses", "depth_m"), [("placed", 0.01), ("rectified", 0.004)])
+def test_a_scene_that_is_not_settled_is_written_as_it_is_and_not_certified(poses: str, depth_m: float) -> None:
+    side = 0.05
+    before = layout([Solid(box(side, side, side), (x, 0.0, side / 2)) for x in (0.0, side - 0.01)])
+    between = replace(before.poses[1], position=np.array([side - 0.004, 0.0, side / 2]))
+    settled = replace(as_settled(replace(before, poses=(before.poses[0], between))), poses=before.poses)
+    outcome = run(curated(settled), poses)
+    assert isinstance(outcome, Done)
+    assert outcome.value.object_rows[1]["x_m"] == pytest.approx(side - depth_m)
+    assert outcome.value.certificate.piece_penetration_m == pytest.approx(depth_m, abs=1e-6)
+    assert outcome.value.scene_row["colliding"]
+    assert not outcome.value.scene_row["at_rest"]
 
 
 def test_a_planted_collision_of_pieces_is_pushed_apart_or_refused() -> None:

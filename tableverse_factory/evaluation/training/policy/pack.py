@@ -1,6 +1,7 @@
 """Packing of a dataset's successful motions into one file of demonstrations."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,38 +39,55 @@ Row = Mapping[str, Any]
 Arrays = dict[str, np.ndarray]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneMotions:
+    """Successful motions of one scene, as rows of trajectories/, and its split."""
+
+    dataset: Dataset
+    scene_id: str
+    rows: list[Row]
+    split: str
+
+
 def pack_demonstrations(
-    dataset: Dataset,
+    datasets: Sequence[Dataset],
     splits: Sequence[str] = ("train", "validation"),
     robot: str = "panda",
     on_scene: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Demonstrations:
-    """Pack the successful motions of an arm in these splits, by scene and task; of `validation` they are held out.
+    """Pack the successful motions of an arm in these splits, by dataset, scene and task; of `validation` held out.
 
     Raises:
         InputError: `no_trajectories` where there are none.
     """
-    packer, motions = _Packer(robot), list_motions(dataset, splits, robot)
-    for done, (scene_id, (rows, split)) in enumerate(motions.items(), 1):
-        packer.add_scene(dataset.scene(scene_id), rows, split == "validation")
+    packer, motions = _Packer(robot), list_motions(datasets, splits, robot)
+    for done, own in enumerate(motions, 1):
+        packer.add_scene(own.dataset.scene(own.scene_id), own.rows, own.split == "validation")
         on_scene(done, len(motions))
     return packer.finish()
 
 
-def list_motions(dataset: Dataset, splits: Sequence[str], robot: str) -> dict[str, tuple[list[Row], str]]:
-    """List the successful motions of an arm, and the split, of each scene of these splits that has any.
+def list_motions(datasets: Sequence[Dataset], splits: Sequence[str], robot: str) -> list[SceneMotions]:
+    """List the scenes of these splits with successful motions of an arm, of one dataset after another.
 
-    Tasks of nouns that the benchmark holds out are left out.
+    Splits are each dataset's own. Tasks of nouns that the benchmark holds out are left out.
     """
+    found = [own for dataset in datasets for own in _list_scenes(dataset, splits, robot)]
+    if not found:
+        names = ", ".join(str(dataset.path) for dataset in datasets)
+        raise InputError(f"{names}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
+    return found
+
+
+def _list_scenes(dataset: Dataset, splits: Sequence[str], robot: str) -> list[SceneMotions]:
     tasks = list_split_tasks(dataset, robot)
-    found = dataset.trajectories.to_table(filter=pc.field("success") & (pc.field("robot") == robot)).to_pylist()
-    motions: dict[str, tuple[list[Row], str]] = {}
-    for row in sorted(found, key=lambda row: (row["scene_id"], row["task_id"])):
-        if (split := tasks.get((row["scene_id"], row["task_id"]))) is not None and split in splits:
-            motions.setdefault(row["scene_id"], ([], split))[0].append(row)
-    if not motions:
-        raise InputError(f"{dataset.path}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
-    return motions
+    rows = dataset.trajectories.to_table(filter=pc.field("success") & (pc.field("robot") == robot)).to_pylist()
+    scenes: dict[str, SceneMotions] = {}
+    for row in sorted(rows, key=lambda row: (row["scene_id"], row["task_id"])):
+        scene_id = row["scene_id"]
+        if (split := tasks.get((scene_id, row["task_id"]))) is not None and split in splits:
+            scenes.setdefault(scene_id, SceneMotions(dataset, scene_id, [], split)).rows.append(row)
+    return list(scenes.values())
 
 
 class _Packer:

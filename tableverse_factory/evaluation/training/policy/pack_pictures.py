@@ -24,15 +24,15 @@ from tableverse_factory.robotics.robots.registry import load_arm
 
 
 def pack_pictures(
-    dataset: Dataset,
+    datasets: Sequence[Dataset],
     splits: Sequence[str] = ("train", "validation"),
     robot: str = "panda",
     on_scene: Callable[[int, int], object] = lambda _done, _total: None,
     jobs: int = 1,
 ) -> FirstPictures:
     """Take and pack the pictures that `pack_demonstrations` with the same arguments has the motions of."""
-    motions = list_motions(dataset, splits, robot)
-    scenes = [(str(dataset.path), robot, scene_id, rows) for scene_id, (rows, _) in motions.items()]
+    motions = list_motions(datasets, splits, robot)
+    scenes = [(str(own.dataset.path), robot, own.scene_id, own.rows) for own in motions]
     files: list[bytes] = []
     words: list[np.ndarray] = []
     for done, own in enumerate(parallel_map(_take_pictures, scenes, jobs, "takes pictures"), 1):

@@ -13,6 +13,8 @@ class PolicySettings:
         flows: Noises per goal.
         chunks: Chunks per step.
         rate: Peak of the learning rate.
+        scenes: Number of the scenes whose motions are learnt; None for all.
+        motions: Number of motions that are learnt, taken from these scenes in turn; None for all.
     """
 
     steps: int
@@ -21,6 +23,8 @@ class PolicySettings:
     flows: int = 8
     chunks: int = 1024
     rate: float = 6e-4
+    scenes: int | None = None
+    motions: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

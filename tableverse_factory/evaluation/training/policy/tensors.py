@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.training.policy.choose_motions import choose_motions
 from tableverse_factory.evaluation.training.policy.demonstrations import (
     OPENING_M,
     POINT_M,
@@ -32,8 +33,13 @@ PRE_GRASP, GRASP, POST_GRASP, PRE_PLACE, PLACE, POST_PLACE = range(6)
 class DemonstrationTensors:
     """Demonstrations as tensors; a `…_turn` is a matrix and a `…_at` a position, in the table frame."""
 
-    def __init__(self, demonstrations: Demonstrations, device: str) -> None:
-        """Copy them to the device; InputError where one has no grasp or no release."""
+    def __init__(
+        self, demonstrations: Demonstrations, device: str, scenes: int | None = None, motions: int | None = None
+    ) -> None:
+        """Copy them to the device; InputError where one has no grasp or no release.
+
+        Of those that are not held out, `choose_motions` chooses which are learnt.
+        """
         own = demonstrations
 
         def load(array: np.ndarray, unit: float = 1.0) -> Tensor:
@@ -62,8 +68,11 @@ class DemonstrationTensors:
         kinds, sides = describe_relations([RELATIONS[k] for k in own.relations])
         self.kind, self.side = kinds.to(device), sides.to(device)
         self._find_goals(own, device)
-        held_out = torch.tensor(own.held_out.astype(bool), device=device)
-        self.choices = {False: self._list(~held_out), True: self._list(held_out)}
+        learnt, held_out = choose_motions(own, scenes, motions), own.held_out.astype(bool)
+        self.choices = {
+            False: self._list(torch.tensor(learnt, device=device)),
+            True: self._list(torch.tensor(held_out, device=device)),
+        }
 
     def _list(self, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """List the chosen demonstrations and their samples."""

@@ -67,7 +67,7 @@ def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int
 
     A checkpoint in the folder is continued.
     """
-    data = DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device)
+    data = _load(settings, run)
     return _train(data, StateLesson(data), settings, run, log, _hash_files(run.demonstrations))
 
 
@@ -76,10 +76,7 @@ def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path
 
     Its motions are taken over: they find their way without objects, as they were trained to.
     """
-    data, packed = (
-        DemonstrationTensors(Demonstrations.read(run.demonstrations), run.device),
-        FirstPictures.read(pictures),
-    )
+    data, packed = _load(settings, run), FirstPictures.read(pictures)
     if len(packed.ends) != len(data.last):
         raise InputError(f"{pictures} has pictures of {len(packed.ends)} demonstrations, not of {len(data.last)}")
     teacher = make_network(0)
@@ -88,6 +85,11 @@ def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path
     words = torch.tensor(packed.words.astype("int64"), device=run.device)
     lesson = PictureLesson(data, shown, words, teacher.motion.state_dict())
     return _train(data, lesson, settings, run, log, _hash_files(run.demonstrations, pictures, state))
+
+
+def _load(settings: PolicySettings, run: TrainRun) -> DemonstrationTensors:
+    own = Demonstrations.read(run.demonstrations)
+    return DemonstrationTensors(own, run.device, settings.scenes, settings.motions)
 
 
 def _train(

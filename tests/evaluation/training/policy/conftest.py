@@ -24,7 +24,7 @@ def packed(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tableverse_factory.evaluation.training.policy.pack import pack_demonstrations
 
     path = tmp_path_factory.mktemp("packed") / "demonstrations.npz"
-    own = pack_demonstrations(dataset, tuple(SPLITS))
+    own = pack_demonstrations([dataset], tuple(SPLITS))
     replace(own, held_out=np.zeros_like(own.held_out)).write(path)
     return path
 

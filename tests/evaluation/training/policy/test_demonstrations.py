@@ -9,6 +9,7 @@ import pytest
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.dataset.splits import SPLITS
 from tableverse_factory.evaluation.training.policy.chain import load_chain
 from tableverse_factory.evaluation.training.policy.demonstrations import (
     OPENING_M,
@@ -54,9 +55,17 @@ def test_the_file_gives_back_what_was_written_and_the_same_bytes(packed: Path, t
         assert not getattr(own, field.name).flags.writeable
 
 
+def test_datasets_are_packed_one_after_another(dataset: Dataset, packed: Path) -> None:
+    one, two = Demonstrations.read(packed), pack_demonstrations([dataset, dataset], tuple(SPLITS))
+    assert two.scenes.tolist() == [0, 1]
+    assert two.ends.tolist() == [len(one.tcp), 2 * len(one.tcp)]
+    assert np.array_equal(two.tcp, np.concatenate([one.tcp, one.tcp]))
+    assert np.array_equal(two.points[two.objects[1, 0]], one.points[one.objects[0, 0]])
+
+
 def test_a_dataset_without_motions_in_a_split_is_refused(dataset: Dataset) -> None:
     with pytest.raises(InputError, match=r"no motion of panda in nowhere succeeds"):
-        pack_demonstrations(dataset, ("nowhere",))
+        pack_demonstrations([dataset], ("nowhere",))
 
 
 def test_files_of_other_content_are_refused(packed: Path, tmp_path: Path) -> None:

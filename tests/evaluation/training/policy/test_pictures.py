@@ -40,7 +40,7 @@ pytestmark = [pytest.mark.heavy, pytest.mark.usefixtures("thin")]
 @pytest.fixture(scope="module")
 def pictures(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("pictures") / "pictures.npz"
-    pack_pictures(dataset, tuple(SPLITS)).write(path)
+    pack_pictures([dataset], tuple(SPLITS)).write(path)
     return path
 
 
