@@ -6,6 +6,7 @@ from typing import Any
 
 from schemas.identity import check_id, clean_label
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
 from tableverse_factory.delivery.formats.folders import SCENE_GLB, SCENE_XML
@@ -17,8 +18,7 @@ from tableverse_factory.delivery.formats.usd import encode_usd
 
 def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[Path, ...]:
     """Write the scene to a new or empty folder, in a format of `FORMATS`, and return the paths."""
-    if file_format not in FORMATS:
-        raise InputError(f"format {file_format!r:.40}: give one of {', '.join(FORMATS)}")
+    check_format(file_format)
     if dest.exists() and (not dest.is_dir() or any(dest.iterdir())):
         raise InputError(f"{dest}: already there; give a new or an empty folder")
     contents = read_model_contents(scene.model(), colliders=file_format in WITH_COLLIDERS)
@@ -34,6 +34,14 @@ def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
     return tuple(dest / name for name in files)
+
+
+def check_format(file_format: str) -> None:
+    """Refuse an unknown format, and one whose package is not installed."""
+    if file_format not in FORMATS:
+        raise InputError(f"format {file_format!r:.40}: give one of {', '.join(FORMATS)}")
+    if file_format == "usd":
+        import_extra("pxr", "USD", "usd")
 
 
 def read_labels(meta: Mapping[str, Any]) -> dict[str, str]:

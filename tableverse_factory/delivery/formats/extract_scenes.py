@@ -22,7 +22,7 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.dataset.query_parser import parse_filter
 from tableverse_factory.dataset.splits import get_split
-from tableverse_factory.delivery.formats.extract import MAIN_FILES, extract_scene
+from tableverse_factory.delivery.formats.extract import MAIN_FILES, check_format, extract_scene
 from tableverse_factory.run_record import AFTERWARDS
 
 INDEX, RECORD, STAGING = "index.jsonl", "extract.json", ".partial"
@@ -72,6 +72,7 @@ def extract_scenes(
     A folder appears whole. The same call again goes on, and with another condition adds scenes; DEST of another
     dataset, format or appearance is refused.
     """
+    check_format(file_format)
     dataset = open_dataset(out)
     record = {"dataset": _identify(dataset), "format": file_format, "appearance": asdict(appearance)}
     condition = parse_filter(where, dataset.scenes.schema) if where else pc.scalar(True)

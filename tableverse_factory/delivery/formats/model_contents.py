@@ -8,6 +8,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
+from tableverse_factory.delivery.formats.model_settings import (
+    ContactSettings,
+    SolverSettings,
+    read_contact_settings,
+    read_solver_settings,
+)
 from tableverse_factory.delivery.formats.model_views import (
     ModelCamera,
     ModelLight,
@@ -49,17 +55,19 @@ class ModelObject(Frozen):
     inertia: Matrix3  # about the center of mass [kg m²]
     friction: float  # largest sliding friction of the colliders
     spin_roll: tuple[float, float]  # largest torsional and rolling friction of the colliders [m]
+    contact: ContactSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelContents(Frozen):
-    """Objects of a scene, and how it is lit and seen."""
+    """Objects of a scene, how it is lit and seen, and the solver settings with which it rests."""
 
     objects: tuple[ModelObject, ...]  # movable ones; in a model without any, every body on the world but the table
     still: tuple[ModelObject, ...]  # usually the table
     lights: tuple[ModelLight, ...]
     ambient: Float64[np.ndarray, "3"]  # light from everywhere; 1 is white
     cameras: tuple[ModelCamera, ...]
+    solver: SolverSettings
 
 
 def read_model_contents(model: mujoco.MjModel, colliders: bool = True) -> ModelContents:
@@ -77,6 +85,7 @@ def read_model_contents(model: mujoco.MjModel, colliders: bool = True) -> ModelC
         read_lights(model, data),
         read_ambient(model),
         read_cameras(model, data),
+        read_solver_settings(model),
     )
 
 
@@ -97,7 +106,8 @@ def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int, collider
     friction, spin, roll = model.geom_friction[solid].max(axis=0).tolist() if solid else (1.0, 0.0, 0.0)
     properties = _compute_mass_properties(model, data, root, pose)
     shapes = tuple(looks), tuple(unseen), tuple(hulls)
-    return ModelObject(body_name(model, root), pose, *shapes, *properties, friction, (spin, roll))
+    contact = read_contact_settings(model, solid)
+    return ModelObject(body_name(model, root), pose, *shapes, *properties, friction, (spin, roll), contact)
 
 
 def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:

@@ -1,8 +1,8 @@
 """URDF: a file per object and support, and one of the whole scene with every object on a floating joint.
 
 Readers that know no floating joints, such as Bullet, load the files one by one, at the poses of `poses.json`. Meshes
-are OBJ files under `meshes/`. Labels and friction, which URDF lacks, are in extra elements (`label`, and Bullet's
-`contact`) that other readers ignore.
+are OBJ files under `meshes/`. Labels and friction, which URDF lacks, are in extra elements (`label`, Bullet's `contact`
+and Drake's `drake:proximity_properties`) that other readers ignore.
 """
 
 import json
@@ -25,6 +25,7 @@ from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
 MESHES = "meshes"
 WORLD = "world"
 _FLAT_M = 1e-7
+_DRAKE_MODULUS_PA = "1e7"  # Drake's own default, which its parser wants to be told
 
 
 def encode_urdf(contents: ModelContents, labels: Mapping[str, str]) -> dict[str, bytes]:
@@ -60,7 +61,7 @@ def _check_unique_names(what: str, names: Sequence[str]) -> None:
 
 
 def _make_robot(name: str) -> ET.Element:
-    robot = ET.Element("robot", name=name)
+    robot = ET.Element("robot", {"name": name, "xmlns:drake": "http://drake.mit.edu"})
     # For MuJoCo alone: meshes are where they are said to be, and a body without a joint keeps its mass.
     compiler = {"strippath": "false", "fusestatic": "false", "discardvisual": "false"}
     ET.SubElement(ET.SubElement(robot, "mujoco"), "compiler", compiler)
@@ -84,10 +85,12 @@ def _build_link(content: ModelObject, moves: bool) -> tuple[ET.Element, list[tup
     for index, hull in enumerate(content.hulls):
         name = f"{stem}_piece_{index:02d}"
         if is_box(hull):  # exact everywhere; Bullet rounds convex meshes by a margin
-            link.append(_build_box(name, hull))
+            shape = _build_box(name, hull)
         else:
             files.append((f"{MESHES}/{name}.obj", encode_obj(hull)))
-            link.append(_build_shape("collision", name))
+            shape = _build_shape("collision", name)
+        shape.append(_build_drake_contact(content))
+        link.append(shape)
     link.append(_build_contact(content))
     return link, files
 
@@ -114,6 +117,16 @@ def _build_contact(content: ModelObject) -> ET.Element:
     contact = ET.Element("contact")
     for name, value in values.items():
         ET.SubElement(contact, name, value=_format_numbers([value]))
+    return contact
+
+
+def _build_drake_contact(content: ModelObject) -> ET.Element:
+    """Build Drake's element: patches of contact, as things do not rest on its single points."""
+    contact = ET.Element("drake:proximity_properties")
+    ET.SubElement(contact, "drake:compliant_hydroelastic")
+    ET.SubElement(contact, "drake:hydroelastic_modulus", value=_DRAKE_MODULUS_PA)
+    for name in ("mu_dynamic", "mu_static"):
+        ET.SubElement(contact, f"drake:{name}", value=_format_numbers([content.friction]))
     return contact
 
 

@@ -1,6 +1,11 @@
 """The export in the hands of those it is made for: the packages `lerobot` and `datasets`."""
 
 import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,6 +117,44 @@ def test_act_takes_a_step_on_it(made, pictures):
         optimizer.step()
         losses.append(float(loss))
     assert losses[-1] < losses[0]
+
+
+def test_lerobot_s_own_script_trains_act(made, tmp_path):
+    """Run with lerobot 0.6.1, whose command it is, for a minute of one core."""
+    pytest.importorskip("lerobot.scripts.lerobot_train", reason="LeRobot 0.6 is not installed")
+    small = {"chunk_size": 8, "n_action_steps": 8, "dim_model": 64, "n_heads": 2, "dim_feedforward": 64}
+    options = {
+        "dataset.repo_id": "tableverse/made", "dataset.root": made, "dataset.video_backend": "pyav",
+        "policy.type": "act",
+        "policy.device": "cpu", "policy.push_to_hub": "false", "policy.pretrained_backbone_weights": "null",
+        "policy.optimizer_lr": 1e-3, **{f"policy.{name}": value for name, value in small.items()},
+        "batch_size": 4, "num_workers": 0, "steps": 20, "log_freq": 5, "save_freq": 20, "wandb.enable": "false",
+        "output_dir": tmp_path / "runs",
+    }  # fmt: skip
+    arguments = [f"--{name}={value}" for name, value in options.items()]
+    said = _run_script("lerobot_train", arguments, tmp_path)
+    losses = [float(loss) for loss in re.findall(r" loss:([0-9.]+)", said)]
+    assert len(losses) == 4
+    assert losses[-1] < losses[0] / 2
+    assert list(tmp_path.glob("runs/checkpoints/000020/pretrained_model/model.safetensors"))
+
+
+def test_lerobot_s_visualiser_writes_an_episode(made, tmp_path):
+    """Run with lerobot 0.6.1 and rerun-sdk 0.33.1."""
+    pytest.importorskip("lerobot.scripts.lerobot_dataset_viz", reason="LeRobot 0.6 is not installed")
+    pytest.importorskip("rerun", reason="Rerun is not installed")
+    arguments = ["--repo-id=tableverse/made", f"--root={made}", "--episode-index=1", "--save=1", "--num-workers=0"]
+    _run_script("lerobot_dataset_viz", [*arguments, f"--output-dir={tmp_path}"], tmp_path)
+    (recording,) = tmp_path.glob("*.rrd")
+    assert recording.stat().st_size > 50_000
+
+
+def _run_script(name: str, arguments: list[str], home: Path) -> str:
+    command = [sys.executable, "-m", f"lerobot.scripts.{name}", *arguments]
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(home / "hub")}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout + done.stderr
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -114,6 +114,13 @@ def test_one_that_cannot_be_written_is_named_and_the_others_are_written(out, tmp
     assert not (tmp_path / "x").exists()
 
 
+def test_a_format_whose_package_is_missing_is_refused_before_any_work(out, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(InputError, match=r"tableverse-factory\[usd\]"):
+        extract_scenes(str(out), tmp_path / "new", "usd")
+    assert not (tmp_path / "new").exists()
+
+
 def test_an_id_that_leaves_the_folder_is_refused(out, tmp_path):
     path = next((out / "scenes").glob("*0.parquet"))
     table = pq.read_table(path)

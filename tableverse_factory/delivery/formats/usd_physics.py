@@ -1,0 +1,120 @@
+"""Masses, colliders, friction and solver settings of a USD stage.
+
+What UsdPhysics has no words for stands in the attributes of MuJoCo's and Newton's schemas, by name, as usd-core lacks
+these schemas: `mjc:…` is read by MuJoCo's importer and by Newton's, `newton:…` by both too. Other readers ignore them.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from schemas.geometry import Matrix3, Quaternion
+from tableverse_factory.delivery.formats.model_contents import ModelObject
+from tableverse_factory.delivery.formats.model_settings import SolverSettings
+from tableverse_factory.delivery.formats.usd_meshes import define_mesh, define_surface
+from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
+
+if TYPE_CHECKING:
+    from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+_VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # as in scene.xml
+_VARYING = ("newton:contactGap", "newton:torsionalFriction", "newton:rollingFriction")
+
+
+def add_solver_settings(stage: "Usd.Stage", path: str, solver: SolverSettings) -> None:
+    """Add the physics scene: gravity, and the settings with which things rest in MuJoCo."""
+    from pxr import Sdf, UsdPhysics
+
+    physics = UsdPhysics.Scene.Define(stage, path)
+    physics.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
+    physics.CreateGravityMagnitudeAttr(9.81)
+    types = Sdf.ValueTypeNames
+    values = {
+        "integrator": (types.Token, solver.integrator),
+        "cone": (types.Token, solver.cone),
+        "impratio": (types.Double, solver.impratio),
+        "noslip_iterations": (types.Int, solver.noslip_iterations),
+    }
+    named = {f"mjc:option:{name}": value for name, value in values.items()}
+    _set_attributes(physics.GetPrim(), "MjcSceneAPI", {**named, "mjc:flag:multiccd": (types.Bool, solver.multiccd)})
+    rate = {"newton:timeStepsPerSecond": (types.Int, round(1.0 / solver.timestep))}
+    _set_attributes(physics.GetPrim(), "NewtonSceneAPI", rate)
+
+
+def _set_attributes(prim: "Usd.Prim", schema: str, values: "dict[str, tuple[Sdf.ValueTypeName, Any]]") -> None:
+    """Set attributes of a schema that usd-core does not know."""
+    from pxr import Sdf
+
+    prim.AddAppliedSchema(schema)
+    for name, (kind, value) in values.items():
+        varies = name in _VARYING
+        prim.CreateAttribute(name, kind, False, Sdf.VariabilityVarying if varies else Sdf.VariabilityUniform).Set(value)
+
+
+def add_mass(body: "UsdGeom.Xform", content: ModelObject) -> None:
+    """Make a rigid body of a prim, with the object's mass and inertia."""
+    from pxr import Gf, UsdPhysics
+
+    UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
+    mass = UsdPhysics.MassAPI.Apply(body.GetPrim())
+    moments, axes = compute_principal_axes(content.inertia)
+    mass.CreateMassAttr(content.mass_kg)
+    mass.CreateCenterOfMassAttr(Gf.Vec3f(*content.center.tolist()))
+    mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*moments.tolist()))
+    mass.CreatePrincipalAxesAttr(Gf.Quatf(*axes.tolist()))
+
+
+def compute_principal_axes(inertia: Matrix3) -> tuple[np.ndarray, Quaternion]:
+    """Compute principal moments [kg m²], smallest first, and the rotation of their right-handed axes."""
+    moments, axes = np.linalg.eigh(inertia)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 2] *= -1.0
+    return moments, quaternion_from_matrix(axes)
+
+
+def set_visual_group(prim: "Usd.Prim") -> None:
+    """Put a visual where MuJoCo's viewer shows it."""
+    from pxr import Sdf
+
+    _set_attributes(prim, "MjcImageableAPI", {"mjc:group": (Sdf.ValueTypeNames.Int, _VISUAL_GROUP)})
+
+
+def add_colliders(stage: "Usd.Stage", path: str, content: ModelObject) -> None:
+    """Add the convex pieces of an object, all of one material."""
+    from pxr import Sdf, UsdGeom, UsdPhysics, UsdShade, Vt
+
+    types, contact = Sdf.ValueTypeNames, content.contact
+    for_mujoco = {
+        "mjc:condim": (types.Int, contact.condim),
+        "mjc:group": (types.Int, _COLLISION_GROUP),
+        "mjc:solref": (types.DoubleArray, Vt.DoubleArray(contact.solref)),
+        "mjc:solimp": (types.DoubleArray, Vt.DoubleArray(contact.solimp)),
+    }
+    # Newton looks 10 cm around shapes by default
+    for_newton = {"newton:contactGap": (types.Float, 0.0)}
+    material = _define_contact_material(stage, f"{path}/contact", content)
+    for index, hull in enumerate(content.hulls):
+        piece = define_mesh(stage, f"{path}/piece_{index:02d}", hull)
+        piece.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        UsdPhysics.CollisionAPI.Apply(piece.GetPrim())
+        UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
+        _set_attributes(piece.GetPrim(), "MjcCollisionAPI", for_mujoco)
+        _set_attributes(piece.GetPrim(), "NewtonCollisionAPI", for_newton)
+        binding = UsdShade.MaterialBindingAPI.Apply(piece.GetPrim())
+        binding.Bind(material)  # the only one that MuJoCo's importer reads
+        binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+
+
+def _define_contact_material(stage: "Usd.Stage", path: str, content: ModelObject) -> "UsdShade.Material":
+    from pxr import Gf, Sdf, UsdPhysics, UsdShade
+
+    material = UsdShade.Material.Define(stage, path)
+    contact = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    contact.CreateStaticFrictionAttr(content.friction)
+    contact.CreateDynamicFrictionAttr(content.friction)
+    spin, roll = content.spin_roll
+    kind = Sdf.ValueTypeNames.Float
+    names = {"newton:torsionalFriction": (kind, spin), "newton:rollingFriction": (kind, roll)}
+    _set_attributes(material.GetPrim(), "NewtonMaterialAPI", names)
+    define_surface(stage, material).Set(Gf.Vec3f(0.5))  # MuJoCo's importer warns of materials without one
+    return material
