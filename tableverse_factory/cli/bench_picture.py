@@ -29,8 +29,8 @@ def bench_picture(
 ) -> None:
     """Compare depth, table, scale and objects found in the colour of captures with their depth and masks.
 
-    One scale is taken out of the depth error; masks are compared where there is a seg.png or masks.png. Of the folder
-    --other the pictures are listed that are not dropped.
+    One scale is taken out of the depth error; measured, it is that of one distance which the sensor tells. Masks are
+    compared where there is a seg.png or masks.png. Of the folder --other the pictures are listed that are not dropped.
 
     Example: `tableverse bench picture captures`
     """
@@ -51,15 +51,20 @@ def bench_picture(
 
 
 def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
-    geometry, masks = ("depth %", "plane °", "scale %", "σ %"), ("mean IoU", "recall@0.5", "overlap F")
+    geometry, masks = ("depth %", "measured %", "plane °", "scale %", "σ %"), ("mean IoU", "recall@0.5", "overlap F")
     columns = ("picture", *geometry, *masks, "CPU s", "dropped")
     rows: list[tuple[object, ...]] = []
     for s in scores:
-        figures = (100 * s.depth_error, s.plane_deg, 100 * math.expm1(-s.log_scale), 100 * s.scale_sigma)
+        scale = math.expm1(-s.log_scale)
+        figures = (100 * s.depth_error, 100 * s.measured_error, s.plane_deg, 100 * scale, 100 * s.scale_sigma)
         rows.append((s.name, *map(_format, figures), *_format_masks(s.masks), f"{s.cpu_s:.2f}", s.reason))
-    figures = (100 * total.depth_error, total.plane_deg, 100 * total.scale_error, math.nan)
+    depth, measured, scale = (100 * share for share in (total.depth_error, total.measured_error, total.scale_error))
+    figures = (depth, measured, total.plane_deg, scale, math.nan)
     rows.append(("all", *map(_format, figures), *_format_masks(total.masks), f"{total.cpu_s:.2f}", f"{total.dropped}"))
-    print_figures(columns, rows, "depth error in the mean, one scale taken out; angle, scale and CPU s in the median")
+    note = (
+        "depth error in the mean, one scale taken out; in the median what is left of it where one length was measured"
+    )
+    print_figures(columns, rows, f"{note}, angle, scale and CPU s")
     print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")
 
 

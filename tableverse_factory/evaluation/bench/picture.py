@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from schemas.config import Config, ObserveConfig, PerceiveConfig
 from schemas.geometry import DepthImage, IdImage
 from schemas.identity import check_id
+from schemas.known_length import KnownDistance
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.observation import Observation
@@ -30,6 +31,7 @@ from tableverse_factory.sources.capture import COLOR_NAMES, read_id_image
 from tableverse_factory.sources.image_file import read_image
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
+from tableverse_factory.stages.perceive.scale.surface import measure_distance
 
 MIN_PIXELS = 100  # of table and objects, for a scale
 
@@ -42,6 +44,7 @@ class PictureScore:
     depth_error: float  # mean relative error of the depth of table and objects, one scale taken out
     log_scale: float  # logarithm of that scale: true over predicted depth
     scale_sigma: float  # standard deviation that was stated for it
+    measured_error: float  # mean relative error of the same depth, after one length was measured in the picture
     plane_deg: float  # angle between the table's normals [°]
     cpu_s: float  # CPU time of `observe` and `perceive` [s]
     masks: MaskScore | None = None  # None without true masks
@@ -60,6 +63,7 @@ class PictureSummary:
     pictures: int
     dropped: int
     depth_error: float  # mean
+    measured_error: float  # median
     plane_deg: float  # median [°]
     scale_error: float  # median of the scale's relative error
     within_sigma: float  # share of pictures whose scale is within the stated standard deviation
@@ -109,11 +113,14 @@ def score_picture(capture: Path, config: Config, with_focal: bool = False) -> Pi
         masks = compare_masks(capture.name, ids, own, cpu_s, reason)
     nothing = float("nan")
     if found is None or truth is None:
-        return PictureScore(capture.name, nothing, nothing, nothing, nothing, cpu_s, masks, reason)
+        return PictureScore(capture.name, nothing, nothing, nothing, nothing, nothing, cpu_s, masks, reason)
+    wanted = (ids > 0) | (truth.instance_ids == -1)
     depth = resize_nearest(found.observation.depth, sensor.depth.shape)
-    error, log_scale = compare_depth(depth, sensor.depth, (ids > 0) | (truth.instance_ids == -1))
+    error, log_scale = compare_depth(depth, sensor.depth, wanted)
+    measured = compare_measured_depth(found.observation, sensor, wanted)
     plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))
-    return PictureScore(capture.name, error, log_scale, found.observation.scale_sigma, plane, cpu_s, masks)
+    sigma = found.observation.scale_sigma
+    return PictureScore(capture.name, error, log_scale, sigma, measured, plane, cpu_s, masks)
 
 
 def compare_depth(depth: DepthImage, true: DepthImage, wanted: np.ndarray) -> tuple[float, float]:
@@ -127,6 +134,33 @@ def compare_depth(depth: DepthImage, true: DepthImage, wanted: np.ndarray) -> tu
     ratio = true[both] / depth[both].astype(np.float64)
     scale = float(np.median(ratio))
     return float(np.mean(np.abs(scale / ratio - 1.0))), float(np.log(scale))
+
+
+def compare_measured_depth(found: Observation, sensor: Observation, wanted: np.ndarray) -> float:
+    """Compare depth where it is `wanted` and both are known, after the scale of one distance that the sensor measures.
+
+    The distance is that between the pixels of the first and the last twentieth column, as a tape would span the table.
+    Returns the mean relative error; NaN for fewer than `MIN_PIXELS`, or where the distance cannot be measured.
+    """
+    depth = resize_nearest(found.depth, sensor.depth.shape)
+    both = wanted & (depth > 0) & (sensor.depth > 0)
+    if int(both.sum()) < MIN_PIXELS:
+        return float("nan")
+    rows, columns = np.nonzero(both)
+    order = np.argsort(columns, kind="stable")
+    outer = order[[len(order) // 20, -len(order) // 20]]
+    ends = np.stack([columns[outer], rows[outer]], axis=1) / sensor.depth.shape[::-1]
+    try:
+        true, own = (_measure_between(ends, seen) for seen in (sensor, found))
+    except InputError:  # an end lies where depth is torn: a person would mark another
+        return float("nan")
+    return float(np.mean(np.abs(true / own * depth[both].astype(np.float64) / sensor.depth[both] - 1.0)))
+
+
+def _measure_between(ends: np.ndarray, seen: Observation) -> float:
+    """Measure the distance between two points of a picture, given in shares of its sides, shape (2, 2)."""
+    (a, b), (c, d) = (ends * seen.depth.shape[::-1]).tolist()
+    return measure_distance(seen, KnownDistance(kind="distance", length_m=1.0, pixels=((a, b), (c, d)))).length_m
 
 
 def get_table_normal(found: PerceivedObjects) -> Float64[np.ndarray, "3"]:
@@ -148,6 +182,7 @@ def summarize_pictures(scores: Sequence[PictureScore]) -> PictureSummary:
         len(scores),
         sum(bool(score.reason) for score in scores),
         _average(score.depth_error for score in known),
+        _find_median(score.measured_error for score in known if np.isfinite(score.measured_error)),
         _find_median(score.plane_deg for score in known),
         _find_median(abs(float(np.expm1(-score.log_scale))) for score in known),
         _average(score.is_within_sigma for score in known),

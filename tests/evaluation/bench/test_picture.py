@@ -22,7 +22,15 @@ DATA = Path(skimage.__file__).parent / "data"
 
 
 def make_score(**changed: object) -> PictureScore:
-    given = {"name": "a", "depth_error": 0.02, "log_scale": 0.1, "scale_sigma": 0.2, "plane_deg": 1.0, "cpu_s": 0.5}
+    given = {
+        "name": "a",
+        "depth_error": 0.02,
+        "log_scale": 0.1,
+        "scale_sigma": 0.2,
+        "plane_deg": 1.0,
+        "cpu_s": 0.5,
+        "measured_error": 0.03,
+    }
     return PictureScore(**{**given, **changed})
 
 
