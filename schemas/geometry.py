@@ -4,8 +4,7 @@ Lengths in metres, angles in radians, quaternions wxyz. Camera frames have OpenC
 the table frame has z up, its origin on the table plane, x to the camera's right and y away from the camera.
 """
 
-from dataclasses import dataclass, fields
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,18 +23,13 @@ IdImage = Int32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 
 
-@cache
-def _list_fields(kind: type[Any]) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind))
-
-
 class Frozen:
     """Mixin that makes the arrays of frozen dataclasses read-only, which `frozen=True` alone does not."""
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for name in _list_fields(type(self)):
+        for name in self.__dataclass_fields__:  # type: ignore[attr-defined]
             value: Any = getattr(self, name)
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 view = value.view()

@@ -1,12 +1,14 @@
 """Mesh files of a scene: OBJ with fixed decimals, so that equal meshes give equal bytes everywhere."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from schemas.geometry import Frozen, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.geometry.mesh.hulls import compute_face_heights, make_hull_mesh
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
@@ -16,6 +18,7 @@ from tableverse_factory.physics.mjcf.number_format import format_decimal_lines, 
 MAX_PIECE_VERTICES = 64
 MIN_MESH_VERTICES = 4
 MIN_PIECE_THICKNESS_M = 5e-5  # thinner convex pieces carry nothing in a simulation and make MuJoCo's own hull fail
+REMEMBERED_BYTES = 64 * 1024 * 1024  # OBJ files of a hundred things
 ROUNDING_UNITS = 4  # units of the last digit by which rounding may lift a corner over the plane of a compact face
 
 
@@ -67,6 +70,21 @@ def encode_obj(mesh: TriangleMesh, appearance: Appearance | None = None) -> byte
     table = np.stack([corners, appearance.corners + 1], axis=2).reshape(-1, 6)
     points = format_decimal_lines(b"vt ", appearance.points, 6, b" \n")
     return text + points + format_integer_lines(b"f ", table, b"/ / /\n")
+
+
+# By identity: `make_body_shape` gives equal shapes the same pieces, in settling, in export and in scene after scene.
+encode_piece = lru_cache(2048)(encode_obj)
+
+
+def encode_visual(mesh: TriangleMesh, appearance: Appearance | None) -> bytes:
+    """Encode a visual mesh, once for the same thing at the same scale in many scenes."""
+    shape = replace(mesh, vertex_colors=None, texture=None)  # pictures are in no OBJ file
+    return _encode_shape(shape, None if appearance is None else replace(appearance, texture_png=b""))
+
+
+@memoize_by_content(REMEMBERED_BYTES)
+def _encode_shape(mesh: TriangleMesh, appearance: Appearance | None) -> bytes:
+    return encode_obj(mesh, appearance)
 
 
 def _find_distinct(points: Float64[np.ndarray, "n 2"]) -> tuple[Float64[np.ndarray, "k 2"], Int64[np.ndarray, " n"]]:

@@ -7,7 +7,6 @@ contacts so stiff that a stack sinks in by hundredths of a millimetre instead of
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -20,7 +19,7 @@ from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import OPENCV_TO_OPENGL, multiply_quaternions, quaternion_about_z
 from tableverse_factory.geometry.mesh.mass_integrals import encloses_volume
 from tableverse_factory.physics.mjcf.inertia import MassProperties
-from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_obj
+from tableverse_factory.physics.mjcf.obj_assets import Appearance, encode_piece, encode_visual
 from tableverse_factory.physics.mjcf.portable_xml import make_portable_xml
 from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import THICKNESS_M, Slab
@@ -50,8 +49,6 @@ _PIXEL_M = 5e-6  # MuJoCo wants the size of a camera's sensor for its focal leng
 _TETRAHEDRON_OBJ = (
     b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"
 )
-# By identity: `make_body_shape` gives equal shapes the same pieces, in settling, in export and in scene after scene.
-_encode_piece = lru_cache(2048)(encode_obj)
 _PIXEL_PNG = encode_png(np.zeros((1, 1, 3), dtype=np.uint8))
 
 
@@ -271,7 +268,7 @@ def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) ->
     part.explicitinertial = True
     for index, hull in enumerate(body.hulls):
         name = f"{make_file_stem(body.object_id)}_piece_{index:02d}"
-        geom = _add_mesh_geom(spec, part, name, "collision", _encode_piece(hull), assets, solid=True)
+        geom = _add_mesh_geom(spec, part, name, "collision", encode_piece(hull), assets, solid=True)
         geom.friction = [body.friction, TORSIONAL_FRICTION, body.rolling_friction]
     return part
 
@@ -279,7 +276,8 @@ def _add_body(spec: mujoco.MjSpec, body: SceneBody, assets: dict[str, bytes]) ->
 def _add_visual(spec: mujoco.MjSpec, part: mujoco.MjsBody, body: SceneBody, assets: dict[str, bytes]) -> None:
     name = make_file_stem(body.object_id)
     solid = encloses_volume(body.mesh)
-    geom = _add_mesh_geom(spec, part, name, "visual", encode_obj(body.mesh, body.appearance), assets, solid)
+    data = encode_visual(body.mesh, body.appearance)
+    geom = _add_mesh_geom(spec, part, name, "visual", data, assets, solid)
     if body.appearance is None:
         geom.rgba = [*(np.array(body.color) / 255.0), 1.0]
         return

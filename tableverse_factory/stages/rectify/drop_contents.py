@@ -97,10 +97,10 @@ class Surroundings:
         self._fixed, self._clearance_m, self.budget = fixed, clearance_m, budget
         self._pieces = sum(len(body.solids.starts) for body in fixed)
 
-    def freed(self, member: CompositeMember, direction: Vector3) -> tuple[CompositeMember, float]:
-        """Push an object clear in a direction (unit vector); returns it and the distance [m]."""
+    def freed(self, member: CompositeMember, solid: MovingSolid, direction: Vector3) -> tuple[CompositeMember, float]:
+        """Push an object, with its pieces, clear in a direction (unit vector); returns it and the distance [m]."""
         self.budget.comparisons -= len(member.body.hulls) * self._pieces
-        way = LinearSweep(direction).find_first_clear([member.solid], self._fixed, self._clearance_m)
+        way = LinearSweep(direction).find_first_clear([solid], self._fixed, self._clearance_m)
         return member.at(translate_pose(member.pose, way * direction)), way
 
 
@@ -111,10 +111,11 @@ def find_seen_starts(member: CompositeMember, around: Surroundings, holder: Holl
     """
     found: list[tuple[float, int, CompositeMember]] = []
     for turned, angle in _tilt_upright(member):
+        solid = turned.solid
         for direction in _list_push_directions():
             if not around.budget.may_drop:
                 break
-            moved, way = around.freed(turned, direction)
+            moved, way = around.freed(turned, solid, direction)
             found.append((way + METRES_PER_RAD * angle, len(found), moved))
             if way == 0.0:
                 break
@@ -133,7 +134,7 @@ def draw_random_start(
     Every other draw keeps the object's orientation but for its heading; the rest have any orientation.
     """
     draws = [_draw_start(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
-    raised = [around.freed(start, UP)[0] for start in draws]
+    raised = [around.freed(start, start.solid, UP)[0] for start in draws]
     return min(raised, key=lambda member: sum(corner[2] for corner in aabb(member.corners)))
 
 

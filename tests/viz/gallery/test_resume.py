@@ -43,7 +43,7 @@ def rewrite_dataset(out: Path, done: dict[str, dict[str, bytes]]) -> None:
 
 
 def test_a_killed_report_goes_on(tmp_path):
-    out = write_dataset(tmp_path / "out", photographs("a", "b", "c", "d", "e"), [])
+    out = write_dataset(tmp_path / "out", photographs("a", "b", "c"), [])
     whole = write_gallery(open_dataset(out), tmp_path / "whole", jobs=1).parent
     site = tmp_path / "site"
     main = "from tableverse_factory.cli.main import main; main()"
@@ -53,8 +53,8 @@ def test_a_killed_report_goes_on(tmp_path):
             time.sleep(0.01)
         process.kill()
     drawn = [path.stem for path in site.glob("drawn/*.json")]
-    assert 0 < len(drawn) < 5
-    assert re.search(r"Drawn so far: [0-4] of 5 scenes", Page(site / "index.html").text)
+    assert 0 < len(drawn) < 3
+    assert re.search(r"Drawn so far: [0-2] of 3 scenes", Page(site / "index.html").text)
     before = written(site)
     write_gallery(open_dataset(out), site)
     assert digest(site) == digest(whole)

@@ -53,21 +53,26 @@ def find(path: Path, known_length: str = "", **sections: dict[str, object]) -> P
     return outcome.value
 
 
+@pytest.fixture(scope="module")
+def found(view: tuple[Path, IdImage]) -> PerceivedObjects:
+    """What is found in the view."""
+    return find(view[0])
+
+
 @pytest.mark.heavy
-def test_the_boxes_are_found_on_the_table(view: tuple[Path, IdImage]) -> None:
+def test_the_boxes_are_found_on_the_table(view: tuple[Path, IdImage], found: PerceivedObjects) -> None:
     path, ids = view
-    found = find(path)
     assert len(found.objects) == 2
     assert min(best_overlaps(ids, found.instance_ids)) > 0.8
-    assert {o.object_id for o in found.objects} == {o.object_id for o in find(path).objects}
-    np.testing.assert_array_equal(find(path).instance_ids, found.instance_ids)
+    again = find(path)
+    assert {o.object_id for o in found.objects} == {o.object_id for o in again.objects}
+    np.testing.assert_array_equal(again.instance_ids, found.instance_ids)
     normal, true = (rotation_matrix(pose.quaternion_wxyz)[2] for pose in (found.camera_to_table, POSE))
     assert normal @ true > np.cos(np.radians(8.0))
 
 
 @pytest.mark.heavy
-def test_the_scale_is_estimated_and_says_how_sure_it_is(view: tuple[Path, IdImage]) -> None:
-    found = find(view[0])
+def test_the_scale_is_estimated_and_says_how_sure_it_is(found: PerceivedObjects) -> None:
     seen = found.observation
     assert (seen.scale_source, seen.intrinsics_source) == ("estimated", "assumed")
     assert 0.05 < seen.scale_sigma < 1.0
@@ -76,9 +81,9 @@ def test_the_scale_is_estimated_and_says_how_sure_it_is(view: tuple[Path, IdImag
 
 
 @pytest.mark.heavy
-def test_the_height_of_the_camera_measures_the_scale(view: tuple[Path, IdImage]) -> None:
+def test_the_height_of_the_camera_measures_the_scale(view: tuple[Path, IdImage], found: PerceivedObjects) -> None:
     path, ids = view
-    estimated, measured = find(path), find(path, HEIGHT, observe={"focal_px": CAMERA.fx})
+    estimated, measured = found, find(path, HEIGHT, observe={"focal_px": CAMERA.fx})
     assert measured.observation.scale_source == "measured"
     assert 0 < measured.observation.scale_sigma < 0.1 < estimated.observation.scale_sigma
     assert measured.camera_to_table.position[2] == pytest.approx(0.6, rel=0.02)
@@ -123,7 +128,7 @@ def test_weights_that_are_missing_stop_the_build_and_drop_no_picture(view: tuple
 @pytest.mark.heavy
 def test_the_colour_of_synthetic_captures_shows_most_of_their_objects(tmp_path: Path) -> None:
     overlaps: list[float] = []
-    for folder in synthesize_captures(tmp_path / "captures", 3, 0):
+    for folder in synthesize_captures(tmp_path / "captures", 2, 0):
         found = find(folder / "color.png")
         true = np.asarray(Image.open(folder / "masks.png")).astype(np.int32)
         overlaps += best_overlaps(np.where(true > 0, true + 1, 0), found.instance_ids)
