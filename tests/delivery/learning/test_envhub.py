@@ -88,10 +88,7 @@ def test_lerobot_loads_the_documented_file_and_evaluates_policies(out, hub_cache
     from lerobot.scripts.lerobot_eval import eval_policy, rollout
 
     recording = open_dataset(str(out)).scene("s-0").trajectory("task_000").recording()
-    commands, every = (
-        recording.command,
-        round(0.1 / recording.step_s),
-    )  # the page's environment has ten actions a second
+    commands, every = recording.command, round(1.0 / (50 * recording.step_s))  # the page's rate is the default
 
     class Replay(torch.nn.Module):
         def reset(self) -> None:
