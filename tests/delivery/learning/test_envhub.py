@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tableverse_factory import open_dataset
-from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.delivery.episodes.observation import count_object_rows
 from tableverse_factory.delivery.learning.envhub import make_env
 from tests.helpers.docs_pages import find_example
@@ -53,6 +53,14 @@ def test_the_actions_of_an_export_succeed(out, fps):
             break
     assert info["is_success"].tolist() == [True]
     envs.close()
+
+
+@pytest.mark.heavy
+def test_an_action_without_all_joints_is_refused(out):
+    (env,) = make_env(str(out)).envs
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=r"action of shape \(1,\): give \(8,\)"):
+        env.step(np.zeros(1, dtype=np.float32))
 
 
 @pytest.mark.heavy
