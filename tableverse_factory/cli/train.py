@@ -158,11 +158,9 @@ def train_policy(
     minutes: TrainMinutes = None,
     goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 256,
     chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 1_024,
-    scenes: Annotated[
-        int | None, typer.Option(min=1, help="Learn the motions of so many scenes; of all without.")
-    ] = None,
+    scenes: Annotated[int | None, typer.Option(min=1, help="Number of scenes to learn from; all without.")] = None,
     motions: Annotated[
-        int | None, typer.Option(min=1, help="Learn so many motions, of each scene as many; all without.")
+        int | None, typer.Option(min=1, help="Number of motions to learn, from these scenes in turn; all without.")
     ] = None,
     state: Annotated[
         Path | None,
@@ -205,6 +203,8 @@ def _provide_packed(path: Path, datasets: list[str], pictures: bool) -> Path:
     from tableverse_factory.core.errors import ConfigError
 
     if path.is_file():
+        if datasets:
+            print(f"{path} is there already: --dataset is not read", file=sys.stderr, flush=True)
         return path
     if not datasets:
         raise ConfigError(f"{path} is not there: give --dataset, whose motions are packed into it")

@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from schemas.identity import check_id, clean_label
+from schemas.identity import clean_label
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
-from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.formats.folders import SCENE_GLB, SCENE_XML
+from tableverse_factory.delivery.formats.folders import SCENE_GLB, SCENE_XML, check_body_name
 from tableverse_factory.delivery.formats.glb import encode_glb
 from tableverse_factory.delivery.formats.model_contents import ModelContents, read_model_contents
 from tableverse_factory.delivery.formats.urdf import encode_urdf
@@ -23,11 +22,7 @@ def extract_scene(scene: Scene, dest: Path, file_format: str = "mjcf") -> tuple[
         raise InputError(f"{dest}: already there; give a new or an empty folder")
     contents = read_model_contents(scene.model(), colliders=file_format in WITH_COLLIDERS)
     for content in (*contents.objects, *contents.still):
-        try:
-            check_id(content.name)  # foreign scenes may hold anything
-        except ValueError as error:
-            why = sanitize_line(str(error), 200)
-            raise InputError(f"a body of the scene cannot be a file: {why}", "bad_name") from None
+        check_body_name(content.name)
     files = FORMATS[file_format](scene, contents, read_labels(scene.meta))
     for name, data in files.items():
         path = dest / name

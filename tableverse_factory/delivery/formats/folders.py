@@ -2,6 +2,10 @@
 
 from pathlib import Path
 
+from schemas.identity import check_id
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
+
 SCENE_XML, SCENE_GLB = "scene.xml", "scene.glb"
 
 
@@ -25,3 +29,12 @@ def list_scene_folders(folder: Path) -> list[tuple[str, Path]]:
     homes = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
     found = ((home.name, find_scene_file(home)) for home in homes)
     return [(name, file) for name, file in found if file is not None]
+
+
+def check_body_name(name: str) -> None:
+    """Check that a body, of a scene that may be foreign, can be a file; InputError `bad_name` if not."""
+    try:
+        check_id(name)
+    except ValueError as error:
+        why = sanitize_line(str(error), 200)
+        raise InputError(f"a body of the scene cannot be a file: {why}", "bad_name") from None

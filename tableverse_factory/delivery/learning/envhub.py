@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.delivery.learning.dataset_environment import DatasetEnv, make_environment
 from tableverse_factory.delivery.learning.environment import FPS, MAX_STEPS, TableEnv
 
@@ -58,6 +58,8 @@ class LeRobotEnv(gymnasium.Wrapper[dict[str, Any], np.ndarray, dict[str, np.ndar
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Execute one command; rewards of the steps of 1/50 s on the way to it add up."""
+        if np.shape(action) != self._command.shape:
+            raise InputError(f"action of shape {np.shape(action)}: give {self._command.shape}", "bad_action")
         start, rewards = self._command, 0.0
         for share in np.arange(1, self._steps + 1) / self._steps:
             command = start + share * (np.asarray(action) - start)

@@ -6,6 +6,7 @@ from typing import Any
 
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.physics.mjcf.load import load_spec
 
 _READ = ("scene.xml", "assets/")
 
@@ -17,15 +18,17 @@ def add_to_newton(builder: Any, scene: Scene, visuals: bool = True) -> None:
     then. So the pieces, which are convex, become hulls, and the gap of the scene's shapes is 0.
 
     Raises:
-        InputError: `no_extra` without newton.
+        InputError: `no_extra` without newton, `bad_mjcf` if the scene names files that are not its own.
     """
     newton = import_extra("newton", "add_to_newton", "newton")
+    files = scene.files()
+    load_spec(files)  # refuses foreign files, which Newton would open
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     first, gap = builder.shape_count, builder.rigid_gap
     builder.rigid_gap = 0.0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for path, data in scene.files().items():
+        for path, data in files.items():
             if path.startswith(_READ):
                 (folder / path).parent.mkdir(exist_ok=True)
                 (folder / path).write_bytes(data)

@@ -15,6 +15,7 @@ from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.delivery.formats.folders import check_body_name
 from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_about_z, rotation_matrix
 from tableverse_factory.physics.mjcf.load import parse_document
 
@@ -47,13 +48,15 @@ def add_to_robosuite(
 
     Raises:
         ConfigError: if robosuite is not installed.
-        InputError: `bad_mjcf` if the scene names files that are not its own.
+        InputError: `bad_mjcf` if the scene names files that are not its own, or classes that this program does not
+            write; `bad_name` if a body cannot be a file.
     """
     try:
         from robosuite.models.objects import MujocoXMLObject
     except ImportError:
         raise ConfigError("add_to_robosuite needs robosuite: pip install robosuite") from None
     document = parse_document(scene.files())
+    _check_names(document, scene)
     paths = _write_objects(document, scene, Path(folder).absolute() / scene.scene_id)
     objects = {}
     for body in document.findall("worldbody/body"):
@@ -107,15 +110,25 @@ def _copy_options(document: ET.Element, option: ET.Element) -> None:
         flag.set("multiccd", "enable")
 
 
-def _write_objects(document: ET.Element, scene: Scene, folder: Path) -> dict[str, Path]:
-    """Write a file per body and all assets, where they are not there yet. Returns the paths by the bodies' names."""
+def _check_names(document: ET.Element, scene: Scene) -> None:
+    """Check what becomes a path, or a group of robosuite: foreign scenes may hold anything."""
     files = scene.files()
     for name in (value for its in document.iter() for key, value in its.attrib.items() if key.startswith("file")):
         if f"assets/{name}" not in files:  # MuJoCo would look for it on the disk
             called = sanitize_line(name, 80)
-            raise InputError(f"scene {scene.scene_id}: it names {called!r}, which is none of its files", "bad_mjcf")
+            raise InputError(f"scene.xml names {called!r}, which is none of its files", "bad_mjcf")
+    for body in document.findall("worldbody/body"):
+        check_body_name(body.get("name", ""))
+    for default in document.findall("default/default"):
+        if default.get("class") not in _GROUPS:
+            called = sanitize_line(default.get("class", ""), 80)
+            raise InputError(f"scene.xml has the class {called!r}: only {' and '.join(_GROUPS)} are known", "bad_mjcf")
+
+
+def _write_objects(document: ET.Element, scene: Scene, folder: Path) -> dict[str, Path]:
+    """Write a file per body and all assets, where they are not there yet. Returns the paths by the bodies' names."""
     paths = {body.attrib["name"]: folder / f"{body.attrib['name']}.xml" for body in document.findall("worldbody/body")}
-    written = {folder / name: data for name, data in files.items() if name.startswith("assets/")}
+    written = {folder / name: data for name, data in scene.files().items() if name.startswith("assets/")}
     for body in document.findall("worldbody/body"):
         written[paths[body.attrib["name"]]] = ET.tostring(_make_object_document(document, body))
     for path, data in written.items():

@@ -49,7 +49,7 @@ def _lock_file(out: Path) -> Iterator[BinaryIO]:
         with path.open("a+b") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+            except BlockingIOError:
                 raise BuildError(
                     f"{out}: another process writes these results; wait for it, or give another --out"
                 ) from None

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -60,7 +59,7 @@ def export(
     """
     layout = scene.settled.rectified
     try:
-        bodies = _build_bodies(scene, config.export.poses)
+        bodies = _build_bodies(scene, config.export)
     except GeometryError as error:
         return Dropped("unusable_mesh", str(error))
     objects = layout.placed.objects
@@ -97,25 +96,25 @@ class _CertifiedFiles:
     sizes: SimulationSizes
 
 
-def _choose_poses(scene: CuratedScene, which: Literal["settled", "rectified", "placed"]) -> Sequence[Pose]:
+def _choose_poses(scene: CuratedScene, export: ExportConfig) -> Sequence[Pose]:
     """Choose the poses of `export.poses`; a copy, which no picture shows, is placed by rectification."""
     layout = scene.settled.rectified
-    if which == "settled":
+    if export.poses == "settled":
         return scene.settled.poses
-    if which == "rectified":
+    if export.poses == "rectified":
         return layout.poses
     items = zip(layout.placed.objects, layout.poses, strict=True)
     return [rectified if item.copy_of else item.pose for item, rectified in items]
 
 
-def _build_bodies(scene: CuratedScene, which: Literal["settled", "rectified", "placed"]) -> tuple[SceneBody, ...]:
+def _build_bodies(scene: CuratedScene, export: ExportConfig) -> tuple[SceneBody, ...]:
     layout = scene.settled.rectified
     masses = {verdict.object_id: verdict.mass_kg for verdict in scene.assessment.objects}
     objects, evidence = layout.placed.objects, layout.placed.evidence
     pictures: Sequence[ColorProjector | None] = [None] * len(objects)
     if evidence is not None:
         pictures = load_projectors(evidence, [item.pose for item in objects], [item.scale for item in objects])
-    bodies, poses = [], _choose_poses(scene, which)
+    bodies, poses = [], _choose_poses(scene, export)
     for index, (item, pieces) in enumerate(zip(objects, layout.pieces, strict=True)):
         if item.object_id not in masses:
             raise TableverseError(f"{scene.scene_id}: the assessment has no mass for {item.object_id}")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tableverse_factory import open_dataset
-from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.delivery.episodes.observation import count_object_rows
 from tableverse_factory.delivery.learning.envhub import make_env
 from tests.helpers.docs_pages import find_example
@@ -56,6 +56,14 @@ def test_the_actions_of_an_export_succeed(out, fps):
 
 
 @pytest.mark.heavy
+def test_an_action_without_all_joints_is_refused(out):
+    (env,) = make_env(str(out)).envs
+    env.reset(seed=0)
+    with pytest.raises(InputError, match=r"action of shape \(1,\): give \(8,\)"):
+        env.step(np.zeros(1, dtype=np.float32))
+
+
+@pytest.mark.heavy
 def test_a_rate_that_steps_do_not_divide_into_is_refused(out):
     with pytest.raises(ConfigError, match="20 frames per second, of 50 steps: give one of 1, 2, 5, 10, 25, 50"):
         make_env(str(out), fps=20)
@@ -88,10 +96,7 @@ def test_lerobot_loads_the_documented_file_and_evaluates_policies(out, hub_cache
     from lerobot.scripts.lerobot_eval import eval_policy, rollout
 
     recording = open_dataset(str(out)).scene("s-0").trajectory("task_000").recording()
-    commands, every = (
-        recording.command,
-        round(0.1 / recording.step_s),
-    )  # the page's environment has ten actions a second
+    commands, every = recording.command, round(1.0 / (50 * recording.step_s))  # the page's rate is the default
 
     class Replay(torch.nn.Module):
         def reset(self) -> None:

@@ -47,10 +47,19 @@ def test_the_documented_environment_resets_steps_and_rests(tmp_path, monkeypatch
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_scene_that_names_other_files_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("own", "foreign", "message"),
+    [
+        ('"obj_000.png"', '"../../own.png"', r"names '\.\./\.\./own\.png', which is none of its files"),
+        ('body name="obj_000"', 'body name="../../obj_000"', "cannot be a file"),
+        ('body name="obj_000"', "body", "cannot be a file"),
+        ('default class="visual"', 'default class="seen"', "has the class 'seen'"),
+    ],
+)
+def test_a_foreign_scene_is_refused_before_anything_is_written(tmp_path, own, foreign, message):
     pytest.importorskip("robosuite", reason="installed where it is tested, with an older MuJoCo")
-    own = exported()
-    files = own.files() | {"scene.xml": own.xml.replace('"obj_000.png"', '"../../own.png"').encode()}
-    with pytest.raises(InputError, match=r"it names '\.\./\.\./own\.png', which is none of its files"):
-        add_to_robosuite(None, Scene(own.scene_id, {}, files), tmp_path / "made")
-    assert not (tmp_path / "made").exists()
+    scene = exported()
+    files = scene.files() | {"scene.xml": scene.xml.replace(own, foreign).encode()}
+    with pytest.raises(InputError, match=message):
+        add_to_robosuite(None, Scene(scene.scene_id, {}, files), tmp_path / "a/b/made")
+    assert not list(tmp_path.iterdir())

@@ -9,8 +9,8 @@ from tableverse_factory.evaluation.training.policy.demonstrations import Demonst
 def choose_motions(own: Demonstrations, scenes: int | None = None, motions: int | None = None) -> np.ndarray:
     """Choose among the demonstrations that are not held out: of the first `scenes` scenes, `motions` in turn.
 
-    In turn means the first of each scene, then the second, and so on. Scenes are in the order of their ids, which are
-    hashes, so a smaller choice is a random part of a larger one. None is no limit.
+    In turn means the first of each scene, then the second, and so on. A smaller choice is part of a larger one. Scenes
+    are in the order in which they were packed: by dataset, then by id. None is no limit.
 
     Returns:
         A mask of shape (n,).

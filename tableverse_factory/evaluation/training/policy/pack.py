@@ -55,7 +55,9 @@ def pack_demonstrations(
     robot: str = "panda",
     on_scene: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Demonstrations:
-    """Pack the successful motions of an arm in these splits, by dataset, scene and task; of `validation` held out.
+    """Pack the successful motions of an arm in these splits, by dataset, scene and task.
+
+    Those of `validation` are held out.
 
     Raises:
         InputError: `no_trajectories` where there are none.

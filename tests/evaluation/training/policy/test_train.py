@@ -136,6 +136,7 @@ def test_the_command_packs_trains_and_continues(
     assert "give --dataset, whose motions are packed into it" in run("--steps", "1")
     assert "1 of 1 steps" in run("--steps", "1", "--dataset", str(dataset.path))
     assert "2 of 2 steps" in run("--steps", "2")
+    assert "--dataset is not read" in run("--steps", "2", "--dataset", "another")
     assert sorted(path.name for path in folder.iterdir()) == [CHECKPOINT, "demonstrations.npz", WEIGHTS]
 
 
