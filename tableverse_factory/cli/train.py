@@ -154,10 +154,10 @@ def train_policy(
         list[str] | None,
         typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories, read the first time; may repeat."),
     ] = None,
-    steps: TrainSteps = 16_000,
+    steps: TrainSteps = 3_000,
     minutes: TrainMinutes = None,
-    goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 256,
-    chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 1_024,
+    goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 128,
+    chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 512,
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of scenes to learn from; all without.")] = None,
     motions: Annotated[
         int | None, typer.Option(min=1, help="Number of motions to learn, from these scenes in turn; all without.")

@@ -14,6 +14,7 @@ class SolverSettings:
     """What MuJoCo's solver is told, with the names of MJCF's `option`."""
 
     timestep: float  # [s]
+    gravity: tuple[float, ...]  # [m/s²]
     integrator: str
     cone: str
     impratio: float
@@ -35,6 +36,7 @@ def read_solver_settings(model: mujoco.MjModel) -> SolverSettings:
     option = model.opt
     return SolverSettings(
         float(option.timestep),
+        tuple(option.gravity.tolist()),
         mujoco.mjtIntegrator(option.integrator).name.removeprefix("mjINT_").lower(),
         mujoco.mjtCone(option.cone).name.removeprefix("mjCONE_").lower(),
         float(option.impratio),

@@ -26,10 +26,12 @@ def add_solver_settings(stage: "Usd.Stage", path: str, solver: SolverSettings) -
     from pxr import Sdf, UsdPhysics
 
     physics = UsdPhysics.Scene.Define(stage, path)
-    physics.CreateGravityDirectionAttr((0.0, 0.0, -1.0))
-    physics.CreateGravityMagnitudeAttr(9.81)
+    strength = float(np.linalg.norm(solver.gravity))
+    physics.CreateGravityDirectionAttr(tuple(each / strength for each in solver.gravity) if strength else (0, 0, -1))
+    physics.CreateGravityMagnitudeAttr(strength)
     types = Sdf.ValueTypeNames
     values = {
+        "timestep": (types.Double, solver.timestep),
         "integrator": (types.Token, solver.integrator),
         "cone": (types.Token, solver.cone),
         "impratio": (types.Double, solver.impratio),

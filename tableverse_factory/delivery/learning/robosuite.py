@@ -33,7 +33,7 @@ def add_to_robosuite(
     """Add a scene to a robosuite `Task`, with the settings with which it rests: in `_load_model` of an environment.
 
     Integrator, cone, impratio and no-slip iterations of the task become the scene's, and several contacts per pair are
-    enabled. The timestep is robosuite's (`macros.SIMULATION_TIMESTEP`, 0.002 s), as the scene's is by default.
+    enabled. The timestep is robosuite's (`macros.SIMULATION_TIMESTEP`, 0.002 s), which must not exceed the scene's.
 
     Args:
         task: To add to, of an arena without a table.
@@ -47,15 +47,22 @@ def add_to_robosuite(
         The `MujocoXMLObject` of the table and of each object, by the body's name; the task has them too.
 
     Raises:
-        ConfigError: if robosuite is not installed.
+        ConfigError: if robosuite is not installed, or its timestep is longer than the scene's.
         InputError: `bad_mjcf` if the scene names files that are not its own, or classes that this program does not
             write; `bad_name` if a body cannot be a file.
     """
     try:
+        from robosuite import macros
         from robosuite.models.objects import MujocoXMLObject
     except ImportError:
         raise ConfigError("add_to_robosuite needs robosuite: pip install robosuite") from None
     document = parse_document(scene.files())
+    timestep = min((float(its.get("timestep", 0.002)) for its in document.findall("option")), default=0.002)
+    if timestep < macros.SIMULATION_TIMESTEP:
+        raise ConfigError(
+            f"scene {scene.scene_id} rests with steps of {timestep:g} s, and robosuite's take "
+            f"{macros.SIMULATION_TIMESTEP:g} s: set robosuite.macros.SIMULATION_TIMESTEP"
+        )
     _check_names(document, scene)
     paths = _write_objects(document, scene, Path(folder).absolute() / scene.scene_id)
     objects = {}

@@ -27,6 +27,8 @@ def test_what_usd_lacks_stands_in_the_attributes_of_mujoco_and_newton(folder):
     found = {name: physics.GetAttribute(f"mjc:option:{name}").Get() for name in ("cone", "integrator", "impratio")}
     assert found == {"cone": "elliptic", "integrator": "implicitfast", "impratio": 100.0}
     assert physics.GetAttribute("mjc:option:noslip_iterations").Get() == 5
+    assert physics.GetAttribute("mjc:option:timestep").Get() == model.opt.timestep
+    assert physics.GetAttribute("physics:gravityMagnitude").Get() == pytest.approx(9.81)
     assert physics.GetAttribute("newton:timeStepsPerSecond").Get() == round(1 / model.opt.timestep)
     for name in NAMES:
         piece, geom = stage.GetPrimAtPath(f"/World/{name}/piece_00"), model.geom(f"{name}_piece_00")

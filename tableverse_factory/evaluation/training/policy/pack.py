@@ -45,7 +45,7 @@ class SceneMotions:
 
     dataset: Dataset
     scene_id: str
-    rows: list[Row]
+    rows: tuple[Row, ...]
     split: str
 
 
@@ -84,12 +84,12 @@ def list_motions(datasets: Sequence[Dataset], splits: Sequence[str], robot: str)
 def _list_scenes(dataset: Dataset, splits: Sequence[str], robot: str) -> list[SceneMotions]:
     tasks = list_split_tasks(dataset, robot)
     rows = dataset.trajectories.to_table(filter=pc.field("success") & (pc.field("robot") == robot)).to_pylist()
-    scenes: dict[str, SceneMotions] = {}
+    scenes: dict[tuple[str, str], list[Row]] = {}
     for row in sorted(rows, key=lambda row: (row["scene_id"], row["task_id"])):
         scene_id = row["scene_id"]
         if (split := tasks.get((scene_id, row["task_id"]))) is not None and split in splits:
-            scenes.setdefault(scene_id, SceneMotions(dataset, scene_id, [], split)).rows.append(row)
-    return list(scenes.values())
+            scenes.setdefault((scene_id, split), []).append(row)
+    return [SceneMotions(dataset, scene_id, tuple(own), split) for (scene_id, split), own in scenes.items()]
 
 
 class _Packer:

@@ -43,7 +43,7 @@ def pack_pictures(
     return FirstPictures(np.frombuffer(b"".join(files), np.uint8), ends, np.array(words, dtype=np.int16))
 
 
-def _take_pictures(scene: tuple[str, str, str, list[Row]]) -> list[tuple[list[bytes], np.ndarray]]:
+def _take_pictures(scene: tuple[str, str, str, tuple[Row, ...]]) -> list[tuple[list[bytes], np.ndarray]]:
     """Take the pictures of a scene's motions, and number the words of their instructions."""
     path, robot, scene_id, rows = scene
     opened, arm, found = open_dataset(path).scene(scene_id), load_arm(robot), []

@@ -19,9 +19,9 @@ class PolicySettings:
 
     steps: int
     seed: int = 0
-    goals: int = 256
+    goals: int = 128
     flows: int = 8
-    chunks: int = 1024
+    chunks: int = 512
     rate: float = 6e-4
     scenes: int | None = None
     motions: int | None = None
