@@ -129,6 +129,8 @@ def score(
     from tableverse_factory.evaluation.benchmark.leaderboard import name_policies, render_leaderboard
     from tableverse_factory.evaluation.benchmark.score import GROUP_NOTES, score_results
 
+    if page is not None and page.resolve() in [path.resolve() for path in results]:
+        raise ConfigError(f"--page {page}: it is one of the results, which the page would replace; give another file")
     found = score_results(results)
     if page is not None:
         write_atomic(page, render_leaderboard(found))

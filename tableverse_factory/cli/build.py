@@ -1,5 +1,6 @@
 """`tableverse build`: from the image manifest to the dataset; the same command again resumes."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -127,9 +128,10 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
     planned = pluralize(state.total, "scene")
     print(f"{state.done} done, {state.dropped} dropped, {state.failed} failed of {planned}, in {out}")
     if state.done:
-        print(f"look at them: tableverse view {out}, or a gallery of files: tableverse report {out}")
+        place = shlex.quote(str(out))
+        print(f"look at them: tableverse view {place}, or a gallery of files: tableverse report {place}")
     if state.failed or (state.dropped and not state.done):
-        print(f"see why: tableverse failures {out}")
+        print(f"see why: tableverse failures {shlex.quote(str(out))}")
     if tally.postponed:
         later = pluralize(tally.postponed, "scene")
         print(f"left for a later run: {later}, because a model did not answer; run it again for them")

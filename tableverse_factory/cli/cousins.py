@@ -42,6 +42,7 @@ def cousins(
 
     Example: `tableverse cousins out out-cousins --per-scene 10`
     """
+    from tableverse_factory.core.config import load_config
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.cousin_rows import list_cousins
     from tableverse_factory.dataset.dataset import open_dataset
@@ -49,18 +50,26 @@ def cousins(
     from tableverse_factory.stages.curate.lexicon import find_kind
     from workers.api import build
     from workers.driver.signals import StopSignals
+    from workers.plan.read_manifest import read_manifest
 
     source, place = parse_path(out), parse_path(dest)
     if place == source:
         raise InputError(f"{dest} is the dataset of the parents: give another folder for the cousins")
     manifest = place.parent / f"{place.name}.parquet"
+    overrides = [*(overrides or []), f"run.seed={seed}"]
+    load_config(config, overrides)  # what is refused leaves no manifest behind
     rows = list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind)
+    if (place / "plan.parquet").exists() and manifest.exists() and list(read_manifest(manifest)) != list(rows):
+        raise InputError(
+            f"{dest} was begun with other cousins than {per_scene} of each scene with seed {seed}: give --per-scene "
+            "and --seed as then, or another folder"
+        )
     write_manifest(manifest, rows)
     summary = build(
         str(manifest),
         dest,
         config=config,
-        overrides=[*(overrides or []), f"run.seed={seed}"],
+        overrides=overrides,
         executor=executor,
         workers=workers,
         address=address,

@@ -44,8 +44,7 @@ def make_dataset_card(out: StoragePath, run: Mapping[str, Any], shards: Sequence
     parts = [
         make_front_matter(scenes.num_rows, licences, tables),
         "# Table-top scenes for MuJoCo",
-        "Made by TableVerse Factory from pictures; every scene was settled, and certified on the exported XML. "
-        "MuJoCo 3.2 and newer load the scenes; they rest as certified with 3.3.7 and newer.",
+        _describe_certification(run),
         _format_table(
             ("what", "count"),
             [
@@ -165,6 +164,17 @@ def _count_values(done: pa.Table, name: str, missing: str) -> list[tuple[Any, in
 
 def _sort_by_count(counts: Mapping[Any, int]) -> list[tuple[Any, int]]:
     return sorted(counts.items(), key=lambda item: (-item[1], str(item[0])))[:_MAX_ROWS]
+
+
+def _describe_certification(run: Mapping[str, Any]) -> str:
+    poses = run.get("config", {}).get("export", {}).get("poses", "settled")
+    made = "Made by TableVerse Factory from pictures; "
+    if poses != "settled":
+        return f"{made}objects stand as they were {poses}: scenes may collide and move, as their certificates say."
+    return (
+        f"{made}every scene was settled, and certified on the exported XML. MuJoCo 3.2 and newer load the scenes; they "
+        "rest as certified with 3.3.7 and newer."
+    )
 
 
 def _format_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -95,13 +95,15 @@ def write_weights(average: Any, folder: Path) -> None:
         for name, each in average.state_dict().items()
     }
     partial = folder / f"{WEIGHTS}.partial"
-    safetensors.save_file(weights, partial)
+    partial.write_bytes(safetensors.save(weights))  # `save_file` would let nobody else read it
     partial.rename(folder / WEIGHTS)
 
 
 def read_weights(path: Path, network: Any) -> None:
     """Load the weights that `write_weights` wrote."""
     safetensors = import_extra("safetensors", "training", "models")
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file: give the weights that a training wrote")
     try:
         with safetensors.safe_open(path, "pt") as file:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping

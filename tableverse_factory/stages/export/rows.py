@@ -41,7 +41,7 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate, sizes: Simula
         "judge": scene.judge,
         "mesh_licences": sorted({item.mesh_licence for item in placed.objects if item.mesh_licence}) or None,
         "n_objects": len(scene.settled.poses),
-        "usable": scene.assessment.usable,
+        "usable": scene.assessment.usable and certificate.at_rest and not certificate.colliding,
         "quality_score": scene.assessment.quality_score,
         **_describe_detector(placed.detection),
         **_describe_judge(scene.assessment),

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.curation import Relation
 from tableverse_factory.cli.main import app
-from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.evaluation.benchmark.leaderboard import render_leaderboard
 from tableverse_factory.evaluation.benchmark.results import (
     EpisodeResult,
@@ -123,6 +123,10 @@ def test_the_command_prints_rates_and_writes_the_page(tmp_path, capsys):
     assert "75.0 (30–95) of 4" in printed
     assert "planner: 1 disturbed" in printed
     assert "75.0" in page.read_text()
+    before = (tmp_path / "b.jsonl").read_bytes()
+    with pytest.raises(ConfigError, match="it is one of the results"):
+        app(["benchmark", "score", *files, "--page", str(tmp_path / "." / "b.jsonl")], standalone_mode=False)
+    assert (tmp_path / "b.jsonl").read_bytes() == before
     app(["benchmark", "score", *files, "--json"], standalone_mode=False)
     told = json.loads(capsys.readouterr().out)
     assert told["rows"][0]["rates"][0]["successes"] == 3

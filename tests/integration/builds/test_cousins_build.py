@@ -193,6 +193,10 @@ def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
     assert (tmp_path / "dest.parquet").is_file()
     code, text, _ = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 2, "--executor", "local")
     assert "nothing was left to do" in text
+    manifest = (tmp_path / "dest.parquet").read_bytes()
+    code, _, errors = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 3, "--executor", "local")
+    assert (code, (tmp_path / "dest.parquet").read_bytes()) == (1, manifest)
+    assert "begun with other cousins" in errors
     code, _, errors = run("cousins", made / "out", made / "out", "--executor", "local")
     assert code == 1
     assert "is the dataset of the parents" in errors

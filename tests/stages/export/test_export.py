@@ -154,6 +154,7 @@ def test_a_scene_that_is_not_settled_is_written_as_it_is_and_not_certified(poses
     assert outcome.value.object_rows[1]["x_m"] == pytest.approx(side - depth_m)
     assert outcome.value.certificate.piece_penetration_m == pytest.approx(depth_m, abs=1e-6)
     assert outcome.value.scene_row["colliding"]
+    assert not outcome.value.scene_row["usable"]
     assert not outcome.value.scene_row["at_rest"]
 
 

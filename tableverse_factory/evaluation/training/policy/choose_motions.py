@@ -26,7 +26,10 @@ def choose_motions(own: Demonstrations, scenes: int | None = None, motions: int 
         rows, scene = rows[scene < scenes], scene[scene < scenes]
     if motions is not None:
         if motions > len(rows):
-            raise InputError(f"{motions} motions are to be learnt, and there are {len(rows)}", "too_few_motions")
+            raise InputError(
+                f"{motions} motions are to be learnt, and the {len(np.unique(scene))} scenes have {len(rows)}",
+                "too_few_motions",
+            )
         turn = np.array([np.count_nonzero(scene[:k] == scene[k]) for k in range(len(scene))], dtype=np.int64)
         rows = rows[np.lexsort((scene, turn))[:motions]]
     chosen = np.zeros(len(own), dtype=bool)

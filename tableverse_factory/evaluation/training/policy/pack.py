@@ -78,6 +78,12 @@ def list_motions(datasets: Sequence[Dataset], splits: Sequence[str], robot: str)
     if not found:
         names = ", ".join(str(dataset.path) for dataset in datasets)
         raise InputError(f"{names}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
+    ids = [own.scene_id for own in found]
+    if len(set(ids)) < len(ids):
+        twice = next(name for name in ids if ids.count(name) > 1)
+        raise InputError(
+            f"scene {twice} is in two of the datasets, and its motions would count twice: give one of them"
+        )
     return found
 
 

@@ -40,5 +40,5 @@ def test_scenes_give_motions_in_turn(own: Demonstrations, scenes: int, motions: 
 def test_more_than_there_are_is_refused(own: Demonstrations) -> None:
     with pytest.raises(InputError, match="4 scenes are to be learnt, and 3 have motions"):
         choose_motions(own, scenes=4)
-    with pytest.raises(InputError, match="5 motions are to be learnt, and there are 4"):
+    with pytest.raises(InputError, match="5 motions are to be learnt, and the 2 scenes have 4"):
         choose_motions(own, scenes=2, motions=5)

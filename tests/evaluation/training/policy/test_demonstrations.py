@@ -55,12 +55,9 @@ def test_the_file_gives_back_what_was_written_and_the_same_bytes(packed: Path, t
         assert not getattr(own, field.name).flags.writeable
 
 
-def test_datasets_are_packed_one_after_another(dataset: Dataset, packed: Path) -> None:
-    one, two = Demonstrations.read(packed), pack_demonstrations([dataset, dataset], tuple(SPLITS))
-    assert two.scenes.tolist() == [0, 1]
-    assert two.ends.tolist() == [len(one.tcp), 2 * len(one.tcp)]
-    assert np.array_equal(two.tcp, np.concatenate([one.tcp, one.tcp]))
-    assert np.array_equal(two.points[two.objects[1, 0]], one.points[one.objects[0, 0]])
+def test_a_scene_of_two_datasets_is_refused(dataset: Dataset) -> None:
+    with pytest.raises(InputError, match="scene s-0 is in two of the datasets"):
+        pack_demonstrations([dataset, dataset], tuple(SPLITS))
 
 
 def test_a_dataset_without_motions_in_a_split_is_refused(dataset: Dataset) -> None:
