@@ -46,6 +46,8 @@ def cousins(
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.cousin_rows import list_cousins
     from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.dataset.image_rows import ImageRows
+    from tableverse_factory.dataset.shard_plan import digest_manifest
     from tableverse_factory.sources.manifest import write_manifest
     from tableverse_factory.stages.curate.lexicon import find_kind
     from workers.api import build
@@ -58,8 +60,9 @@ def cousins(
     manifest = place.parent / f"{place.name}.parquet"
     overrides = [*(overrides or []), f"run.seed={seed}"]
     load_config(config, overrides)  # what is refused leaves no manifest behind
-    rows = list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind)
-    if (place / "plan.parquet").exists() and manifest.exists() and list(read_manifest(manifest)) != list(rows):
+    rows = ImageRows.from_rows(list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind))
+    begun = (place / "plan.parquet").exists() and manifest.exists()
+    if begun and digest_manifest(read_manifest(manifest)) != digest_manifest(rows):
         raise InputError(
             f"{dest} was begun with other cousins than {per_scene} of each scene with seed {seed}: give --per-scene "
             "and --seed as then, or another folder"
