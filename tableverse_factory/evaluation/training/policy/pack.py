@@ -72,18 +72,21 @@ def pack_demonstrations(
 def list_motions(datasets: Sequence[Dataset], splits: Sequence[str], robot: str) -> list[SceneMotions]:
     """List the scenes of these splits with successful motions of an arm, of one dataset after another.
 
-    Splits are each dataset's own. Tasks of nouns that the benchmark holds out are left out.
+    Splits are each dataset's own. Tasks of nouns that the benchmark holds out are left out. A scene of two datasets is
+    refused.
     """
-    found = [own for dataset in datasets for own in _list_scenes(dataset, splits, robot)]
+    found: list[SceneMotions] = []
+    owner: dict[str, int] = {}
+    for number, dataset in enumerate(datasets):
+        for own in _list_scenes(dataset, splits, robot):
+            if owner.setdefault(own.scene_id, number) != number:
+                raise InputError(
+                    f"scene {own.scene_id} is in two of the datasets, and its motions would count twice: give one"
+                )
+            found.append(own)
     if not found:
         names = ", ".join(str(dataset.path) for dataset in datasets)
         raise InputError(f"{names}: no motion of {robot} in {', '.join(splits)} succeeds", "no_trajectories")
-    ids = [own.scene_id for own in found]
-    if len(set(ids)) < len(ids):
-        twice = next(name for name in ids if ids.count(name) > 1)
-        raise InputError(
-            f"scene {twice} is in two of the datasets, and its motions would count twice: give one of them"
-        )
     return found
 
 
