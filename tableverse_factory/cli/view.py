@@ -1,7 +1,6 @@
 """`tableverse view`: scenes in the browser."""
 
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -44,7 +43,6 @@ def view(
     Example: `tableverse view out` and open the address that it prints
     """
     import signal
-    import threading
 
     from tableverse_factory.dataset.dataset import open_dataset
     from tableverse_factory.viz.viewer.loaded_scene import load_scene_file
@@ -63,15 +61,16 @@ def view(
         raise InputError(f"{out}: no scene is done yet")
     if scene_id is not None and scenes.find_dropped_row(scene_id) is None:
         scenes.open(scene_id)
-    ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
-    viewer = Viewer(scenes, first, host, port, robot, allow_origin or ())
-    print(viewer.url, flush=True)
+    ends = {signal.SIGINT, signal.SIGTERM}
+    # Blocked before the viewer's threads start, which inherit it: neither signal can come between two lines here.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ends)
     try:
-        with suppress(KeyboardInterrupt):
-            ended.wait()
+        viewer = Viewer(scenes, first, host, port, robot, allow_origin or ())
+        print(viewer.url, flush=True)
+        signal.sigwait(ends)
     finally:
-        viewer.stop()
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ends)  # a second Ctrl-C ends what does not stop
+    viewer.stop()
 
 
 def _open_first(scenes: "SceneCache") -> str | None:
