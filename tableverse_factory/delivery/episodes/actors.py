@@ -25,7 +25,7 @@ from tableverse_factory.robotics.robots.arm import Arm
 from tableverse_factory.robotics.robots.station import PEDESTAL_HEIGHT_M, PEDESTAL_SHARE, PEDESTAL_TOP_M
 
 _VISUAL_GROUP = 2
-_PEDESTAL_COLOR = (82, 87, 94)
+PEDESTAL_COLOR = (82, 87, 94)
 _SECTIONS = 24  # sides of round primitives
 
 
@@ -95,7 +95,7 @@ def build_render_scene(scene: Scene, moved: AbstractSet[str], figure: ArmMeshes,
     return RenderScene(
         PaintedMeshes(
             (*(scenery.parts[k] for k in still), figure.pedestal(base)),
-            (*(scenery.colors[k] for k in still), _PEDESTAL_COLOR),
+            (*(scenery.colors[k] for k in still), PEDESTAL_COLOR),
         ),
         PaintedMeshes((*meshes, *figure.meshes), (*(scenery.colors[k] for k in taken), *[None] * len(figure.meshes))),
         tuple(names[k] for k in taken),

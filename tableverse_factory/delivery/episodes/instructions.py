@@ -4,13 +4,14 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from schemas.curation import Relation
+from schemas.curation import INSTRUCTION, Relation
 from tableverse_factory.core.text import sanitize_line
 
 _MAX_INSTRUCTION = 500
 _RELATIONS = "|".join(sorted((re.escape(relation.value) for relation in Relation), key=len, reverse=True))
-_TEMPLATE = re.compile(rf"Pick up (?P<x>.+) and place it (?P<relation>{_RELATIONS}) (?P<y>.+?)\.?")
-_PARAPHRASES = (
+_PARTS = {"x": "(?P<x>.+)", "relation": f"(?P<relation>{_RELATIONS})", "y": "(?P<y>.+?)"}
+_TEMPLATE = re.compile(rf"{INSTRUCTION.format_map(_PARTS)}\.?")
+PARAPHRASES = (
     "Put {x} {relation} {y}",
     "Move {x} so that it is {relation} {y}",
     "Grasp {x}, carry it over and set it down {relation} {y}",
@@ -25,4 +26,4 @@ def read_instruction(row: Mapping[str, Any]) -> str:
 def paraphrase_instruction(instruction: str) -> tuple[str, ...]:
     """Say an instruction of the usual template in three other ways; none of another template."""
     found = _TEMPLATE.fullmatch(instruction)
-    return tuple(text.format_map(found.groupdict()) for text in _PARAPHRASES) if found else ()
+    return tuple(text.format_map(found.groupdict()) for text in PARAPHRASES) if found else ()

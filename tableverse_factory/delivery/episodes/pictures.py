@@ -34,7 +34,7 @@ where nothing is; `front_instances` (h, w, 1) uint8: 1 + row in the states of ob
 Likewise others."""
 TABLE_ID, ROBOT_ID = 254, 255
 MAX_DEPTH_M = 4.095  # twelve bits of millimetres, as videos have
-_MOVING_QUALITY = 1, 0  # samples and sky rays of a camera for which nothing stands still
+MOVING_QUALITY = 1, 0  # samples and sky rays of a camera for which nothing stands still
 
 
 def check_pictures(names: Sequence[str]) -> tuple[str, ...]:
@@ -68,14 +68,14 @@ class CameraRig:
         self._pictures, self._mount = tuple(pictures), mount_wrist_camera(arm)
         if shift is not None:
             self._mount = compose_poses(self._mount, shift.pose)
-        self._ids = _number_parts(cast, object_ids)
+        self._ids = number_parts(cast, object_ids)
         self._renderers = {
             name: IncrementalRenderer(
                 cast.still,
                 cast.moving,
                 _place(name, scene, arm, base, size, shift),
                 lighting,
-                *_MOVING_QUALITY if name == "wrist" else (),
+                *MOVING_QUALITY if name == "wrist" else (),
             )
             for name in dict.fromkeys(picture.partition("_")[0] for picture in pictures)
         }
@@ -115,7 +115,7 @@ def _place_unshifted(name: str, scene: Scene, arm: Arm, base: Pose, size: tuple[
     return eye
 
 
-def _number_parts(cast: RenderScene, object_ids: Sequence[str]) -> np.ndarray:
+def number_parts(cast: RenderScene, object_ids: Sequence[str]) -> np.ndarray:
     """Give every mesh, the still ones first, its instance; the last entry is for nothing. Shape (parts + 1,)."""
     if len(object_ids) >= TABLE_ID:
         raise InputError(f"{len(object_ids)} objects: instances tell at most {TABLE_ID - 1} apart")

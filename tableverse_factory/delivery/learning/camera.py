@@ -7,7 +7,7 @@ import numpy as np
 
 from schemas.geometry import Texture, TriangleMesh
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.episodes.actors import ArmMeshes, build_render_scene
+from tableverse_factory.delivery.episodes.actors import ArmMeshes, RenderScene, build_render_scene
 from tableverse_factory.delivery.episodes.cameras import CameraShift
 from tableverse_factory.delivery.episodes.incremental_renderer import PaintedMeshes
 from tableverse_factory.delivery.episodes.pictures import CameraRig, join_poses
@@ -41,7 +41,7 @@ class SceneCameras:
         """
         self._figure, self._base = ArmMeshes(station.arm), station.base
         cast = build_render_scene(scene, set(object_ids), self._figure, self._base)
-        self._cast = cast if table is None else replace(cast, still=_retexture_table(cast.still, scene, table))
+        self._cast = cast if table is None else retexture_table(cast, scene, table)
         self._rig = CameraRig(pictures, scene, self._cast, station.arm, self._base, object_ids, size, lighting, shift)
 
     def take(self, poses: Mapping[str, np.ndarray], positions: np.ndarray, tcp: np.ndarray) -> dict[str, np.ndarray]:
@@ -52,8 +52,9 @@ class SceneCameras:
         return self._rig.take(join_poses(poses, self._cast, self._figure.poses(positions, self._base)), tcp)
 
 
-def _retexture_table(still: PaintedMeshes, scene: Scene, seed: int) -> PaintedMeshes:
-    """Replace the texture of the table, the last mesh but the pedestal."""
+def retexture_table(cast: RenderScene, scene: Scene, seed: int) -> RenderScene:
+    """Replace the texture of the table, the last still mesh but the pedestal."""
+    still = cast.still
     index, slab = len(still.meshes) - 2, read_slab(scene.files())
     board = still.meshes[index]
     c, s = np.cos(slab.yaw), np.sin(slab.yaw)
@@ -61,4 +62,4 @@ def _retexture_table(still: PaintedMeshes, scene: Scene, seed: int) -> PaintedMe
     texture = Texture(make_texture(seed, _TEXTURE_PX), along[board.faces])
     meshes, paints = list(still.meshes), list(still.paints)
     meshes[index], paints[index] = TriangleMesh(board.vertices, board.faces, texture=texture), None
-    return replace(still, meshes=tuple(meshes), paints=tuple(paints))
+    return replace(cast, still=PaintedMeshes(tuple(meshes), tuple(paints)))

@@ -46,7 +46,7 @@ class DatasetEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ign
             options: Those of `TableEnv`.
         """
         self._dataset = open_dataset(dataset) if isinstance(dataset, str) else dataset
-        self.tasks = list_solved_tasks(self._dataset, split, load_arm(robot).name)
+        self.tasks = list_solved_tasks(self._dataset, split, robot)
         rows = count_object_rows(self._dataset) if max_objects is None else max_objects
         self._options = {**options, "robot": robot, "max_objects": rows}
         self._task, self._env = self.tasks[0], self._open(self.tasks[0])
@@ -90,22 +90,26 @@ class DatasetEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):  # type: ign
 
 
 def list_solved_tasks(dataset: Dataset, split: str | None, robot: str) -> tuple[Task, ...]:
-    """List the tasks of a split that a recorded motion of `robot` solves, by scene and task."""
+    """List the tasks of a split that a recorded motion of `robot` (`registry.load_arm`) solves, by scene and task."""
     if split is not None and split not in SPLITS:
         raise ConfigError(f"split {sanitize_line(repr(split), 60)}: give one of {', '.join(SPLITS)}, or None for all")
     rows = dataset.scenes.to_table(columns=["scene_id", "split"]).to_pylist()
     chosen = {row["scene_id"] for row in rows if split is None or get_split(row) == split}
-    solved = dataset.trajectories.to_table(
-        columns=["scene_id", "task_id"], filter=(pc.field("success")) & (pc.field("robot") == robot)
-    ).to_pylist()
+    solved = dataset.trajectories.to_table(columns=["scene_id", "task_id"], filter=filter_successes(robot)).to_pylist()
     tasks = sorted((row["scene_id"], row["task_id"]) for row in solved if row["scene_id"] in chosen)
     if not tasks:
         raise InputError(
-            f"{dataset.path}: no motion of {robot} solves a task of {len(chosen)} scenes (split {split}; "
-            f"{len(solved)} tasks of {len(rows)} scenes in all): give another split, or build trajectories",
+            f"{dataset.path}: no motion of {robot} solves a task of the {len(chosen)} scenes of "
+            f"{split or 'all splits'} ({len(solved)} tasks of {len(rows)} scenes in all): "
+            f"{'give another split, or ' if split else ''}build trajectories",
             "no_trajectories",
         )
     return tuple(tasks)
+
+
+def filter_successes(robot: str) -> pc.Expression:
+    """Filter rows of trajectories/ for motions of `robot` (`registry.load_arm`) that succeeded."""
+    return pc.field("success") & (pc.field("robot") == load_arm(robot).name)
 
 
 def make_environment(

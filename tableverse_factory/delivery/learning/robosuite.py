@@ -29,6 +29,7 @@ def add_to_robosuite(
     folder: str | Path,
     position: tuple[float, float, float] = (0.0, 0.0, 0.8),
     yaw_rad: float = -np.pi / 2,
+    prefix: str = "",
 ) -> dict[str, Any]:
     """Add a scene to a robosuite `Task`, with the settings with which it rests: in `_load_model` of an environment.
 
@@ -42,12 +43,14 @@ def add_to_robosuite(
         position: Of the table frame in the world, z up [m].
         yaw_rad: Turn of the table frame about the vertical [rad]; by default the table's near edge faces -x, where
             robosuite's arms stand.
+        prefix: Of the objects' names, and so of their observables; scenes added to one task need different ones.
 
     Returns:
-        The `MujocoXMLObject` of the table and of each object, by the body's name; the task has them too.
+        The `MujocoXMLObject` of the table and of each object, by the body's name in the scene; the task has them too.
 
     Raises:
-        ConfigError: if robosuite is not installed, or its timestep is longer than the scene's.
+        ConfigError: if robosuite is not installed, its timestep is longer than the scene's, or the task has a name
+            of the scene already.
         InputError: `bad_mjcf` if the scene names files that are not its own, or classes that this program does not
             write; `bad_name` if a body cannot be a file.
     """
@@ -69,9 +72,12 @@ def add_to_robosuite(
     for body in document.findall("worldbody/body"):
         name, joints = body.attrib["name"], "default" if body.find("joint") is not None else None
         bare = body.find("geom[@class='visual']") is None  # as the table: what it touches with is what is seen
-        added = MujocoXMLObject(str(paths[name]), name, joints=joints, duplicate_collision_geoms=bare)
+        added = MujocoXMLObject(str(paths[name]), f"{prefix}{name}", joints=joints, duplicate_collision_geoms=bare)
         added.get_obj().attrib.update(_compute_pose(body, np.array(position), yaw_rad))
         objects[name] = added
+    names = {its for added in objects.values() for its in _list_names(added.root)}
+    if clash := sorted(_list_names(task.root) & names):
+        raise ConfigError(f"prefix {prefix!r}: the task has a {' called '.join(clash[0])} already; give another")
     task.merge_objects(list(objects.values()))
     task.mujoco_objects.extend(objects.values())
     _copy_options(document, task.root.find("option"))
@@ -107,6 +113,11 @@ def _make_sensors(env: Any, body: str) -> dict[str, Any]:
 
     as_object = sensor(modality="object")
     return {"pos": as_object(read_position), "quat": as_object(read_quaternion)}
+
+
+def _list_names(root: ET.Element) -> set[tuple[str, str]]:
+    """List kind and name of all that has one. Of assets with one name, robosuite would keep the first in silence."""
+    return {(its.tag, its.attrib["name"]) for its in root.iter() if "name" in its.attrib}
 
 
 def _copy_options(document: ET.Element, option: ET.Element) -> None:

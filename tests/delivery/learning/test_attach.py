@@ -8,8 +8,6 @@ from tableverse_factory import attach_scene, attach_to_dm_control, find_unfit_se
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, measure_drift, read_body_poses
 
-pytestmark = pytest.mark.filterwarnings("error")
-
 
 @pytest.fixture(scope="module")
 def scene(out):

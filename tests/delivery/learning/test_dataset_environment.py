@@ -51,7 +51,7 @@ def test_every_solved_task_of_a_split_is_drawn_and_no_other(out):
     assert (find_split("s-0"), find_split("s-1")) == ("validation", "train"), "their ids, as they are of no picture"
     assert DatasetEnv(str(out), "validation").tasks == (("s-0", "task_000"),)
     assert DatasetEnv(str(out), "train").tasks == (("s-1", "task_000"),)
-    with pytest.raises(InputError, match="no motion of panda solves a task of 0 scenes"):
+    with pytest.raises(InputError, match="no motion of panda solves a task of the 0 scenes of"):
         DatasetEnv(str(out), "test")
 
 

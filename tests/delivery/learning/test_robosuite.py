@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tableverse_factory import add_to_robosuite, find_unfit_settings
-from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.dataset.scene import Scene
 from tests.helpers.docs_pages import run_example
 from tests.helpers.exported_scenes import exported
@@ -43,6 +43,28 @@ def test_the_documented_environment_resets_steps_and_rests(tmp_path, monkeypatch
         assert env.check_contact(env.things[name], env.things["table"])
     known = set(env.model.geom_ids_to_instances.values())
     assert {"table", *THINGS} < known, "segmentation of instances"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_two_scenes_stand_in_one_task_with_a_prefix_each(tmp_path):
+    pytest.importorskip("robosuite", reason="installed where it is tested, with an older MuJoCo")
+    from robosuite.models.arenas import EmptyArena
+    from robosuite.models.robots import Panda
+    from robosuite.models.tasks import ManipulationTask
+
+    task = ManipulationTask(EmptyArena(), [Panda()])
+    left = add_to_robosuite(task, exported("left"), tmp_path, (0.0, -2.0, 0.8), prefix="left/")
+    with pytest.raises(ConfigError, match="prefix 'left/': the task has a body called left/obj_000_main already"):
+        add_to_robosuite(task, exported("right"), tmp_path, (0.0, 2.0, 0.8), prefix="left/")
+    right = add_to_robosuite(task, exported("right"), tmp_path, (0.0, 2.0, 0.8))
+    assert set(left) == set(right) == {"table", *THINGS}
+    model = task.get_model()
+    for name in THINGS:
+        assert (left[name].name, right[name].name) == (f"left/{name}", name)
+        apart = model.body(right[name].root_body).pos - model.body(left[name].root_body).pos
+        np.testing.assert_allclose(apart, (0.0, 4.0, 0.0), atol=1e-9)
+    assert model.nmesh >= 2 * len(THINGS)
 
 
 @pytest.mark.slow
