@@ -34,11 +34,16 @@ def bench_picture(
 
     Example: `tableverse bench picture captures`
     """
+    from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.errors import InputError
     from tableverse_factory.evaluation.bench.picture import bench_other_pictures, bench_pictures, summarize_pictures
 
     settings = load_config(config, overrides or [])
-    scores = list(bench_pictures(folder, settings, focal))
+    with count_progress("pictures") as done:
+        scores = list(bench_pictures(folder, settings, focal, done.update))
+    if all(score.unread for score in scores):
+        raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     total = summarize_pictures(scores)
     others = dict(bench_other_pictures(other, settings)) if other else {}
     if as_json:
@@ -65,6 +70,8 @@ def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
         "depth error in the mean, one scale taken out; in the median what is left of it where one length was measured"
     )
     print_figures(columns, rows, f"{note}, angle, scale and CPU s")
+    if total.unread:
+        print(f"{total.unread} captures could not be read: their rows say why")
     print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")
 
 

@@ -1,7 +1,7 @@
 """Scores of bare pictures: the colour of captures through `observe` and `perceive`, against their depth and masks."""
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +48,8 @@ class PictureScore:
     plane_deg: float  # angle between the table's normals [°]
     cpu_s: float  # CPU time of `observe` and `perceive` [s]
     masks: MaskScore | None = None  # None without true masks
-    reason: str = ""  # why the picture was dropped, or empty
+    reason: str = ""  # why the picture was dropped, or the capture could not be read, or empty
+    unread: bool = False
 
     @property
     def is_within_sigma(self) -> bool:
@@ -62,6 +63,7 @@ class PictureSummary:
 
     pictures: int
     dropped: int
+    unread: int  # captures that could not be read
     depth_error: float  # mean
     measured_error: float  # median
     plane_deg: float  # median [°]
@@ -71,8 +73,13 @@ class PictureSummary:
     masks: MaskScore | None
 
 
-def bench_pictures(folder: Path, config: Config, with_focal: bool = False) -> Iterator[PictureScore]:
-    """Score the colour of every capture in `folder`, in the order of their names.
+def bench_pictures(
+    folder: Path,
+    config: Config,
+    with_focal: bool = False,
+    on_picture: Callable[[int, int], object] = lambda _done, _total: None,
+) -> Iterator[PictureScore]:
+    """Score the colour of every capture in `folder`, in the order of their names; what cannot be read says so.
 
     What lies on the table, and where the table is, tells the sensor through the detector `geometric`; objects are those
     of `seg.png` or `masks.png` where there is one. `with_focal` gives the net the capture's focal length.
@@ -80,8 +87,13 @@ def bench_pictures(folder: Path, config: Config, with_focal: bool = False) -> It
     names = sorted(path.parent.name for path in folder.glob("*/camera.json"))
     if not names:
         raise InputError(f"{str(folder)!r} holds no capture: a folder with color.png, depth.png and camera.json")
-    for name in names:
-        yield score_picture(folder / name, config, with_focal)
+    for done, name in enumerate(names, 1):
+        try:
+            yield score_picture(folder / name, config, with_focal)
+        except InputError as error:
+            nothing = float("nan")
+            yield PictureScore(name, nothing, nothing, nothing, nothing, nothing, 0.0, None, str(error), unread=True)
+        on_picture(done, len(names))
 
 
 def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, str]]:
@@ -180,7 +192,8 @@ def summarize_pictures(scores: Sequence[PictureScore]) -> PictureSummary:
     masks = [score.masks for score in scores if score.masks is not None]
     return PictureSummary(
         len(scores),
-        sum(bool(score.reason) for score in scores),
+        sum(bool(score.reason) and not score.unread for score in scores),
+        sum(score.unread for score in scores),
         _average(score.depth_error for score in known),
         _find_median(score.measured_error for score in known if np.isfinite(score.measured_error)),
         _find_median(score.plane_deg for score in known),

@@ -112,7 +112,9 @@ class _ConnectionQueue:
                     self._selector.register(self._listener.accept()[0], selectors.EVENT_READ)
                 elif isinstance(connection, socket.socket) and len(batch) < most:
                     self._receive(connection, batch)
-            if batch and until == float("inf"):
+            if not batch:  # whoever asked may have hung up since
+                until = float("inf")
+            elif until == float("inf"):
                 until = time.monotonic() + GATHER_S
             if not batch and self._is_idle():
                 break

@@ -12,7 +12,7 @@ from schemas.cousins import Change, Donor, Recipe, parse_recipe
 from schemas.manifest import ImageRow
 from schemas.objects import PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
-from tableverse_factory.core.errors import GeometryError, InputError
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.cousin_rows import DIGEST_CHARS, digest_objects
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.models.services import Services
@@ -22,6 +22,8 @@ from tableverse_factory.stages.cousins.parent import ParentScene, read_parent, r
 from tableverse_factory.stages.cousins.reflection import mirror_object
 
 Row = Mapping[str, Any]
+
+_DROPPED_FOR = frozenset({"bad_recipe", "content_changed"})
 
 _open = lru_cache(2)(open_dataset)  # its index of scenes is read once in a process
 
@@ -35,7 +37,11 @@ def derive_cousin(
     """Change a scene of a dataset; the later stages separate, settle, judge and certify it like any other layout.
 
     Drops: `content_changed` if the dataset is not the one that the manifest saw, `no_room` if nothing could be changed,
-    `bad_recipe` if the row has none, and the reason why the parent cannot be read.
+    `bad_recipe` if the row has none.
+
+    Raises:
+        InputError, GeometryError: if files of the parent or of a donor are damaged or gone, which fails the cousin:
+            once they are restored, it can be retried.
     """
     if item.rejected:
         return Dropped(item.rejected, item.rejected_detail)
@@ -49,9 +55,9 @@ def derive_cousin(
                 draft.make(change)
         draft.fill()
     except InputError as error:
+        if error.reason not in _DROPPED_FOR:
+            raise
         return Dropped(error.reason, str(error))
-    except GeometryError as error:
-        return Dropped("bad_mesh", str(error))
     objects = tuple(draft.arrangement.objects.values())
     if Change.MIRROR in recipe.changes:
         objects = tuple(mirror_object(thing, parent.table) for thing in objects)

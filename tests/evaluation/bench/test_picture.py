@@ -117,3 +117,19 @@ def test_a_folder_without_other_pictures_is_refused(tmp_path, run) -> None:
     code, _, errors = run("bench", "picture", tmp_path / "captures", "--other", tmp_path / "others")
     assert code != 0
     assert "notes.txt" in errors
+
+
+@pytest.mark.heavy
+def test_a_capture_that_cannot_be_read_costs_its_own_row(tmp_path, run) -> None:
+    good, bad = synthesize_captures(tmp_path / "captures", 2, 5)
+    (bad / "depth.png").write_bytes(b"no picture")
+    code, said, errors = run("bench", "picture", good.parent, "--json")
+    assert code == 0, errors
+    rows = json.loads(said)["pictures"]
+    assert [row["unread"] for row in rows] == [False, True]
+    assert "depth.png" in rows[1]["reason"]
+    assert json.loads(said)["all"]["unread"] == 1
+    (good / "depth.png").write_bytes(b"no picture")
+    code, _, errors = run("bench", "picture", good.parent)
+    assert code != 0
+    assert "none of 2 captures could be read" in errors

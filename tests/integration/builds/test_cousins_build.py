@@ -168,6 +168,31 @@ def test_a_dataset_that_was_built_anew_is_noticed(made, tmp_path):
     assert {row["reason"] for row in rows_of(build(tmp_path, "dropped"))} == {"content_changed"}
 
 
+def test_cousins_of_a_damaged_parent_fail_and_are_made_once_it_is_restored(made, tmp_path, run):
+    """A cut tar, as by a full disk, is no property of the scene: it must not pass for a finished dataset."""
+    shutil.copytree(made / "out", tmp_path / "out")
+    parents, dest = rows_of(tmp_path / "out"), tmp_path / "dest"
+    last = max(parents, key=lambda row: (row["shard"], row["tar_offset"]))
+    tar = tmp_path / "out" / "mjcf" / f"shard-{last['shard']:05d}.tar"
+    whole = tar.read_bytes()
+    tar.write_bytes(whole[: last["tar_offset"] + 1000])
+    command = ("cousins", tmp_path / "out", dest, "--per-scene", 1, "--executor", "local")
+    code, text, _ = run(*command)
+    assert (code, "1 failed of 3 scenes" in text) == (3, True), text
+    (failed,) = (row for row in rows_of(dest) if row["status"] == "failed")
+    assert (failed["parent"], failed["stage"], failed["error_kind"]) == (
+        last["scene_id"],
+        "derive_cousin",
+        "InputError",
+    )
+    assert "cut short" in failed["detail"]
+    tar.write_bytes(whole)
+    assert run("failures", dest, "--retry")[0] == 0
+    code, text, _ = run(*command)
+    assert code == 0, text
+    assert {row["status"] for row in rows_of(dest)} == {"done"}
+
+
 def test_unfinished_datasets_have_no_cousins(made, tmp_path):
     shutil.copytree(made / "out", tmp_path / "out")
     run = json.loads((tmp_path / "out" / "run.json").read_text())

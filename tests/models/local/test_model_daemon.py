@@ -206,6 +206,16 @@ def test_who_hangs_up_or_talks_nonsense_is_forgotten(desk):
     assert receive_arrays(good)[1].tolist() == [42]
 
 
+def test_who_asks_and_hangs_up_ends_the_process_for_nobody_else(desk):
+    connect = desk(doubled)
+    gone, good = connect(), connect()
+    send_arrays(gone, [np.array([1])])
+    gone.close()
+    time.sleep(0.1)  # longer than a batch is waited for
+    send_arrays(good, [np.array([21])])
+    assert receive_arrays(good)[1].tolist() == [42]
+
+
 def test_no_pickle_passes():
     left, right = socket.socketpair()
     with left, right, pytest.raises(ValueError, match="Object arrays"):
