@@ -27,6 +27,9 @@ class Relation(StrEnum):
     OUTSIDE = "outside"
 
 
+INSTRUCTION = "Pick up {x} and place it {relation} {y}"
+"""Template of a task's instruction (paper appendix B)."""
+
 HINGE_CATEGORIES = ("Bottle", "Box", "Bucket", "Laptop", "Pliers", "Scissors", "TrashCan")
 
 

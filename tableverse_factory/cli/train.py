@@ -154,10 +154,13 @@ def train_policy(
         list[str] | None,
         typer.Option("--dataset", metavar="OUT", help="Dataset with trajectories, read the first time; may repeat."),
     ] = None,
-    steps: TrainSteps = 3_000,
+    steps: Annotated[
+        int | None, typer.Option(min=1, max=10_000_000, help="Steps; by default 3,000 on states, 8,000 on pictures.")
+    ] = None,
     minutes: TrainMinutes = None,
     goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 128,
-    chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step.")] = 512,
+    chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step, on states.")] = 512,
+    views: Annotated[int, typer.Option(min=1, max=65_536, help="Views per step, on pictures.")] = 64,
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of scenes to learn from; all without.")] = None,
     motions: Annotated[
         int | None, typer.Option(min=1, help="Number of motions to learn, from these scenes in turn; all without.")
@@ -166,10 +169,13 @@ def train_policy(
         Path | None,
         typer.Option("--pictures-from", metavar="WEIGHTS", dir_okay=False, exists=True, help=_PICTURES_FROM),
     ] = None,
+    tables: Annotated[
+        int | None, typer.Option(min=0, max=50_000, help="Synthetic tables that pictures show too; 2,000 by default.")
+    ] = None,
     seed: TrainSeed = 0,
     device: TrainDevice = "auto",
 ) -> None:
-    """Train a policy on states from the successful motions of the splits train and validation.
+    """Train a policy on states, or one on pictures, from the successful motions of the splits train and validation.
 
     Writes DIR/demonstrations.npz (the motions, packed), DIR/checkpoint.safetensors and DIR/weights.safetensors, with
     which `tableverse benchmark run` plays it; with --pictures-from also DIR/pictures.npz. What is packed already is not
@@ -179,6 +185,8 @@ def train_policy(
     """
     import math
 
+    from tableverse_factory.core.errors import ConfigError
+
     where = _prepare_training(device, ("torch", "safetensors")).kind
     from tableverse_factory.evaluation.training.policy.settings import PolicySettings
     from tableverse_factory.evaluation.training.policy.train import TrainRun, train_picture_policy, train_state_policy
@@ -186,42 +194,63 @@ def train_policy(
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    demonstrations = _provide_packed(folder / "demonstrations.npz", datasets or [], pictures=False)
+    demonstrations = _provide_packed(folder / "demonstrations.npz", datasets or [])
     run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
-    settings = PolicySettings(steps, seed, goals, chunks=chunks, scenes=scenes, motions=motions)
+    if state is None and tables is not None:
+        raise ConfigError("--tables is for a policy on pictures: give --pictures-from too")
+    steps = steps or (3_000 if state is None else 8_000)
+    settings = PolicySettings(steps, seed, goals, chunks=chunks, views=views, scenes=scenes, motions=motions)
     if state is None:
         done = train_state_policy(settings, run, say)
     else:
-        pictures = _provide_packed(folder / "pictures.npz", datasets or [], pictures=True)
+        pictures = _provide_pictures(folder / "pictures.npz", datasets or [], tables)
         done = train_picture_policy(settings, run, pictures, state, say)
     print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
     print(f"{folder / 'weights.safetensors'}: give it to `tableverse benchmark run --weights`")
 
 
-def _provide_packed(path: Path, datasets: list[str], pictures: bool) -> Path:
-    """Pack the datasets' motions, or their first pictures, unless an earlier command did, and return their file."""
+def _provide_packed(path: Path, datasets: list[str]) -> Path:
+    """Pack the datasets' motions, unless an earlier command did, and return their file."""
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.evaluation.training.policy.pack import pack_demonstrations
+
+    if not _is_packed(path, datasets):
+        with count_progress("scenes") as done:
+            pack_demonstrations([*map(open_dataset, datasets)], on_scene=done.update).write(path)
+    return path
+
+
+def _provide_pictures(path: Path, datasets: list[str], tables: int | None) -> Path:
+    """Pack pictures of the datasets' scenes and of synthetic tables, unless an earlier command did."""
+    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.core.process_pool import count_available_cpus
+    from tableverse_factory.dataset.dataset import open_dataset
+    from tableverse_factory.evaluation.training.policy.pack_pictures import pack_pictures
+    from tableverse_factory.evaluation.training.policy.synthetic_views import TABLES
+
+    if _is_packed(path, datasets):
+        if tables is not None:
+            print(f"{path} is there already: no table is drawn for --tables", file=sys.stderr, flush=True)
+        return path
+    opened, wanted = [*map(open_dataset, datasets)], TABLES if tables is None else tables
+    with count_progress("scenes and tables") as done:
+        pack_pictures(opened, on_scene=done.update, jobs=count_available_cpus(), tables=wanted).write(path)
+    return path
+
+
+def _is_packed(path: Path, datasets: list[str]) -> bool:
+    """Tell whether a file was packed by an earlier command; ConfigError if it has yet to be, and nothing is given."""
     from tableverse_factory.core.errors import ConfigError
 
     if path.is_file():
         if datasets:
             print(f"{path} is there already: --dataset is not read", file=sys.stderr, flush=True)
-        return path
+        return True
     if not datasets:
         raise ConfigError(f"{path} is not there: give --dataset, whose motions are packed into it")
-    from tableverse_factory.cli.progress_bar import count_progress
-    from tableverse_factory.core.process_pool import count_available_cpus
-    from tableverse_factory.dataset.dataset import open_dataset
-    from tableverse_factory.evaluation.training.policy.pack import pack_demonstrations
-    from tableverse_factory.evaluation.training.policy.pack_pictures import pack_pictures
-
     path.parent.mkdir(parents=True, exist_ok=True)
-    opened = [open_dataset(dataset) for dataset in datasets]
-    with count_progress("scenes") as done:
-        if pictures:
-            pack_pictures(opened, on_scene=done.update, jobs=count_available_cpus()).write(path)
-        else:
-            pack_demonstrations(opened, on_scene=done.update).write(path)
-    return path
+    return False
 
 
 def _provide_pool(folder: Path, scenes: int, seed: int, jobs: int) -> Path:

@@ -10,10 +10,11 @@ from types import ModuleType
 from typing import Any
 
 from schemas.identity import content_hash
-from tableverse_factory.core.errors import ConfigError, InputError
+from tableverse_factory.core.errors import ConfigError, InputError, WeightsError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.http_policy import HttpPolicy
 from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
+from tableverse_factory.evaluation.training.policy.shipped import SHIPPED
 
 _ROOM = "tableverse_factory.evaluation.benchmark"
 _TRAINED = "tableverse_factory.evaluation.training.policy"
@@ -24,9 +25,6 @@ SHORT_NAMES: Mapping[str, str] = {  # imported when they are asked for, as the p
     "state": f"{_TRAINED}.state_policy:StatePolicy",
     "picture": f"{_TRAINED}.picture_policy:PicturePolicy",
 }
-
-_SHIPPED = {"state": str(Path(__file__).parents[1] / "training" / "policy" / "state.safetensors")}
-"""Weights of the package, which a policy takes where it is given none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +41,7 @@ class PolicyName:
     @property
     def digest(self) -> str:
         """SHA-256 of the name, the file of the class and that of the weights, so that other weights are another run."""
-        files = [self.name.rpartition(":")[0], self.weights or _SHIPPED.get(self.name, "")]
+        files = [self.name.rpartition(":")[0], self.weights or str(SHIPPED.get(self.name, ""))]
         return content_hash(self.name.encode(), *(_read_if_file(file) for file in files))
 
     @property
@@ -64,6 +62,7 @@ def load_policy(name: PolicyName) -> Policy:
     Raises:
         ConfigError: for a name that is none of the four kinds, or names no class.
         InputError: `bad_policy` if it does not load, or is no policy.
+        WeightsError: if its weights, or the packages that run them, are not there.
     """
     if name.name.startswith(("http://", "https://")):
         if name.weights is not None:
@@ -72,7 +71,7 @@ def load_policy(name: PolicyName) -> Policy:
     make = _find_class(SHORT_NAMES.get(name.name, name.name))
     try:
         policy = make() if name.weights is None else make(name.weights)
-    except (ConfigError, InputError):
+    except (ConfigError, InputError, WeightsError):
         raise
     except Exception as error:
         raise _load_error(name.name, error) from error
@@ -88,7 +87,7 @@ def _find_class(name: str) -> Callable[..., Any]:
         )
     try:
         module = _load_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
-    except (ConfigError, InputError):
+    except (ConfigError, InputError, WeightsError):
         raise
     except Exception as error:
         raise _load_error(name, error) from error

@@ -88,7 +88,7 @@ def make_benchmark(dataset: Dataset, settings: BenchmarkSettings, jobs: int = 1)
     by_scene: dict[str, list[str]] = defaultdict(list)
     for scene_id, task_id in chosen:
         by_scene[scene_id].append(task_id)
-    measure = partial(_measure_tasks, dataset.path, settings.robot)
+    measure = partial(_measure_tasks, dataset.path, load_arm(settings.robot).name)
     found = parallel_map(measure, sorted(by_scene.items()), jobs, "measures tasks")
     measured = {
         (scene_id, task.task.task_id): task

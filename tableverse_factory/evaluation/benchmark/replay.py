@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 from jaxtyping import Float64
 
 from schemas.geometry import Points, Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
+from tableverse_factory.delivery.learning.dataset_environment import filter_successes
 from tableverse_factory.delivery.learning.environment import FPS
 from tableverse_factory.evaluation.benchmark.policy import EpisodeStart, PolicyError
 from tableverse_factory.evaluation.benchmark.splits import list_split_tasks
@@ -80,9 +80,7 @@ def _list_demonstrations(dataset: Dataset, robot: str) -> list[tuple[str, Task, 
         raise InputError(f"{dataset.path}: no task of its training split to replay", "no_trajectories")
     columns = ["scene_id", "object_id", *_PLACE, *_SIZE]
     objects = {(row["scene_id"], row["object_id"]): row for row in dataset.objects.to_table(columns).to_pylist()}
-    rows = dataset.trajectories.to_table(
-        columns=list(_COLUMNS), filter=pc.field("success") & (pc.field("robot") == robot)
-    ).to_pylist()
+    rows = dataset.trajectories.to_table(columns=list(_COLUMNS), filter=filter_successes(robot)).to_pylist()
     found = []
     for row in sorted(rows, key=lambda row: (row["scene_id"], row["task_id"])):
         if (task := (row["scene_id"], row["task_id"])) in tasks:

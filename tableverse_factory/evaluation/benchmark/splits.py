@@ -1,7 +1,8 @@
 """Splits of tasks: by picture, and by the nouns of what is carried and of the reference."""
 
 import hashlib
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from tableverse_factory.dataset.dataset import Dataset
@@ -12,6 +13,9 @@ from tableverse_factory.stages.curate.lexicon import find_head_noun, unify_noun
 
 HELD_OUT_SHARE = 0.15
 """Expected share of nouns that are held out."""
+
+_RELATIONS = re.compile(r" (?:in|on|next to) ")  # of phrases, as `curate.phrases` has them
+_PLACES = re.compile(r" (?:nearest to|farthest from|from) the (?:camera|left)")
 
 Row = Mapping[str, Any]
 
@@ -24,6 +28,15 @@ def find_noun(row: Row) -> str:
 def is_held_out(noun: str) -> bool:
     """Return whether a noun is held out of training: its hash decides, so it stays so however a dataset grows."""
     return int(hashlib.sha256(f"held out {noun}".encode()).hexdigest()[:8], 16) / 2**32 < HELD_OUT_SHARE
+
+
+def select_known_phrases(phrases: Iterable[str]) -> tuple[str, ...]:
+    """Select the phrases without a held-out noun, of the object or of one that it is said to stand by."""
+    return tuple(phrase for phrase in phrases if not any(map(is_held_out, _list_nouns(phrase))))
+
+
+def _list_nouns(phrase: str) -> list[str]:
+    return [unify_noun(find_head_noun(part)) for part in _RELATIONS.split(_PLACES.sub("", phrase))]
 
 
 def find_task_split(scene_row: Row, nouns: tuple[str, str]) -> Split | None:

@@ -1,9 +1,11 @@
 """Appearance of an object in words: colours from the mesh, shape from its dimensions."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from skimage.color import rgb2lab
 
-from schemas.geometry import TriangleMesh, Vector3
+from schemas.geometry import Frozen, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.mesh.height_maps import measure_inscribed_width
@@ -24,6 +26,20 @@ _ELONGATED = 3.5
 _FLAT = 0.15
 _BASE_M = 0.001
 _NARROW_BASE = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DescribedObject(Frozen):
+    """An object as names tell it from others: `size` [m] is along its mesh's own axes.
+
+    `colors` is the surface share of each of `lexicon.COLORS`, empty where the mesh has no colours.
+    """
+
+    label: str
+    body: BodyFeatures
+    size: Vector3
+    volume_m3: float
+    colors: dict[str, float]
 
 
 def measure_color_shares(mesh: TriangleMesh) -> dict[str, float]:

@@ -62,7 +62,7 @@ def _assess_objects(answer: JudgeAnswer, case: JudgeInput) -> tuple[ObjectAssess
     given, confidence = answer.object_relabeling, answer.label_confidence
     sure = tuple(confidence.get(str(i), estimate_label_confidence(item)) for i, item in enumerate(case.items))
     complete = all(str(i) in given for i in range(len(case.items)))
-    ruled = () if complete else name_objects(case, sure)
+    ruled = () if complete else name_objects(case.items, sure)
     names = [given.get(str(i)) or ruled[i] for i in range(len(case.items))]
     phrases = Counter(phrase.casefold() for name in names for phrase in set(name.distinguishing_phrases))
     shared = {phrase for phrase, count in phrases.items() if count > 1}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from schemas.config import CurateConfig
-from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
+from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PlacedObject, Table
 from schemas.scene import SettledScene
 from tableverse_factory.geometry.math.aabb import aabb, aabb_size
@@ -17,7 +17,7 @@ from tableverse_factory.geometry.relations.relations import BodyFeatures, comput
 from tableverse_factory.geometry.relations.stable_placement import make_support_surface
 from tableverse_factory.physics.mjcf.shape import make_body_shape
 from tableverse_factory.physics.mjcf.slab import fit_slab
-from tableverse_factory.stages.curate.appearance import measure_color_shares
+from tableverse_factory.stages.curate.appearance import DescribedObject, measure_color_shares
 from tableverse_factory.stages.curate.feasibility import Feasibility
 from tableverse_factory.stages.curate.twin_check import TwinCheck, check_twin
 
@@ -25,25 +25,19 @@ _MAX_CELLS = 400  # most cells along the longer side of the layout: huge layouts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JudgedObject(Frozen):
+class JudgedObject(DescribedObject):
     """One object of the scene, its mesh settled, in the table frame [m]; judges count from 0 in the scene's order.
 
-    `size` [m] is along the mesh's own axes, `volume_m3` that of the pieces where the mesh is open, `fit_residual_m` the
-    median distance from the observed points, `displacement_m` that of the centre from the placed one (0 for a copy),
-    and `colors` the surface share of each of `lexicon.COLORS`, empty where the mesh has no colours.
+    `volume_m3` is that of the pieces where the mesh is open, `fit_residual_m` the median distance from the observed
+    points, and `displacement_m` that of the centre from the placed one (0 for a copy).
     """
 
     object_id: str
-    label: str
     confidence: float
     mesh: TriangleMesh
-    body: BodyFeatures
     grips: Grips
-    size: Vector3
-    volume_m3: float
     fit_residual_m: float
     displacement_m: float
-    colors: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

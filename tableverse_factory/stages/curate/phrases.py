@@ -1,13 +1,12 @@
 """Part F by rules: a name for every object, and phrases that are true of it and of no other object of the scene."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from schemas.curation import Relabelling, Relation
 from tableverse_factory.geometry.relations.relations import relation_holds
-from tableverse_factory.stages.curate.appearance import may_be_called, name_shape
-from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
+from tableverse_factory.stages.curate.appearance import DescribedObject, may_be_called, name_shape
 from tableverse_factory.stages.curate.lexicon import (
     COLORS,
     find_color_words,
@@ -27,9 +26,9 @@ _TRUSTED = 0.5
 _ORDINALS = ("second", "third")  # ordinals that people use at a table
 
 
-def name_objects(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relabelling, ...]:
+def name_objects(items: Sequence[DescribedObject], confidence: Sequence[float]) -> tuple[Relabelling, ...]:
     """Name every object and list its distinguishing phrases, in order."""
-    namer = ObjectNamer(case, confidence)
+    namer = ObjectNamer(items, confidence)
     return tuple(
         Relabelling(relabel_name=name, distinguishing_phrases=namer.phrases(index))
         for index, name in enumerate(namer.names)
@@ -39,9 +38,9 @@ def name_objects(case: JudgeInput, confidence: tuple[float, ...]) -> tuple[Relab
 class ObjectNamer:
     """Names of a scene's objects, and the phrases that may refer to each."""
 
-    def __init__(self, case: JudgeInput, confidence: tuple[float, ...]) -> None:
-        self._items = case.items
-        self.names = tuple(_choose_name(item, sure) for item, sure in zip(case.items, confidence, strict=True))
+    def __init__(self, items: Sequence[DescribedObject], confidence: Sequence[float]) -> None:
+        self._items = items
+        self.names = tuple(_choose_name(item, sure) for item, sure in zip(items, confidence, strict=True))
 
     def phrases(self, index: int) -> tuple[str, ...]:
         """List at most `MAX_PHRASES` noun phrases true of this object alone, the simplest first."""
@@ -138,7 +137,7 @@ class ObjectNamer:
                 yield f"the {_ORDINALS[rank - 1]} {name} {end}", [index]
 
 
-def find_main_color(item: JudgedObject) -> str | None:
+def find_main_color(item: DescribedObject) -> str | None:
     """Find the colour that most of the surface has; None where none dominates."""
     if not item.colors:
         return None
@@ -146,7 +145,7 @@ def find_main_color(item: JudgedObject) -> str | None:
     return best if item.colors[best] >= OWN_COLOR else None
 
 
-def _choose_name(item: JudgedObject, confidence: float) -> str:
+def _choose_name(item: DescribedObject, confidence: float) -> str:
     if not is_generic(item.label) and confidence >= _TRUSTED:
         return " ".join(split_label(item.label)[:6])
     shape = name_shape(item.body, item.size, item.volume_m3)
@@ -158,11 +157,11 @@ def _list_modifiers(name: str) -> set[str]:
     return set(split_label(name)) - {find_head_noun(name), "gray"} - set(COLORS)
 
 
-def _compute_middle(item: JudgedObject) -> np.ndarray:
+def _compute_middle(item: DescribedObject) -> np.ndarray:
     return (item.body.low + item.body.high) / 2
 
 
-_SUPERLATIVES: tuple[tuple[str, Callable[[JudgedObject], float], bool], ...] = (
+_SUPERLATIVES: tuple[tuple[str, Callable[[DescribedObject], float], bool], ...] = (
     ("the largest {}", lambda item: float(np.prod(item.size)), True),
     ("the smallest {}", lambda item: 1.0 / max(float(np.prod(item.size)), 1e-12), True),
     ("the tallest {}", lambda item: float(item.body.high[2] - item.body.low[2]), True),

@@ -35,7 +35,7 @@ class RulesJudge:
         physical = tuple(estimate_physical_properties(item) for item in case.items)
         masses = tuple(properties.mass_kg for properties in physical)
         graspable = tuple(index for index in range(count) if case.feasibility.is_graspable(index, masses[index]))
-        names = name_objects(case, confidence)
+        names = name_objects(case.items, confidence)
         plain = tuple(name.relabel_name for name in names)
         criteria = score_criteria(case, plain, graspable, "EXTREME_REGIONAL_PARTITION" in usability.reason_codes)
         return JudgeAnswer(

@@ -2,7 +2,7 @@
 
 import re
 
-from schemas.curation import GeneratedTask, JudgeAnswer, ObjectAssessment, Relation, TaskAssessment
+from schemas.curation import INSTRUCTION, GeneratedTask, JudgeAnswer, ObjectAssessment, Relation, TaskAssessment
 from tableverse_factory.stages.curate.judge_input import JudgeInput
 from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic, may_share_noun
 
@@ -60,8 +60,8 @@ def fits_template(task: GeneratedTask) -> bool:
     """Whether the instruction is the paper's template with the task's own names; an article may precede them."""
     name_x, name_y = (re.escape(_strip_article(name)) for name in (task.x_name, task.y_name))
     article = "(?:the |a |an )?"
-    pattern = f"Pick up {article}{name_x} and place it {re.escape(task.relation)} {article}{name_y}\\.?"
-    return re.fullmatch(pattern, task.instruction, re.IGNORECASE) is not None
+    pattern = INSTRUCTION.format(x=article + name_x, relation=re.escape(task.relation), y=article + name_y)
+    return re.fullmatch(rf"{pattern}\.?", task.instruction, re.IGNORECASE) is not None
 
 
 def _list_head_nouns(label: str, verdict: ObjectAssessment) -> frozenset[str]:

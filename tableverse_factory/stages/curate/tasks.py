@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from schemas.curation import GeneratedTask, Relabelling, Relation
+from schemas.curation import INSTRUCTION, GeneratedTask, Relabelling, Relation
 from tableverse_factory.geometry.relations.relations import is_inside, relation_nearly_holds
 from tableverse_factory.stages.curate.appearance import can_roll
 from tableverse_factory.stages.curate.judge_input import JudgeInput
@@ -77,5 +77,5 @@ def _is_sensible(case: JudgeInput, kinds: list[str], relation: Relation, x: int,
 def _build_task(triple: Triple, names: tuple[Relabelling, ...]) -> GeneratedTask:
     x, relation, y = triple
     name_x, name_y = names[x].distinguishing_phrases[0], names[y].distinguishing_phrases[0]
-    instruction = f"Pick up {name_x} and place it {relation.value} {name_y}"
+    instruction = INSTRUCTION.format(x=name_x, relation=relation.value, y=name_y)
     return GeneratedTask(instruction=instruction, X_id=x, X_name=name_x, Y_id=y, Y_name=name_y, relation=relation.value)

@@ -39,3 +39,11 @@ def test_the_nearest_demonstration_of_training_is_replayed(benchmark, dataset):
     assert (result.reason, result.steps) == ("no_demonstration", 0)
     with pytest.raises(ConfigError, match="give its OUT as --weights"):
         ReplayPolicy()
+
+
+@pytest.mark.parametrize("name", ["state", "picture"])
+def test_policies_with_weights_of_the_package_reach_for_x(benchmark, dataset, name):
+    pytest.importorskip("torch", reason="the extra `models` is not installed")
+    result = play_episode(benchmark, benchmark.episodes[0], dataset, load_policy(PolicyName(name)))
+    assert not result.reason.startswith("policy"), result.detail
+    assert result.lifted

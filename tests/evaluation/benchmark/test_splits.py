@@ -8,6 +8,7 @@ from tableverse_factory.evaluation.benchmark.splits import (
     find_task_split,
     is_held_out,
     list_split_tasks,
+    select_known_phrases,
 )
 from tableverse_factory.stages.curate.lexicon import KINDS
 
@@ -48,3 +49,19 @@ def test_scenes_of_splits_are_disjoint(benchmark):
     assert scenes["train"]
     assert scenes["test"]
     assert scenes["train"].isdisjoint(scenes["test"])
+
+
+def test_phrases_with_a_held_out_noun_are_not_known():
+    known = (
+        "the orange tea box",
+        "the mug nearest to the camera",
+        "the second book from the left",
+        "the fork in the cup",
+    )
+    unknown = (
+        "the plate",
+        "the orange",
+        "the mug next to the smallest plate",
+        "the lime on the plate nearest to the camera",
+    )
+    assert select_known_phrases([*known, *unknown]) == known

@@ -103,7 +103,13 @@ def test_it_holds_all_of_the_packages_and_nothing_else(names):
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
-@pytest.mark.parametrize("weights", ["models/picture/picture.onnx", "evaluation/training/policy/state.safetensors"])
+WEIGHTS = [
+    "models/picture/picture.onnx",
+    *(f"evaluation/training/policy/{name}.safetensors" for name in ("picture", "state")),
+]
+
+
+@pytest.mark.parametrize("weights", WEIGHTS)
 def test_it_holds_weights_undamaged(wheel, weights):
     path = f"tableverse_factory/{weights}"
     with zipfile.ZipFile(wheel) as archive:

@@ -67,7 +67,7 @@ def test_pale_is_not_washed_out(rgb: tuple[int, int, int], name: str) -> None:
 
 def phrases_of(things: list[Thing]) -> list[tuple[str, ...]]:
     namer = ObjectNamer(
-        build_judge_input(settled(things, (1, 1)), CurateConfig()), tuple(thing.score for thing in things)
+        build_judge_input(settled(things, (1, 1)), CurateConfig()).items, tuple(thing.score for thing in things)
     )
     return [namer.phrases(index) for index in range(len(things))]
 

@@ -1,19 +1,17 @@
 """Pool of the generator's meshes and of settled arrangements, one file that a GPU machine reads with numpy alone."""
 
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Self
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8, UInt16
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.training.packed_arrays import write_arrays
+from tableverse_factory.evaluation.training.packed_arrays import refuse_damaged, write_arrays
 
 STEPS = 65535  # of a coordinate across its mesh
 SCENES_AT_A_TIME = 2
@@ -62,12 +60,8 @@ class MeshPool:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a pool that `write` wrote; raise an `InputError` if the file is not one."""
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                pool = cls(**{field.name: file[field.name] for field in fields(cls)})
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
-            raise InputError(f"{path} is not a pool of meshes ({type(error).__name__}): remove it") from error
-        return pool
+        with refuse_damaged(path, "a pool of meshes", "remove it"), np.load(path, allow_pickle=False) as file:
+            return cls(**{field.name: file[field.name] for field in fields(cls)})
 
 
 def make_pool(scenes: int, seed: int, on_scene: Callable[[], object] = lambda: None, jobs: int = 1) -> MeshPool:

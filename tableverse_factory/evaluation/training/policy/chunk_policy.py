@@ -32,6 +32,7 @@ from tableverse_factory.evaluation.training.policy.select import select_goals
 from tableverse_factory.evaluation.training.policy.tensors import GRASP, PLACE, POST_PLACE, PRE_GRASP
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, matrix_from_pose, pose_from_rotation
 from tableverse_factory.models.local.device import Tensor, import_torch
+from tableverse_factory.models.local.shipped_weights import read_shipped
 from tableverse_factory.robotics.motion.kinematics import solve_ik
 
 torch = import_torch()
@@ -51,13 +52,16 @@ Observation = Mapping[str, np.ndarray]
 
 
 class ChunkPolicy(ABC):
-    """Policy that moves in chunks; `network` has the parts `goal` and `motion`, and its weights are in a file."""
+    """Policy that moves in chunks; `network` has the parts `goal` and `motion`."""
 
     pictures: tuple[str, ...] = ()
     picture_size = (96, 128)
 
-    def __init__(self, network: Any, weights: str | Path) -> None:
-        read_weights(Path(weights), network)
+    def __init__(self, network: Any, weights: str | Path | None, shipped: Path) -> None:
+        """Load the file that training wrote, or without one the `shipped` weights of the package."""
+        if weights is None:
+            read_shipped(shipped, shipped.with_suffix(".sha256"))
+        read_weights(Path(weights or shipped), network)
         self._network = network.eval()
 
     def reset(self, start: EpisodeStart) -> None:

@@ -1,17 +1,14 @@
 """Demonstrations that policies learn from: one compact file of plain arrays, read with numpy alone."""
 
-import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Self
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float32, Int16, Int32, UInt8
 
 from schemas.geometry import Frozen
-from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.training.packed_arrays import write_arrays
+from tableverse_factory.evaluation.training.packed_arrays import check_arrays, refuse_damaged, write_arrays
 
 POINTS = 192  # on the surface of each object
 POINT_M = 1e-4  # unit of their coordinates
@@ -66,15 +63,13 @@ class Demonstrations(Frozen):
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a file that `write` wrote; raise an `InputError` if it is none."""
-        try:
+        with refuse_damaged(path, "a file of packed demonstrations", "pack them again"):
             with np.load(path, allow_pickle=False) as file:
                 arrays = {field.name: file[field.name] for field in fields(cls)}
             for name in _ALONG_TIME:
                 arrays[name] = np.cumsum(arrays[name], axis=0, dtype=np.uint16).view(np.int16)
             found = cls(**arrays)
             found._check()
-        except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: no packed demonstrations ({error}): pack them again") from error
         return found
 
     def _check(self) -> None:
@@ -94,10 +89,7 @@ class Demonstrations(Frozen):
             "opening": ((t, 2), np.int16),
             "phases": ((t,), np.uint8),
         }
-        for name, (shape, kind) in wanted.items():
-            array = getattr(self, name)
-            if array.shape != shape or array.dtype != kind:
-                raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, not {np.dtype(kind)} of {shape}")
+        check_arrays(self, wanted)
         if not n or (np.diff(self.ends, prepend=0) < 1).any() or self.ends[-1] != t:
             raise ValueError("the ends of the demonstrations do not divide the samples")
         if self.objects.max() >= o or (self.objects[:, :2] < 0).any() or self.objects.min() < -1:

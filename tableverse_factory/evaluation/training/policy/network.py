@@ -61,8 +61,8 @@ def expand_lengths(vectors: Tensor, scales: tuple[float, ...]) -> Tensor:
     return torch.cat([vectors / scales[0], *(torch.tanh(vectors / scale) for scale in scales[1:])], -1)
 
 
-class GoalFlow(Module):  # type: ignore[misc]
-    """Tokens of a scene and its task; a field that carries noise to goals."""
+class GoalNetwork(Module):  # type: ignore[misc]
+    """Tokens of the points of a scene and of its task; a field that carries noise to goals."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,36 +72,6 @@ class GoalFlow(Module):  # type: ignore[misc]
         self.decoder = nn.ModuleList([Attention() for _ in range(DECODER)])
         self.flow = nn.Sequential(nn.LayerNorm(WIDTH), nn.Linear(WIDTH, GOAL))
         nn.init.zeros_(self.flow[1].weight)
-
-    def attend(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Let tokens, (b, n, c), attend to those that are there, (b, n); return both."""
-        for layer in self.encoder:
-            tokens = layer(tokens, mask)
-        return self.memory(tokens), mask
-
-    def compute_flow(self, memory: tuple[Tensor, Tensor], noisy: Tensor, time: Tensor) -> Tensor:
-        """Compute the velocity of noisy goals, (b, m, GOAL), each by itself, at times (b, m) from 0 to 1."""
-        angle = time[..., None] * (2.0 ** torch.arange(8, device=time.device)) * (torch.pi / 2)
-        x = self.noisy(torch.cat([noisy, angle.sin(), angle.cos()], -1))
-        x = x + memory[0][:, :1]
-        for layer in self.decoder:
-            x = layer(x, memory[1], memory[0])
-        return self.flow(x).float()
-
-    def draw(self, memory: tuple[Tensor, Tensor], noise: Tensor) -> Tensor:
-        """Carry noise to goals. Both of shape (b, m, GOAL)."""
-        goals = noise
-        for step in range(FLOW_STEPS):
-            time = torch.full(noise.shape[:2], step / FLOW_STEPS, device=noise.device)
-            goals = goals + self.compute_flow(memory, goals, time) / FLOW_STEPS
-        return goals
-
-
-class GoalNetwork(GoalFlow):
-    """Goals from points of the scene."""
-
-    def __init__(self) -> None:
-        super().__init__()
         self.point = make_perceptron(3 * 4 + 3 * 2 + ROLES, WIDTH)
         self.task = make_perceptron(QUERY, WIDTH)
 
@@ -123,7 +93,27 @@ class GoalNetwork(GoalFlow):
         task_token = self.task(task)
         tokens = self.point(torch.cat([shown, role], -1)) + task_token[:, None]
         tokens = torch.cat([task_token[:, None], tokens], 1)
-        return self.attend(tokens, torch.cat([torch.ones_like(mask[:, :1]), mask], 1))
+        mask = torch.cat([torch.ones_like(mask[:, :1]), mask], 1)
+        for layer in self.encoder:
+            tokens = layer(tokens, mask)
+        return self.memory(tokens), mask
+
+    def compute_flow(self, memory: tuple[Tensor, Tensor], noisy: Tensor, time: Tensor) -> Tensor:
+        """Compute the velocity of noisy goals, (b, m, GOAL), each by itself, at times (b, m) from 0 to 1."""
+        angle = time[..., None] * (2.0 ** torch.arange(8, device=time.device)) * (torch.pi / 2)
+        x = self.noisy(torch.cat([noisy, angle.sin(), angle.cos()], -1))
+        x = x + memory[0][:, :1]
+        for layer in self.decoder:
+            x = layer(x, memory[1], memory[0])
+        return self.flow(x).float()
+
+    def draw(self, memory: tuple[Tensor, Tensor], noise: Tensor) -> Tensor:
+        """Carry noise to goals. Both of shape (b, m, GOAL)."""
+        goals = noise
+        for step in range(FLOW_STEPS):
+            time = torch.full(noise.shape[:2], step / FLOW_STEPS, device=noise.device)
+            goals = goals + self.compute_flow(memory, goals, time) / FLOW_STEPS
+        return goals
 
 
 class ChunkNetwork(Module):  # type: ignore[misc]

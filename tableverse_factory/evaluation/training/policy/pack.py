@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.dataset.dataset import Dataset, Scene
+from tableverse_factory.delivery.learning.dataset_environment import filter_successes
 from tableverse_factory.delivery.learning.item_parts import PARTS
 from tableverse_factory.evaluation.benchmark.policy import sample_points
 from tableverse_factory.evaluation.benchmark.splits import list_split_tasks
@@ -92,7 +92,7 @@ def list_motions(datasets: Sequence[Dataset], splits: Sequence[str], robot: str)
 
 def _list_scenes(dataset: Dataset, splits: Sequence[str], robot: str) -> list[SceneMotions]:
     tasks = list_split_tasks(dataset, robot)
-    rows = dataset.trajectories.to_table(filter=pc.field("success") & (pc.field("robot") == robot)).to_pylist()
+    rows = dataset.trajectories.to_table(filter=filter_successes(robot)).to_pylist()
     scenes: dict[tuple[str, str], list[Row]] = {}
     for row in sorted(rows, key=lambda row: (row["scene_id"], row["task_id"])):
         scene_id = row["scene_id"]

@@ -76,9 +76,14 @@ def draw_rows(choices: Tensor, count: int) -> Tensor:
     return choices[torch.randint(len(choices), (count,), device=choices.device)]
 
 
-def sample_goals(data: DemonstrationTensors, demos: Tensor, release: Tensor, augment: bool) -> GoalBatch:
-    """Sample the goal of each demonstration: its release, or its grasp. Both of shape (b,)."""
-    points, present = data.place_points(demos, DRAWN_POINTS)
+def sample_goals(
+    data: DemonstrationTensors, demos: Tensor, release: Tensor, augment: bool, seen: tuple[Tensor, Tensor] | None = None
+) -> GoalBatch:
+    """Sample the goal of each demonstration: its release, or its grasp. Both of shape (b,).
+
+    `seen` are the points that are told of the scene and the rows that are there; those of all objects by default.
+    """
+    points, present = data.place_points(demos, DRAWN_POINTS) if seen is None else seen
     if augment:
         points = points + JITTER_M * torch.randn_like(points)
         kept = torch.rand(present.shape, device=present.device) > LOST

@@ -4,7 +4,7 @@ import copy
 import hashlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ from tableverse_factory.evaluation.training.checkpoint import (
     write_weights,
 )
 from tableverse_factory.evaluation.training.policy.demonstrations import Demonstrations
-from tableverse_factory.evaluation.training.policy.first_pictures import FirstPictures
-from tableverse_factory.evaluation.training.policy.lessons import Lesson, PictureLesson, StateLesson
+from tableverse_factory.evaluation.training.policy.lessons import Lesson, StateLesson
 from tableverse_factory.evaluation.training.policy.network import make_network
+from tableverse_factory.evaluation.training.policy.packed_pictures import PackedPictures
+from tableverse_factory.evaluation.training.policy.picture_lesson import PictureLesson, PictureTensors
 from tableverse_factory.evaluation.training.policy.settings import PolicyPosition, PolicySettings
 from tableverse_factory.evaluation.training.policy.tensors import DemonstrationTensors
 from tableverse_factory.evaluation.training.policy.validate import SEED
@@ -72,18 +73,17 @@ def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int
 
 
 def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path, state: Path, log: Log) -> int:
-    """Train goals on the pictures of the same demonstrations, likewise; `state` are the weights of a policy on states.
+    """Train sight and goals on the pictures of the same demonstrations; `state` are the weights of a policy on states.
 
-    Its motions are taken over: they find their way without objects, as they were trained to.
+    Goals are trained on from its own; its motions are taken over as they are. InputError if fewer scenes or motions are
+    wanted: sight learns from all views.
     """
-    data, packed = _load(settings, run), FirstPictures.read(pictures)
-    if len(packed.ends) != len(data.last):
-        raise InputError(f"{pictures} has pictures of {len(packed.ends)} demonstrations, not of {len(data.last)}")
+    if settings.scenes is not None or settings.motions is not None:
+        raise InputError("--scenes and --motions are for a policy on states: pack fewer datasets instead")
+    data, packed = _load(settings, run), PackedPictures.read(pictures)
     teacher = make_network(0)
     read_weights(state, teacher)
-    shown = torch.tensor(packed.decode(), device=run.device).permute(0, 1, 4, 2, 3).contiguous()
-    words = torch.tensor(packed.words.astype("int64"), device=run.device)
-    lesson = PictureLesson(data, shown, words, teacher.motion.state_dict())
+    lesson = PictureLesson(data, PictureTensors(packed, run.device), teacher)
     return _train(data, lesson, settings, run, log, _hash_files(run.demonstrations, pictures, state))
 
 
@@ -122,7 +122,7 @@ class _Trainer:
         run.folder.mkdir(parents=True, exist_ok=True)
         self._network = lesson.make_network(settings.seed).to(run.device).train()
         self._average = copy.deepcopy(self._network).eval()
-        self._optimizer = _make_optimizer(self._network, settings, run.device)
+        self._optimizer = _make_optimizer(self._network, settings, run.device, lesson.rate_factors)
         position = load_checkpoint(
             run.folder, self._network, self._average, self._optimizer, settings, PolicyPosition(), run.device
         )
@@ -158,7 +158,7 @@ class _Trainer:
     def _take_step(self, step: int) -> dict[str, Tensor]:
         torch.manual_seed(self._settings.seed * 100_000_007 + step)
         for group in self._optimizer.param_groups:
-            group["lr"].fill_(compute_rate(step, self._settings))
+            group["lr"].fill_(group["factor"] * compute_rate(step, self._settings))
         if self._run.device != "cuda" or not self._run.graph:
             losses = self._descend()
         else:
@@ -174,7 +174,7 @@ class _Trainer:
         losses = self._lesson.compute_losses(self._network, self._settings)
         self._optimizer.zero_grad(set_to_none=True)
         torch.stack([*losses.values()]).sum().backward()
-        for part in (self._network.goal, self._network.motion):
+        for part in self._network.children():
             torch.nn.utils.clip_grad_norm_(part.parameters(), MAX_NORM)
         self._optimizer.step()
         return {name: each.detach() for name, each in losses.items()}
@@ -229,10 +229,16 @@ def compute_rate(step: int, settings: PolicySettings) -> float:
     return settings.rate * warm * min(1.0, left / (1 - DECAY_FROM))
 
 
-def _make_optimizer(network: Any, settings: PolicySettings, device: str) -> Any:
+def _make_optimizer(network: Any, settings: PolicySettings, device: str, rate_factors: Mapping[str, float]) -> Any:
     groups = [
-        {"params": [p for p in network.parameters() if p.ndim > 1], "weight_decay": WEIGHT_DECAY},
-        {"params": [p for p in network.parameters() if p.ndim <= 1], "weight_decay": 0.0},
+        {
+            "params": [p for p in part.parameters() if (p.ndim > 1) == decays],
+            "weight_decay": WEIGHT_DECAY if decays else 0.0,
+            "factor": rate_factors.get(name, 1.0),
+            "lr": torch.tensor(settings.rate, device=device),
+        }
+        for decays in (True, False)  # outside, as checkpoints number moments in this order
+        for name, part in network.named_children()
     ]
-    rate, on_gpu = torch.tensor(settings.rate, device=device), device == "cuda"
-    return torch.optim.AdamW(groups, lr=rate, betas=BETAS, fused=on_gpu, capturable=on_gpu)
+    on_gpu = device == "cuda"
+    return torch.optim.AdamW(groups, betas=BETAS, fused=on_gpu, capturable=on_gpu)

@@ -69,7 +69,7 @@ def test_files_of_other_content_are_refused(packed: Path, tmp_path: Path) -> Non
     own, path, data = Demonstrations.read(packed), tmp_path / "bad.npz", packed.read_bytes()
     for damaged in (b"", b"PK no zip", data[: len(data) // 2]):
         path.write_bytes(damaged)
-        with pytest.raises(InputError, match="no packed demonstrations"):
+        with pytest.raises(InputError, match="is not a file of packed demonstrations"):
             Demonstrations.read(path)
     arrays = {field.name: getattr(own, field.name) for field in fields(own)}
     for change in (
@@ -81,7 +81,7 @@ def test_files_of_other_content_are_refused(packed: Path, tmp_path: Path) -> Non
         {"phases": own.phases.astype(np.int64)},
     ):
         np.savez_compressed(path, **{**arrays, **change}, allow_pickle=True)
-        with pytest.raises(InputError, match="no packed demonstrations"):
+        with pytest.raises(InputError, match="is not a file of packed demonstrations"):
             Demonstrations.read(path)
 
 
