@@ -16,6 +16,7 @@ import psutil
 import pytest
 
 from tests.helpers.builds import write_manifest
+from tests.helpers.processes import kill_if_alive
 
 BIN = Path(sys.executable).parent
 START_S = 120.0
@@ -125,8 +126,7 @@ def end(process: subprocess.Popen) -> None:
     process.terminate()
     psutil.wait_procs(family, timeout=5.0)
     for member in family:
-        if member.is_running():
-            member.kill()
+        kill_if_alive(member)
     process.kill()
     process.wait()
 

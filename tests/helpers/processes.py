@@ -11,6 +11,15 @@ def command_of(process: psutil.Process) -> str:
         return ""
 
 
+def kill_if_alive(process: psutil.Process) -> bool:
+    """Kills it; False where it ended while we looked."""
+    try:
+        process.kill()
+    except psutil.NoSuchProcess:
+        return False
+    return True
+
+
 def is_alive(process: psutil.Process) -> bool:
     """Whether it runs, or could."""
     try:

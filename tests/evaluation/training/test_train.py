@@ -24,6 +24,7 @@ from tableverse_factory.models.local.device import Device
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet
 from tableverse_factory.stages.perceive.perceive import perceive
+from tests.helpers.processes import command_of, kill_if_alive
 
 torch = pytest.importorskip("torch")
 CPU = Device("cpu", "float32")
@@ -179,8 +180,7 @@ def test_a_process_that_dies_beside_it_ends_in_one_line(views: list[Path], tmp_p
         until = time.monotonic() + 20
         while time.monotonic() < until:
             for child in psutil.Process().children():
-                if "spawn_main" in " ".join(child.cmdline()):
-                    child.kill()
+                if "spawn_main" in command_of(child) and kill_if_alive(child):
                     return
             time.sleep(0.05)
 

@@ -3,7 +3,6 @@
 import random
 import time
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.evaluation.bench.build_family import DRIVER, choose_victim, list_family
 from tests.helpers.builds import build, digests, finish, kill, scenes, start, wait_until, write_manifest
-from tests.helpers.processes import command_of, is_alive
+from tests.helpers.processes import command_of, is_alive, kill_if_alive
 from workers.progress.build_state import read_build_state
 
 RUN = {"deadline_s": 120.0, "shard_size": 8}
@@ -71,9 +70,7 @@ def test_an_actor_killed_in_the_middle_of_a_commit_costs_nothing(tmp_path):
         staging = [*(out / WORK).glob("*.staging/mjcf.tar*")]
         writers = [its for its in psutil.process_iter() if staging and "stage_shard" in command_of(its)]
         for writer in writers:
-            with suppress(psutil.NoSuchProcess):  # it has ended since it was listed
-                writer.kill()
-                killed += 1
+            killed += kill_if_alive(writer)
         time.sleep(0.005)
     code, errors = finish(process, LIMIT_S)
     assert code == 0, errors
