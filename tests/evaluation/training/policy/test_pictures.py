@@ -156,6 +156,17 @@ def test_what_belongs_together_is_moved_together() -> None:
     assert max(still) < 0.9, "each camera is moved by its own draw"
 
 
+def test_a_hidden_side_leaves_the_other() -> None:
+    torch.manual_seed(0)
+    points = torch.rand(400, 900, 3)
+    mask = torch.rand(400, 900) < 0.5
+    left = picture_lesson._hide_side(mask, points)
+    assert not (left & ~mask).any()
+    share = left.sum(1) / mask.sum(1)
+    assert float((share < 1).float().mean()) == pytest.approx(picture_lesson.HIDDEN, abs=0.08)
+    assert share.min() > 0.5, "what is left of an object still tells where it is"
+
+
 def test_files_of_other_content_are_refused(pictures: Path, tmp_path: Path) -> None:
     packed, path, data = PackedPictures.read(pictures), tmp_path / "bad.npz", pictures.read_bytes()
     for damaged in (b"", data[: len(data) // 2]):
