@@ -83,7 +83,10 @@ def _translate_death(doing: str) -> Iterator[None]:
     try:
         yield
     except BrokenProcessPool as error:
-        raise InputError(f"a process that {doing} died: its memory ran out, or a scene crashed it") from error
+        raise InputError(
+            f"a process that {doing} died: its memory ran out, a scene crashed it, or your program is not a file with "
+            "its calls under `if __name__ == '__main__'`, which other processes can import"
+        ) from error
 
 
 def prepare_child() -> None:
