@@ -1,5 +1,7 @@
 """Cameras of an arm at home."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float32
 
@@ -26,7 +28,7 @@ def list_intrinsics(eye: PosedCamera) -> Float32[np.ndarray, "4"]:
     return np.array([eye.camera.fx, eye.camera.fy, eye.camera.cx, eye.camera.cy], dtype=np.float32)
 
 
-def list_mounts(eyes: tuple[PosedCamera, PosedCamera]) -> Float32[np.ndarray, "c 7"]:
+def list_mounts(eyes: Sequence[PosedCamera]) -> Float32[np.ndarray, "c 7"]:
     """List positions [m] and quaternions wxyz."""
     poses = [eye.camera_to_table for eye in eyes]
     return np.array([[*pose.position, *pose.quaternion_wxyz] for pose in poses], dtype=np.float32)

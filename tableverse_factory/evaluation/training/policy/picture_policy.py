@@ -7,6 +7,7 @@ from scipy import ndimage
 
 from tableverse_factory.delivery.episodes.pictures import DEPTH
 from tableverse_factory.evaluation.benchmark.policy import EpisodeStart, PolicyError
+from tableverse_factory.evaluation.training.policy.camera_calibration import calibrate_camera, load_surfaces
 from tableverse_factory.evaluation.training.policy.chunk_policy import Observation, to_tensor
 from tableverse_factory.evaluation.training.policy.goals import Scenes
 from tableverse_factory.evaluation.training.policy.instructions import number_instruction
@@ -67,15 +68,18 @@ class PicturePolicy(ObjectPolicy):
 
     def _crop_pictures(self, observation: Observation) -> tuple[Tensor, Tensor, Rays]:
         """Crop colours, (1, cameras, 3, h, w), and depth, (1, m) [m], to the windows; return their rays too."""
-        colors, depths, intrinsics = [], [], []
-        for camera, eye in zip(CAMERAS, self._eyes, strict=True):
+        colors, depths, intrinsics, eyes = [], [], [], []
+        for camera, said, surface in zip(CAMERAS, self._eyes, load_surfaces(self._start.robot), strict=True):
             depth = observation[camera + DEPTH][..., 0]
-            left, top = find_window(depth[::STRIDE, ::STRIDE], thin_eye(eye))
+            thin = depth[::STRIDE, ::STRIDE]
+            eye = calibrate_camera(thin, said, surface)
+            left, top = find_window(thin, thin_eye(eye))
             window = slice(top, top + WINDOW[0]), slice(left, left + WINDOW[1])
             colors.append(observation[camera][window].transpose(2, 0, 1))
             depths.append(depth[window])
             intrinsics.append(list_intrinsics(crop_eye(eye, left, top)))
-        rays = compute_rays(to_tensor(np.stack(intrinsics))[None], to_tensor(list_mounts(self._eyes)))
+            eyes.append(eye)
+        rays = compute_rays(to_tensor(np.stack(intrinsics))[None], to_tensor(list_mounts(eyes)))
         return to_tensor(np.stack(colors))[None] / 255, to_tensor(np.stack(depths)).reshape(1, -1), rays
 
     def _mark(self, colors: Tensor, depth: Tensor, rays: Rays) -> Tensor:
