@@ -50,12 +50,12 @@ class ModelObject(Frozen):
     looks: tuple[VisualMesh, ...]  # visuals in MuJoCo's viewer, or everything where there are none
     unseen: tuple[TriangleMesh, ...]  # colliders that no visual represents, part of the shape all the same
     hulls: tuple[TriangleMesh, ...]  # convex colliders
+    contacts: tuple[ContactSettings, ...]  # of each of the hulls
     mass_kg: float
     center: Vector3  # of mass [m]
     inertia: Matrix3  # about the center of mass [kg m²]
     friction: float  # largest sliding friction of the colliders
     spin_roll: tuple[float, float]  # largest torsional and rolling friction of the colliders [m]
-    contact: ContactSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +71,7 @@ class ModelContents(Frozen):
 
 
 def read_model_contents(model: mujoco.MjModel, colliders: bool = True) -> ModelContents:
-    """Read a model in its initial state; without its colliders, `hulls` and `unseen` are empty."""
+    """Read a model in its initial state; without its colliders, `hulls`, `contacts` and `unseen` are empty."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -102,12 +102,12 @@ def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int, collider
     looks = [look for geom in seen if (look := _load_visual(model, data, geom, pose))]
     undrawn = find_undrawn_geoms(model, data, seen, solid) if colliders else []
     unseen = [look.mesh for geom in undrawn if (look := _load_visual(model, data, geom, pose))]
-    hulls = [hull for geom in solid if colliders and (hull := _compute_hull(model, data, geom, pose))]
+    found = [(hull, geom) for geom in solid if colliders and (hull := _compute_hull(model, data, geom, pose))]
+    contacts = tuple(read_contact_settings(model, geom) for _, geom in found)
     friction, spin, roll = model.geom_friction[solid].max(axis=0).tolist() if solid else (1.0, 0.0, 0.0)
     properties = _compute_mass_properties(model, data, root, pose)
-    shapes = tuple(looks), tuple(unseen), tuple(hulls)
-    contact = read_contact_settings(model, solid)
-    return ModelObject(body_name(model, root), pose, *shapes, *properties, friction, (spin, roll), contact)
+    shapes = tuple(looks), tuple(unseen), tuple(hull for hull, _ in found)
+    return ModelObject(body_name(model, root), pose, *shapes, contacts, *properties, friction, (spin, roll))
 
 
 def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:

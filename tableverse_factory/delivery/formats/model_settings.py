@@ -1,9 +1,8 @@
-"""Solver settings of a model and contact settings of its objects, with which scenes rest."""
+"""Solver settings of a model and contact settings of its colliders, with which scenes rest."""
 
 from dataclasses import dataclass
 
 import mujoco
-import numpy as np
 
 _MULTICCD = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
 _SOLIMP_SIZE = 5
@@ -24,11 +23,12 @@ class SolverSettings:
 
 @dataclass(frozen=True, slots=True)
 class ContactSettings:
-    """What MuJoCo is told of contacts of an object, with the names of MJCF's `geom`."""
+    """What MuJoCo is told of contacts of a collider, with the names of MJCF's `geom`."""
 
-    condim: int = 3
-    solref: tuple[float, ...] = (0.02, 1.0)
-    solimp: tuple[float, ...] = (0.9, 0.95, 0.001, 0.5, 2.0)
+    condim: int
+    friction: tuple[float, ...]  # sliding, torsional [m], rolling [m]
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
 
 
 def read_solver_settings(model: mujoco.MjModel) -> SolverSettings:
@@ -45,13 +45,11 @@ def read_solver_settings(model: mujoco.MjModel) -> SolverSettings:
     )
 
 
-def read_contact_settings(model: mujoco.MjModel, colliders: list[int]) -> ContactSettings:
-    """Read the contact settings of an object: those of its first collider, and the most directions of friction."""
-    if not colliders:
-        return ContactSettings()
-    first = colliders[0]
+def read_contact_settings(model: mujoco.MjModel, geom: int) -> ContactSettings:
+    """Read the contact settings of a collider."""
     return ContactSettings(
-        int(np.max(model.geom_condim[colliders])),
-        tuple(model.geom_solref[first].tolist()),
-        tuple(model.geom_solimp[first][:_SOLIMP_SIZE].tolist()),
+        int(model.geom_condim[geom]),
+        tuple(model.geom_friction[geom].tolist()),
+        tuple(model.geom_solref[geom].tolist()),
+        tuple(model.geom_solimp[geom][:_SOLIMP_SIZE].tolist()),
     )

@@ -4,13 +4,14 @@ What UsdPhysics has no words for stands in the attributes of MuJoCo's and Newton
 these schemas: `mjc:…` is read by MuJoCo's importer and by Newton's, `newton:…` by both too. Other readers ignore them.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from schemas.geometry import Matrix3, Quaternion
 from tableverse_factory.delivery.formats.model_contents import ModelObject
-from tableverse_factory.delivery.formats.model_settings import SolverSettings
+from tableverse_factory.delivery.formats.model_settings import ContactSettings, SolverSettings
 from tableverse_factory.delivery.formats.usd_meshes import define_mesh, define_surface
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
 
@@ -82,39 +83,47 @@ def set_visual_group(prim: "Usd.Prim") -> None:
 
 
 def add_colliders(stage: "Usd.Stage", path: str, content: ModelObject) -> None:
-    """Add the convex pieces of an object, all of one material."""
-    from pxr import Sdf, UsdGeom, UsdPhysics, UsdShade, Vt
+    """Add the convex pieces of an object, each with its contact settings; pieces of equal friction share a material."""
+    from pxr import Sdf, UsdGeom, UsdPhysics, UsdShade
 
-    types, contact = Sdf.ValueTypeNames, content.contact
-    for_mujoco = {
+    # Newton looks 10 cm around shapes by default
+    for_newton = {"newton:contactGap": (Sdf.ValueTypeNames.Float, 0.0)}
+    materials: dict[tuple[float, ...], UsdShade.Material] = {}
+    for index, (hull, contact) in enumerate(zip(content.hulls, content.contacts, strict=True)):
+        if contact.friction not in materials:
+            name = f"contact_{len(materials):02d}" if materials else "contact"
+            materials[contact.friction] = _define_contact_material(stage, f"{path}/{name}", contact.friction)
+        piece = define_mesh(stage, f"{path}/piece_{index:02d}", hull)
+        piece.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        UsdPhysics.CollisionAPI.Apply(piece.GetPrim())
+        UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
+        _set_attributes(piece.GetPrim(), "MjcCollisionAPI", _list_mujoco_attributes(contact))
+        _set_attributes(piece.GetPrim(), "NewtonCollisionAPI", for_newton)
+        binding, material = UsdShade.MaterialBindingAPI.Apply(piece.GetPrim()), materials[contact.friction]
+        binding.Bind(material)  # the only one that MuJoCo's importer reads
+        binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
+
+
+def _list_mujoco_attributes(contact: ContactSettings) -> "dict[str, tuple[Sdf.ValueTypeName, Any]]":
+    from pxr import Sdf, Vt
+
+    types = Sdf.ValueTypeNames
+    return {
         "mjc:condim": (types.Int, contact.condim),
         "mjc:group": (types.Int, _COLLISION_GROUP),
         "mjc:solref": (types.DoubleArray, Vt.DoubleArray(contact.solref)),
         "mjc:solimp": (types.DoubleArray, Vt.DoubleArray(contact.solimp)),
     }
-    # Newton looks 10 cm around shapes by default
-    for_newton = {"newton:contactGap": (types.Float, 0.0)}
-    material = _define_contact_material(stage, f"{path}/contact", content)
-    for index, hull in enumerate(content.hulls):
-        piece = define_mesh(stage, f"{path}/piece_{index:02d}", hull)
-        piece.CreatePurposeAttr(UsdGeom.Tokens.guide)
-        UsdPhysics.CollisionAPI.Apply(piece.GetPrim())
-        UsdPhysics.MeshCollisionAPI.Apply(piece.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
-        _set_attributes(piece.GetPrim(), "MjcCollisionAPI", for_mujoco)
-        _set_attributes(piece.GetPrim(), "NewtonCollisionAPI", for_newton)
-        binding = UsdShade.MaterialBindingAPI.Apply(piece.GetPrim())
-        binding.Bind(material)  # the only one that MuJoCo's importer reads
-        binding.Bind(material, UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
-def _define_contact_material(stage: "Usd.Stage", path: str, content: ModelObject) -> "UsdShade.Material":
+def _define_contact_material(stage: "Usd.Stage", path: str, friction: Sequence[float]) -> "UsdShade.Material":
     from pxr import Gf, Sdf, UsdPhysics, UsdShade
 
     material = UsdShade.Material.Define(stage, path)
     contact = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-    contact.CreateStaticFrictionAttr(content.friction)
-    contact.CreateDynamicFrictionAttr(content.friction)
-    spin, roll = content.spin_roll
+    slide, spin, roll = friction
+    contact.CreateStaticFrictionAttr(slide)
+    contact.CreateDynamicFrictionAttr(slide)
     kind = Sdf.ValueTypeNames.Float
     names = {"newton:torsionalFriction": (kind, spin), "newton:rollingFriction": (kind, roll)}
     _set_attributes(material.GetPrim(), "NewtonMaterialAPI", names)

@@ -9,6 +9,7 @@ import json
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -88,8 +89,5 @@ class _Handler(BaseHTTPRequestHandler):
 
 def serve_policy(make: Callable[[], Policy], port: int = 8000) -> None:
     """Serve a policy on 127.0.0.1 until Ctrl-C; `make` makes an instance per process of the benchmark."""
-    with PolicyServer(make, port) as server:
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            return
+    with suppress(KeyboardInterrupt), PolicyServer(make, port) as server:  # also while the policy is made
+        server.serve_forever()

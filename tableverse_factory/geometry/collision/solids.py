@@ -1,6 +1,7 @@
 """Convex pieces in the table frame, for exact distance queries."""
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 import coal
 import numpy as np
@@ -84,6 +85,13 @@ def make_convex_shape(points: Points, faces: Faces) -> coal.Convex:
     """Make a coal shape of a convex triangle mesh."""
     vertices = coal.StdVec_Vec3s()
     vertices.extend(list(points))
+    return coal.Convex(vertices, _list_triangles(np.asarray(faces, dtype=np.int64).tobytes()))
+
+
+@lru_cache(4096)  # most work of a shape, and the same wherever a piece stands
+def _list_triangles(faces: bytes) -> coal.StdVec_Triangle:
     triangles = coal.StdVec_Triangle()
-    triangles.extend([coal.Triangle(a, b, c) for a, b, c in faces.tolist()])
-    return coal.Convex(vertices, triangles)
+    triangles.extend(
+        [coal.Triangle(a, b, c) for a, b, c in np.frombuffer(faces, dtype=np.int64).reshape(-1, 3).tolist()]
+    )
+    return triangles

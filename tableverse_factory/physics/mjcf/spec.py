@@ -49,6 +49,7 @@ _PIXEL_M = 5e-6  # MuJoCo wants the size of a camera's sensor for its focal leng
 _TETRAHEDRON_OBJ = (
     b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nf 1/1 3/1 2/1\nf 1/1 2/1 4/1\nf 1/1 4/1 3/1\nf 2/1 3/1 4/1\n"
 )
+_PLACEHOLDERS = "placeholders"
 _PIXEL_PNG = encode_png(np.zeros((1, 1, 3), dtype=np.uint8))
 
 
@@ -136,20 +137,25 @@ def make_scene_files(
     backdrop: Backdrop | None = None,
 ) -> SceneFiles:
     """Make MJCF text with its assets, visual meshes and textures included."""
-    spec, assets = make_scene_spec(bodies, slab, model_name=model_name, timestep_s=timestep_s)
+    spec, assets = _make_spec(bodies, slab, model_name, timestep_s, visuals=True)
     if tabletop is not None:
         _cover_table(spec, slab, tabletop, assets)
     if backdrop is not None:
         _add_backdrop(spec, backdrop, assets)
     if view is not None:
         _add_camera(spec, view)
-    # MuJoCo writes the XML of compiled models only, and only the names of files: placeholders compile at once.
-    # `SceneFiles.model` compiles the real files, from the XML.
-    spec.assets = {name: _TETRAHEDRON_OBJ if name.endswith(".obj") else _PIXEL_PNG for name in assets}
+    # MuJoCo writes the XML of compiled models only, and only the names of files: placeholders compile at once, in a
+    # folder of their own, as MuJoCo caches what each path held last. `SceneFiles.model` compiles the real files.
+    spec.meshdir = spec.texturedir = _PLACEHOLDERS
+    spec.assets = {
+        name.replace(ASSETS, _PLACEHOLDERS, 1): _TETRAHEDRON_OBJ if name.endswith(".obj") else _PIXEL_PNG
+        for name in assets
+    }
     spec.compile()
     spec.compiler.usethread = True  # the XML does not bind its readers
+    xml = spec.to_xml().replace(f'dir="{_PLACEHOLDERS}"', f'dir="{ASSETS}"')
     exact = {body.object_id: (quantize_pose(body.pose), body.properties) for body in bodies}
-    return SceneFiles(make_portable_xml(spec.to_xml(), exact), assets)
+    return SceneFiles(make_portable_xml(xml, exact), assets)
 
 
 def compute_irradiance(normal: Vector3, to_eye: Vector3) -> float:
@@ -170,6 +176,15 @@ def make_scene_spec(
 
     Without `visuals` the model simulates the same and compiles faster.
     """
+    spec, assets = _make_spec(bodies, slab, model_name, timestep_s, visuals)
+    spec.assets = assets
+    return spec, assets
+
+
+def _make_spec(
+    bodies: Sequence[SceneBody], slab: Slab, model_name: str, timestep_s: float, visuals: bool
+) -> tuple[mujoco.MjSpec, dict[str, bytes]]:
+    """Make the spec, and its files, which it has not got yet."""
     spec = mujoco.MjSpec()
     spec.modelname = model_name
     spec.meshdir = spec.texturedir = ASSETS
@@ -181,7 +196,6 @@ def make_scene_spec(
         part = _add_body(spec, body, assets)
         if visuals:
             _add_visual(spec, part, body, assets)
-    spec.assets = assets
     return spec, assets
 
 
@@ -241,7 +255,6 @@ def _add_textured_material(
     spec: mujoco.MjSpec, name: str, texture_png: bytes, assets: dict[str, bytes]
 ) -> mujoco.MjsMaterial:
     assets[f"{ASSETS}/{name}.png"] = texture_png
-    spec.assets = assets
     spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, file=f"{name}.png")
     material = spec.add_material(name=name)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name

@@ -185,4 +185,6 @@ def _settle_gently(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float
 
 
 def _list_warnings(data: mujoco.MjData) -> tuple[str, ...]:
+    if not data.warning.number.any():
+        return ()
     return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)

@@ -77,8 +77,10 @@ class _Assembly:
         waiting = [root]
         while waiting:
             container = waiting.pop(0)
+            if not (contents := self._contents(container)):
+                continue
             holder = filling.holder(container)
-            inside = [name for name in self._contents(container) if self._put(filling, name, holder)]
+            inside = [name for name in contents if self._put(filling, name, holder)]
             for name in inside:
                 self._repeat(filling, name, holder)
             waiting += inside

@@ -1,5 +1,6 @@
 """Start poses for dropping an object into a container, and the budget of a scene for that."""
 
+import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from schemas.geometry import ConvexPieces, Frozen, Points, Pose, TriangleMesh, Vector3
 from schemas.objects import PlacedObject
-from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, MovingSolid
+from tableverse_factory.geometry.collision.linear_sweep import ClearSearch, LinearSweep, MovingSolid
 from tableverse_factory.geometry.collision.solids import place_pieces
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import (
@@ -97,33 +98,77 @@ class Surroundings:
         self._fixed, self._clearance_m, self.budget = fixed, clearance_m, budget
         self._pieces = sum(len(body.solids.starts) for body in fixed)
 
-    def freed(self, member: CompositeMember, solid: MovingSolid, direction: Vector3) -> tuple[CompositeMember, float]:
-        """Push an object, with its pieces, clear in a direction (unit vector); returns it and the distance [m]."""
+    def search(self, member: CompositeMember, solid: MovingSolid, direction: Vector3) -> ClearSearch:
+        """Search how far an object, with its pieces, must be pushed in a direction (unit vector) to be clear."""
         self.budget.comparisons -= len(member.body.hulls) * self._pieces
-        way = LinearSweep(direction).find_first_clear([solid], self._fixed, self._clearance_m)
-        return member.at(translate_pose(member.pose, way * direction)), way
+        return LinearSweep(direction).search([solid], self._fixed, self._clearance_m)
+
+    def raised(self, member: CompositeMember) -> CompositeMember:
+        """Raise an object until it is clear."""
+        search = self.search(member, member.solid, UP)
+        while not search.done:
+            search.advance()
+        return _push(member, search.d, UP)
+
+
+def _push(member: CompositeMember, way: float, direction: Vector3) -> CompositeMember:
+    return member.at(translate_pose(member.pose, way * direction))
+
+
+@dataclass(slots=True)
+class _Push:
+    """An object turned by `angle` [rad], and the search for how far it must be pushed in a direction."""
+
+    turned: CompositeMember
+    angle: float
+    direction: Vector3
+    search: ClearSearch
+
+    @property
+    def cost(self) -> float:
+        """Lower bound of what the start deviates from the seen pose, exact once the search is done [m]."""
+        return self.search.d + METRES_PER_RAD * self.angle
+
+    def advance(self) -> None:
+        """Go on until the cost is higher or exact."""
+        before = self.search.d
+        while not self.search.done and self.search.d == before:
+            self.search.advance()
 
 
 def find_seen_starts(member: CompositeMember, around: Surroundings, holder: HollowVessel) -> Iterator[CompositeMember]:
     """Find starts for a seen object: its pose, else pushed clear as little as possible, long objects also more upright.
 
-    Only starts over or in the container are given, the nearest first, and as many as the budget allows.
+    Only starts over or in the container are given, the nearest first, and as many as the budget allows. No search goes
+    on beyond the cost of the last start that was asked for.
     """
-    found: list[tuple[float, int, CompositeMember]] = []
+    pushes = list(_list_pushes(member, around))
+    waiting = [(push.cost, k) for k, push in enumerate(pushes)]
+    heapq.heapify(waiting)
+    while waiting:
+        _, k = heapq.heappop(waiting)
+        push = pushes[k]
+        if not push.search.done:
+            push.advance()
+            heapq.heappush(waiting, (push.cost, k))
+        elif holder.holds((start := _push(push.turned, push.search.d, push.direction)).mesh):
+            yield start
+
+
+def _list_pushes(member: CompositeMember, around: Surroundings) -> Iterator[_Push]:
+    """List the pushes to try, as many as the budget allows: one where the object is clear as it was seen."""
     for turned, angle in _tilt_upright(member):
         solid = turned.solid
         for direction in _list_push_directions():
             if not around.budget.may_drop:
+                return
+            push = _Push(turned, angle, direction, around.search(turned, solid, direction))
+            push.advance()
+            yield push
+            if push.search.done and push.search.d == 0.0:
+                if direction is UP and turned is member:
+                    return
                 break
-            moved, way = around.freed(turned, solid, direction)
-            found.append((way + METRES_PER_RAD * angle, len(found), moved))
-            if way == 0.0:
-                break
-        if not found or found[0][0] == 0.0:
-            break
-    for _, _, start in sorted(found, key=lambda entry: entry[:2]):
-        if holder.holds(start.mesh):
-            yield start
 
 
 def draw_random_start(
@@ -134,7 +179,7 @@ def draw_random_start(
     Every other draw keeps the object's orientation but for its heading; the rest have any orientation.
     """
     draws = [_draw_start(member, holder, k % 2 == 1, rng) for k in range(DRAWS)]
-    raised = [around.freed(start, start.solid, UP)[0] for start in draws]
+    raised = [around.raised(start) for start in draws]
     return min(raised, key=lambda member: sum(corner[2] for corner in aabb(member.corners)))
 
 

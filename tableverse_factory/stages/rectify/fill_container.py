@@ -6,6 +6,7 @@ from itertools import islice
 import numpy as np
 
 from schemas.config import Config
+from tableverse_factory.geometry.collision.linear_sweep import MovingSolid
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose
 from tableverse_factory.geometry.relations.containers import HollowVessel, make_hollow_vessel
 from tableverse_factory.geometry.relations.support import meshes_touch
@@ -38,6 +39,7 @@ class ContainerFilling:
         self._root = root.item.object_id
         self._rectify, self._timestep_s = config.rectify, config.settle.timestep_s
         self._rng, self._budget = rng, budget
+        self._solids: dict[str, tuple[CompositeMember, MovingSolid]] = {}
 
     def holder(self, container_id: str) -> HollowVessel:
         """Make the container at its current pose."""
@@ -85,8 +87,16 @@ class ContainerFilling:
         return {member.item.object_id: RESTLESS for member, moves in zip(loose, rest.moving, strict=True) if moves}
 
     def _surroundings(self) -> Surroundings:
-        solids = [member.solid for member in self.members.values()]
+        solids = [self._solid(member) for member in self.members.values()]
         return Surroundings(solids, self._rectify.clearance_m, self._budget)
+
+    def _solid(self, member: CompositeMember) -> MovingSolid:
+        """Make the pieces of a member once per pose, with the shapes that distance queries make of them."""
+        made_of, solid = self._solids.get(member.item.object_id, (None, None))
+        if made_of is not member or solid is None:
+            solid = member.solid
+            self._solids[member.item.object_id] = member, solid
+        return solid
 
     def _loose(self) -> list[CompositeMember]:
         return [member for name, member in self.members.items() if name != self._root]
@@ -121,7 +131,7 @@ class ContainerFilling:
         """Whether its mesh touches another: pieces that close a vessel would carry contents over the void."""
         solid, mesh = member.solid, member.mesh
         reach = self._gap_m([member, *others]) + SLACK_M
-        return any(meshes_touch(solid, mesh, other.solid, other.mesh, reach) for other in others)
+        return any(meshes_touch(solid, mesh, self._solid(other), other.mesh, reach) for other in others)
 
     def _gap_m(self, members: Sequence[CompositeMember]) -> float:
         """The gap between pieces that free fall keeps [m]."""

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from tableverse_factory.delivery.formats.extract import extract_scene
+from tableverse_factory.delivery.formats.model_contents import read_model_contents
+from tableverse_factory.delivery.formats.usd import encode_usd
 from tests.helpers.exported_scenes import exported
 
 NAMES = ("obj_000", "obj_001", "obj_002")
@@ -39,6 +41,38 @@ def test_what_usd_lacks_stands_in_the_attributes_of_mujoco_and_newton(folder):
         material = UsdShade.MaterialBindingAPI(piece).ComputeBoundMaterial("physics")[0].GetPrim()
         frictions = [material.GetAttribute(f"newton:{kind}Friction").Get() for kind in ("torsional", "rolling")]
         np.testing.assert_allclose(frictions, geom.friction[1:], rtol=1e-6)
+
+
+TWO_COLLIDERS = """<mujoco><worldbody>
+  <geom name="floor" type="box" size="1 1 0.1" pos="0 0 -0.1" friction="0.7 0.02 0.0003" solref="0.01 1"/>
+  <body name="lamp" pos="0 0 0.05"><freejoint/>
+    <geom type="box" size="0.05 0.05 0.05" friction="0.9 0.01 0.002" condim="6" solref="0.004 1"
+      solimp="0.99 0.999 0.0002"/>
+    <geom type="sphere" size="0.03" pos="0 0 0.08" friction="0.3 0.005 0.0001" condim="4" solref="0.02 0.8"/>
+    <geom type="box" size="0.01 0.01 0.01" pos="0 0 0.12" friction="0.9 0.01 0.002" condim="3"/>
+  </body></worldbody></mujoco>"""
+
+
+def test_each_collider_has_its_own_contact_settings(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is an optional extra")
+    from pxr import Usd, UsdShade
+
+    model = mujoco.MjModel.from_xml_string(TWO_COLLIDERS)
+    (tmp_path / "scene.usd").write_bytes(encode_usd(read_model_contents(model), {})["scene.usd"])
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usd"))
+    materials = []
+    for geom, path in enumerate(["world/piece_00", *(f"lamp/piece_{index:02d}" for index in range(3))]):
+        piece = stage.GetPrimAtPath(f"/World/{path}")
+        assert piece.GetAttribute("mjc:condim").Get() == model.geom_condim[geom]
+        np.testing.assert_allclose(piece.GetAttribute("mjc:solref").Get(), model.geom_solref[geom])
+        np.testing.assert_allclose(piece.GetAttribute("mjc:solimp").Get(), model.geom_solimp[geom])
+        material = UsdShade.MaterialBindingAPI(piece).ComputeBoundMaterial("physics")[0].GetPrim()
+        names = ("physics:staticFriction", "newton:torsionalFriction", "newton:rollingFriction")
+        np.testing.assert_allclose(
+            [material.GetAttribute(n).Get() for n in names], model.geom_friction[geom], rtol=1e-6
+        )
+        materials.append(material.GetPath())
+    assert materials[1] == materials[3] != materials[2], "equal frictions share a material"
 
 
 @pytest.mark.slow

@@ -2,6 +2,10 @@
 
 import http.client
 import json
+import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler
@@ -202,3 +206,39 @@ def test_a_page_of_a_browser_cannot_send_messages(address):
         connection.request("POST", "/describe", "{}", {"Content-Type": kind})
         assert connection.getresponse().status == status
         connection.close()
+
+
+SERVED = """
+import sys, time
+from tableverse_factory.evaluation.benchmark.policy_server import serve_policy
+from tableverse_factory.evaluation.benchmark.random_policy import RandomPolicy
+
+class Slow(RandomPolicy):
+    def __init__(self):
+        print("made", flush=True)
+        time.sleep(float(sys.argv[1]))
+        super().__init__()
+
+serve_policy(Slow, port=int(sys.argv[2]))
+print("over", flush=True)
+"""
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("serves", [False, True])
+def test_ctrl_c_ends_a_served_policy_without_a_word_also_while_it_is_made(serves):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVED, "0" if serves else "60", str(port)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # a background shell ignores it
+    )
+    assert process.stdout.readline() == "made\n"
+    if serves:
+        assert HttpPolicy(f"http://127.0.0.1:{port}").pictures == ()
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60) == ("over\n", "")
+    assert process.returncode == 0

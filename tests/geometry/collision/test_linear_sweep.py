@@ -63,6 +63,28 @@ def test_from_the_answer_on_nothing_is_to_do(seed: int) -> None:
     assert LinearSweep(direction).find_first_clear([moving.moved(d * direction)], [fixed], CLEARANCE) <= 1e-6
 
 
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_search_only_raises_its_bound(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    moving, fixed = body(rng, 3), body(rng, 3)
+    search, bounds = LinearSweep(UP).search([moving], [fixed], CLEARANCE), [0.0]
+    while not search.done:
+        search.advance()
+        bounds.append(search.d)
+    assert bounds == sorted(bounds)
+    assert search.d == LinearSweep(UP).find_first_clear([moving], [fixed], CLEARANCE)
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1))
+def test_a_basis_is_right_handed_and_begins_with_its_direction(direction: tuple[float, float, float]) -> None:
+    unit = np.array(direction) / np.linalg.norm(direction)
+    basis = complete_basis(unit)
+    np.testing.assert_array_equal(basis[:, 0], unit)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(3), atol=1e-12)
+    assert np.linalg.det(basis) > 0.0
+
+
 def test_the_first_gap_is_taken_and_not_a_later_one() -> None:
     """Three slabs in a row; a thin slab that starts in the first fits between it and the second."""
     slab = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])

@@ -1,5 +1,6 @@
 """MJCF: pose in is pose out, mass and inertia as given, loads from memory and from a folder."""
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
@@ -93,6 +94,13 @@ def test_groups_classes_and_settings_are_in_the_xml() -> None:
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert (model.opt.impratio, model.opt.noslip_iterations) == (100.0, 5)
     np.testing.assert_allclose(piece.friction, [0.8, 0.01, 0.01])
+
+
+def test_the_files_that_the_xml_names_are_the_assets() -> None:
+    files = make_scene_files([body_of(ball(0.03), identity_pose())], SLAB)
+    root = ET.fromstring(files.xml)
+    folder = root.find("compiler").get("meshdir")
+    assert {f"{folder}/{mesh.get('file')}" for mesh in root.iter("mesh")} == files.assets.keys()
 
 
 def test_words_that_older_mujoco_does_not_know_are_not_written() -> None:

@@ -14,6 +14,7 @@ from schemas.geometry import Camera, ConvexPieces, Pose, TriangleMesh
 from schemas.identity import check_id
 from schemas.objects import Evidence, PlacedObject, PlacedObjects, Table
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
 from tableverse_factory.geometry.collision.penetration import measure_piece_penetrations
 from tableverse_factory.geometry.math.transforms import (
     identity_pose,
@@ -21,6 +22,7 @@ from tableverse_factory.geometry.math.transforms import (
     normalize_quaternion,
     quaternion_about_z,
     rotation_angle,
+    translate_pose,
 )
 from tableverse_factory.geometry.mesh.hulls import make_bounded_hull
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
@@ -30,11 +32,17 @@ from tableverse_factory.physics.simulate.at_rest import GENTLE_S, HOLD_S
 from tableverse_factory.sources.synthetic import utensils, vessels
 from tableverse_factory.sources.synthetic.model import GeneratedObject
 from tableverse_factory.stages.rectify.composites import AssembledLayout, assemble_composites, break_containment_cycles
-from tableverse_factory.stages.rectify.drop_contents import BUDGET_SPENT, CompositeMember, SimulationBudget
+from tableverse_factory.stages.rectify.drop_contents import (
+    BUDGET_SPENT,
+    CompositeMember,
+    SimulationBudget,
+    Surroundings,
+    find_seen_starts,
+)
 from tableverse_factory.stages.rectify.fill_container import LEFT, RESTLESS, UNSTABLE, ContainerFilling
 from tableverse_factory.stages.rectify.groups import form_entities
 from tableverse_factory.stages.rectify.rigid_part import make_rigid_part
-from tableverse_factory.stages.rectify.vertical import lift_contents
+from tableverse_factory.stages.rectify.vertical import UP, lift_contents
 
 TABLE = Table(np.zeros(2), np.ones(2), 0.0, (200, 200, 200), 0.0)
 MUG, BOWL, SPOON = (
@@ -351,6 +359,22 @@ def test_nothing_is_dropped_when_the_budget_is_spent(spent: SimulationBudget) ->
     before = replace(spent)
     assert not filling(budget=spent).put(marble_at("marble", 0.0, 0.05), filling().holder("mug"))
     assert spent == before
+
+
+def test_starts_come_nearest_first_as_if_every_push_had_been_searched_to_its_end() -> None:
+    assert MUG.cavity is not None
+    marble, mug = marble_at("marble", MUG.cavity.rim_radius, 0.05), member(MUG_AT_HOME, MUG_PIECES)
+    holder, level = filling().holder("mug"), [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(8) * np.pi / 4]
+    directions = [UP, *level, *((flat + UP) / np.sqrt(2.0) for flat in level)]
+    ways = [LinearSweep(direction).find_first_clear([marble.solid], [mug.solid], 0.0005) for direction in directions]
+    order = np.argsort(ways, kind="stable")
+    ends = [marble.at(translate_pose(marble.pose, ways[k] * directions[k])) for k in order]
+    budget = SimulationBudget()
+    starts = list(find_seen_starts(marble, Surroundings([mug.solid], 0.0005, budget), holder))
+    held = [end.pose.position for end in ends if holder.holds(end.mesh)]
+    assert 1 < len(held) < len(directions)
+    np.testing.assert_array_equal([start.pose.position for start in starts], held)
+    assert budget.comparisons == SimulationBudget().comparisons - len(directions) * len(MUG_PIECES.hulls)
 
 
 def test_freeing_together_ends_with_its_budget_and_says_so() -> None:
