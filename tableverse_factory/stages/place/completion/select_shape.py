@@ -15,6 +15,7 @@ from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
+from tableverse_factory.stages.place.completion.turned import build_turned_mesh, fit_turned
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
@@ -75,7 +76,7 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
     """Fit boxes, a surface of revolution, half-turn symmetric and inflated solids and columns, and select the best."""
     rays = sample_rays(view)
     search = _Search()
-    for method, freedom, make in KINDS:
+    for method, freedom, make in ESTIMATED_KINDS if view.estimated else KINDS:
         if search.is_below(freedom + UNAVOIDABLE_M):
             continue
         try:
@@ -97,6 +98,15 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
 def _discount_box(box: SolidBox) -> Draft:
     cost = box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
     return Draft(cost, lambda: (build_box_mesh(box), box.pose, cost))
+
+
+def _draft_box(box: SolidBox) -> Draft:
+    return Draft(box.misfit, lambda: (build_box_mesh(box), box.pose, box.misfit))
+
+
+def _draft_turned(view: ObjectView, rays: RaySample) -> Draft:
+    profile, misfit = fit_turned(view, rays)
+    return Draft(misfit, lambda: (*build_turned_mesh(profile), misfit))
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
@@ -135,4 +145,14 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
     ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     ("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     ("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+)
+
+# The same for depth that a model estimated, whose errors a free shape follows.
+ESTIMATED_KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
+    ("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
+    ("carved/turned", 0.0, _draft_turned),
+    ("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
+    ("carved/half_turn", 2e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    ("carved/inflation", 3e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    ("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )
