@@ -19,7 +19,7 @@ PAST_MARGIN_M = 0.004
 SILHOUETTE_M = 0.003
 # Of estimated depth: how much errors of an object's relief count, and of its distance, and the most that one counts
 # [m]. It is bent by more than the thickness of a wall, and the silhouette and the support tell the distance better.
-RELIEF, DISTANCE, WORST_RELIEF_M = 0.35, 0.1, 0.01
+RELIEF, DISTANCE, WORST_RELIEF_M = 0.25, 0.1, 0.008
 ESTIMATED_RAYS = 1600
 MISS_M = 1e6  # depth at which a ray meets nothing [m]; finite, so that it can be subtracted and weighted
 
@@ -77,7 +77,7 @@ def _weigh_estimated(rays: RaySample, ahead: Depths, hit: Depths) -> Depths:
     if not met.any():
         return np.abs(ahead)
     middle = float(np.median(ahead[met]))
-    return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle) + DISTANCE * abs(middle), WORST_RELIEF_M))
+    return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle), WORST_RELIEF_M) + DISTANCE * abs(middle))
 
 
 def compute_mesh_misfit(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> float:

@@ -37,7 +37,8 @@ HOPELESS_M = 1e-3  # cost over the best template's from which a template is not 
 SOLID = ((1.0,) * 6, (0.3, 0.62, 0.97, 0.97, 0.62, 0.25), (1.0, 0.97, 0.85, 0.65, 0.47, 0.4))
 HOLLOW = ((1.0,) * 6, (0.7, 0.75, 0.83, 0.91, 0.98, 1.0), (0.4, 0.55, 0.76, 0.9, 0.98, 1.0), (0.62, 0.68, 0.78, 0.9, 0.98, 1.0))
 FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
-SMOOTH_STEPS = 6  # of the mesh between two knots
+FLAT_RINGS = 6  # of a level floor or lid
+SMOOTH_STEPS = 4  # of the mesh between two knots
 
 # Heights of the knots as shares of the whole: denser at the ends, where a ball closes.
 _LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
@@ -230,6 +231,9 @@ def _intersect_ring(
 
 def _build_section(heights: Radii, radii: Radii) -> CrossSection:
     heights, radii = _smooth(heights, radii)
+    inner = np.linspace(0.0, 1.0, FLAT_RINGS + 1)[1:-1]  # vertex colours show nothing between two vertices
+    radii = np.concatenate([inner * radii[0], radii, inner[::-1] * radii[-1]])
+    heights = np.concatenate([np.full(len(inner), heights[0]), heights, np.full(len(inner), heights[-1])])
     right = np.stack([radii, heights], axis=1)
     left = right[::-1] * np.array([-1.0, 1.0])
     return CrossSection([np.concatenate([right, left])], FillRule.NonZero)
