@@ -22,6 +22,7 @@ ACROSS_PX = 3  # surfaces are compared at this distance from the border of two p
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
 AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
+MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
 SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
@@ -68,7 +69,10 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         if touches and (continues or border.affinity > SURE):
             wanted.append(border)
     group = _merge_pieces(wanted, borders, len(middle_of))
-    return _renumber(_join_fragments(found, group[pieces]))
+    ids = _join_fragments(found, group[pieces])
+    count = np.bincount(ids.ravel())
+    sure = np.bincount(ids.ravel(), found.label[OBJECT].ravel()) >= MIN_PROBABILITY * count
+    return _renumber(np.where(sure[ids], ids, 0))
 
 
 def _merge_pieces(wanted: Sequence[_Border], borders: Sequence[_Border], count: int) -> IdImage:
@@ -102,9 +106,7 @@ def _join_fragments(found: PicturePrediction, ids: IdImage) -> IdImage:
         at = np.stack([rows, columns])
         votes[k] = (at.mean(axis=1), (at + found.votes[::-1, rows, columns]).mean(axis=1), len(rows))
         shown[k] = at
-    partial = [
-        k for k in parts if np.linalg.norm(votes[k][1] - votes[k][0]) > FRAGMENT * np.sqrt(votes[k][2] / np.pi)
-    ]
+    partial = [k for k in parts if np.linalg.norm(votes[k][1] - votes[k][0]) > FRAGMENT * np.sqrt(votes[k][2] / np.pi)]
     result = ids.copy()
     for one, two in combinations(partial, 2):
         both = np.concatenate([shown[one], shown[two]], axis=1)

@@ -15,7 +15,7 @@ from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
-from tableverse_factory.stages.place.completion.turned import build_turned_mesh, fit_turned
+from tableverse_factory.stages.place.completion.turned import TurnedShape, build_turned_mesh, fit_lying, fit_standing
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
@@ -104,8 +104,10 @@ def _draft_box(box: SolidBox) -> Draft:
     return Draft(box.misfit, lambda: (build_box_mesh(box), box.pose, box.misfit))
 
 
-def _draft_turned(view: ObjectView, rays: RaySample) -> Draft:
-    profile, misfit = fit_turned(view, rays)
+def _draft_turned(shape: TurnedShape | None) -> Draft | None:
+    if shape is None:
+        return None
+    profile, misfit = shape
     return Draft(misfit, lambda: (*build_turned_mesh(profile), misfit))
 
 
@@ -150,9 +152,10 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
 # The same for depth that a model estimated, whose errors a free shape follows.
 ESTIMATED_KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
     ("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
-    ("carved/turned", 0.0, _draft_turned),
+    ("carved/turned", 0.0, lambda view, rays: _draft_turned(fit_standing(view, rays))),
+    ("carved/lying", 3e-4, lambda view, rays: _draft_turned(fit_lying(view, rays))),
     ("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
-    ("carved/half_turn", 2e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
-    ("carved/inflation", 3e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    ("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    ("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     ("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )
