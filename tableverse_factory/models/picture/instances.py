@@ -69,7 +69,8 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         if touches and (continues or border.affinity > SURE):
             wanted.append(border)
     group = _merge_pieces(wanted, borders, len(middle_of))
-    ids = _join_fragments(found, group[pieces])
+    touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}
+    ids = _join_fragments(found, group[pieces], touching)
     count = np.bincount(ids.ravel())
     sure = np.bincount(ids.ravel(), found.label[OBJECT].ravel()) >= MIN_PROBABILITY * count
     return _renumber(np.where(sure[ids], ids, 0))
@@ -94,27 +95,24 @@ def _merge_pieces(wanted: Sequence[_Border], borders: Sequence[_Border], count: 
     return group
 
 
-def _join_fragments(found: PicturePrediction, ids: IdImage) -> IdImage:
-    """Join what others hide the middle of: groups that lie apart, vote for one place and look alike.
+def _join_fragments(found: PicturePrediction, ids: IdImage, touching: set[tuple[int, ...]]) -> IdImage:
+    """Join what others hide the middle of: groups that lie apart and vote for one place.
 
     A whole object votes for its own middle; the visible rest of a plate votes for where the plate's middle is.
     """
-    parts = [k for k in np.unique(ids) if k > 0 and (ids == k).sum() >= MIN_OBJECT_PX // 2]
-    votes, shown = {}, {}
-    for k in parts:
-        rows, columns = np.nonzero(ids == k)
-        at = np.stack([rows, columns])
-        votes[k] = (at.mean(axis=1), (at + found.votes[::-1, rows, columns]).mean(axis=1), len(rows))
-        shown[k] = at
-    partial = [k for k in parts if np.linalg.norm(votes[k][1] - votes[k][0]) > FRAGMENT * np.sqrt(votes[k][2] / np.pi)]
+    fragments = []
+    for k in np.flatnonzero(np.bincount(ids.ravel()) >= MIN_OBJECT_PX // 2):
+        at = np.argwhere(ids == k)
+        middle, vote = at.mean(axis=0), (at + found.votes[::-1, at[:, 0], at[:, 1]].T).mean(axis=0)
+        if k > 0 and np.linalg.norm(vote - middle) > FRAGMENT * np.sqrt(len(at) / np.pi):
+            fragments.append((int(k), at, middle, vote))
     result = ids.copy()
-    for one, two in combinations(partial, 2):
-        both = np.concatenate([shown[one], shown[two]], axis=1)
-        reach = float(np.linalg.norm(np.ptp(both, axis=1)))
-        apart = float(np.linalg.norm(votes[one][1] - votes[two][1]))
-        between = (votes[one][1] - votes[one][0]) @ (votes[two][0] - votes[one][0]) > 0.0
-        if apart < ONE_MIDDLE * reach and between:
-            result[result == result[tuple(shown[two][:, 0])]] = result[tuple(shown[one][:, 0])]
+    for (one, at, middle, vote), (two, other_at, other_middle, other_vote) in combinations(fragments, 2):
+        reach = float(np.linalg.norm(np.ptp(np.concatenate([at, other_at]), axis=0)))
+        towards = (vote - middle) @ (other_middle - middle) > 0.0
+        near = float(np.linalg.norm(vote - other_vote)) < ONE_MIDDLE * reach
+        if near and towards and (one, two) not in touching:
+            result[result == result[tuple(other_at[0])]] = result[tuple(at[0])]
     return result
 
 
