@@ -6,36 +6,30 @@ the depth shows. What another object hides goes on around the axis.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from manifold3d import CrossSection, FillRule, Manifold
-from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize
 
-from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
+from schemas.geometry import Pose
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     quaternion_from_matrix,
-    rotation_matrix,
-    transform_points,
 )
-from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
-from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, Depths, RaySample, compute_misfit
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit
+from tableverse_factory.stages.place.completion.turned_profile import Radii, TurnedProfile, intersect_turned
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 KNOTS = 6
-SEGMENTS = 48
 RADIUS_RANGE_M, HEIGHT_RANGE_M = (0.003, 0.4), (0.004, 0.6)
 WALL_SHARE, WALL_RANGE_M = 0.06, (0.0025, 0.006)  # thickness of a wall, as a share of the widest radius, and [m]
 MIN_HOLLOW = 0.25  # least depth of a cavity, as a share of the height
 BEND_M = 3e-4  # cost of bends of the profile by its widest radius [m]: it decides what was not seen
 CARRY_WEIGHT = 0.1  # weight of how far outside of the body stands what it carries
-CALLS, REFINING_CALLS = 70, 320  # of the search for the size of a template, and for all radii
+CALLS, REFINING_CALLS = 50, 260  # of the search for the size of a template, and for all radii
 HOPELESS_M = 1e-3  # cost over the best template's from which a template is not refined [m]
 # Radii at the knots as shares of the widest, of which one is the start: a can, a ball, a cone; a beaker, a cup, a bowl
 # and a dish.
@@ -54,31 +48,14 @@ LYING = (
 )
 LONG = 1.15  # least length over breadth of what may lie
 FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
-FLAT_RINGS = 6  # of a level floor or lid
-SMOOTH_STEPS = 4  # of the mesh between two knots
 
 # Heights of the knots as shares of the whole: denser at the ends, where a ball closes.
 _LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
 
-Radii = Float64[np.ndarray, " k"]
 Kind = Literal["solid", "hollow", "lying"]
 # Middle x and y, logarithms of height and radii; then the height of a cavity's floor as a share of the whole, or the
 # heading of what lies.
 Numbers = Float64[np.ndarray, " n"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TurnedProfile(Frozen):
-    """A profile about an axis: heights along it and radii, and the same of its cavity, if any [m].
-
-    `frame` has its origin at the height 0 and z along the axis, in the table frame.
-    """
-
-    frame: Pose
-    heights: Radii
-    radii: Radii
-    inner_heights: Radii
-    inner_radii: Radii
 
 
 class TurnedShape(NamedTuple):
@@ -122,38 +99,6 @@ def _fit_best(
     least = min(cost for cost, *_ in found)
     shapes = [_refine(view, rays, x, kind) for cost, kind, x in found if cost < least + HOPELESS_M]
     return min(shapes, key=lambda shape: shape.misfit)
-
-
-def build_turned_mesh(profile: TurnedProfile) -> tuple[TriangleMesh, Pose]:
-    """Build the closed mesh about the middle of its box, and its pose in the table frame."""
-    height = float(profile.heights[-1])
-    section = _build_section(profile.heights, profile.radii)
-    if len(profile.inner_heights):
-        hole = _build_section(profile.inner_heights, profile.inner_radii)
-        radius = float(profile.inner_radii[-1])
-        mouth = np.array(
-            [[-radius, height - 1e-6], [radius, height - 1e-6], [radius, 2 * height], [-radius, 2 * height]]
-        )
-        section = section - (hole + CrossSection([mouth], FillRule.NonZero))
-    mesh = from_manifold(Manifold.revolve(section, SEGMENTS))
-    middle = np.array([0.0, 0.0, height / 2])
-    pose = Pose(transform_points(profile.frame, middle[None])[0], profile.frame.quaternion_wxyz)
-    return TriangleMesh(mesh.vertices - middle, mesh.faces), pose
-
-
-def intersect_turned(rays: RaySample, profile: TurnedProfile) -> Depths:
-    """Intersect the rays with a turned shape: the depths [m], `MISS_M` for a miss."""
-    axes = rotation_matrix(profile.frame.quaternion_wxyz)
-    origin, directions = (rays.eye - profile.frame.position) @ axes, axes.T @ rays.directions
-    hit = _intersect_cones(origin, directions, profile.heights, profile.radii)
-    discs = [(0.0, 0.0, profile.radii[0]), (float(profile.heights[-1]), 0.0, profile.radii[-1])]
-    if len(profile.inner_heights):
-        hit = np.minimum(hit, _intersect_cones(origin, directions, profile.inner_heights, profile.inner_radii))
-        discs[1] = (discs[1][0], profile.inner_radii[-1], profile.radii[-1])
-        discs.append((float(profile.inner_heights[0]), 0.0, profile.inner_radii[0]))
-    for height, least, most in discs:
-        hit = np.minimum(hit, _intersect_ring(origin, directions, height, float(least), float(most)))
-    return hit
 
 
 def _propose_centers(view: ObjectView) -> list[Float64[np.ndarray, "2"]]:
@@ -244,55 +189,3 @@ def _build_cavity(heights: Radii, radii: Radii, floor_share: float) -> tuple[Rad
     found = np.maximum(np.concatenate([[np.interp(floor, heights, inner)], inner[above]]), 1e-3)
     # The rim keeps a wall however steeply the profile opens.
     return at, np.minimum(found, np.interp(at, heights, radii) - min(wall, 0.4 * float(radii.min())))
-
-
-def _intersect_cones(origin: Vector3, directions: Float64[np.ndarray, "3 n"], heights: Radii, radii: Radii) -> Depths:
-    """Intersect rays with the sides of a profile of straight pieces."""
-    slope = np.diff(radii) / np.diff(heights)
-    base = (radii[:-1] - slope * heights[:-1])[:, None]
-    slope = slope[:, None]
-    dx, dy, dz = directions
-    ox, oy, oz = (float(v) for v in origin)
-    here = base + slope * oz
-    a = dx * dx + dy * dy - (slope * dz) ** 2
-    b = ox * dx + oy * dy - slope * dz * here
-    c = ox * ox + oy * oy - here * here
-    a = np.where(np.abs(a) < 1e-12, 1e-12, a)
-    inside = b * b - a * c
-    root = np.sqrt(np.maximum(inside, 0.0))
-    hit = np.full(directions.shape[1], MISS_M)
-    for t in ((-b - root) / a, (-b + root) / a):
-        z = oz + t * dz
-        on = (
-            (inside >= 0.0) & (t > 0.0) & (z >= heights[:-1, None]) & (z <= heights[1:, None]) & (base + slope * z >= 0)
-        )
-        hit = np.minimum(hit, np.where(on, t, MISS_M).min(axis=0))
-    return hit
-
-
-def _intersect_ring(
-    origin: Vector3, directions: Float64[np.ndarray, "3 n"], height: float, least: float, most: float
-) -> Depths:
-    dz = np.where(np.abs(directions[2]) < 1e-12, 1e-12, directions[2])
-    t = (height - origin[2]) / dz
-    across = np.hypot(origin[0] + t * directions[0], origin[1] + t * directions[1])
-    return np.where((t > 0.0) & (across >= least) & (across <= most), t, MISS_M)
-
-
-def _build_section(heights: Radii, radii: Radii) -> CrossSection:
-    heights, radii = _smooth(heights, radii)
-    inner = np.linspace(0.0, 1.0, FLAT_RINGS + 1)[1:-1]  # vertex colours show nothing between two vertices
-    radii = np.concatenate([inner * radii[0], radii, inner[::-1] * radii[-1]])
-    heights = np.concatenate([np.full(len(inner), heights[0]), heights, np.full(len(inner), heights[-1])])
-    right = np.stack([radii, heights], axis=1)
-    left = right[::-1] * np.array([-1.0, 1.0])
-    return CrossSection([np.concatenate([right, left])], FillRule.NonZero)
-
-
-def _smooth(heights: Radii, radii: Radii) -> tuple[Radii, Radii]:
-    """Round a profile between its knots, without new bumps."""
-    if len(heights) < 3:
-        return heights, radii
-    places = np.arange(len(heights), dtype=np.float64)
-    fine = np.linspace(0.0, places[-1], SMOOTH_STEPS * (len(heights) - 1) + 1)
-    return PchipInterpolator(places, heights)(fine), PchipInterpolator(places, radii)(fine)

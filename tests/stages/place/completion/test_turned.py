@@ -17,7 +17,7 @@ from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, p
 from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample
 from tableverse_factory.stages.place.completion.select_shape import complete_by_carving
-from tableverse_factory.stages.place.completion.turned import TurnedProfile, build_turned_mesh, intersect_turned
+from tableverse_factory.stages.place.completion.turned_profile import TurnedProfile, build_turned_mesh, intersect_turned
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import view_object
 from tableverse_factory.stages.place.view.support_from_depth import find_supports
