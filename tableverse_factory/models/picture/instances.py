@@ -1,8 +1,8 @@
 """Objects of a prediction: pixels grouped by their votes, cut at boundaries, and merged where surfaces continue."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
 from jaxtyping import Float64
@@ -22,6 +22,9 @@ ACROSS_PX = 3  # surfaces are compared at this distance from the border of two p
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
 AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
+MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
+FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
+ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
 SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
 
 
@@ -55,16 +58,62 @@ def _find_objects(found: PicturePrediction) -> IdImage:
     pieces, middle_of = _cut_pieces(nearest, found.boundary < EDGE)
     pieces = np.where(is_object, _spread(pieces), 0)
     sizes = np.bincount(pieces.ravel(), minlength=len(middle_of))
-    group = np.arange(len(middle_of))
-    for border in _measure_borders(found, pieces):
+    borders = list(_measure_borders(found, pieces))
+    wanted = []
+    for border in borders:
         a, b = border.pieces
         agreement = _measure_agreement(density, middles[middle_of[a]], middles[middle_of[b]])
         touches = border.length >= MIN_CONTACT * np.sqrt(min(sizes[a], sizes[b]))
         limit = CREASED if agreement >= LIKELY else SMOOTH if agreement >= AGREED else 0.0
         continues = border.boundary < EDGE and border.bend < limit and border.affinity > -SURE
         if touches and (continues or border.affinity > SURE):
-            group[group == group[b]] = group[a]
-    return _renumber(group[pieces])
+            wanted.append(border)
+    group = _merge_pieces(wanted, borders, len(middle_of))
+    touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}
+    ids = _join_fragments(found, group[pieces], touching)
+    count = np.bincount(ids.ravel())
+    sure = np.bincount(ids.ravel(), found.label[OBJECT].ravel()) >= MIN_PROBABILITY * count
+    return _renumber(np.where(sure[ids], ids, 0))
+
+
+def _merge_pieces(wanted: Sequence[_Border], borders: Sequence[_Border], count: int) -> IdImage:
+    """Merge across the wanted borders, the surest first, and number the group of each of `count` pieces.
+
+    Two groups stay apart where most of their common border says so: else a chain of scraps in a shadow joins a cup to
+    its saucer.
+    """
+    length, says = np.zeros((count, count)), np.zeros((count, count))
+    for border in borders:
+        a, b = border.pieces
+        length[a, b] = length[b, a] = border.length
+        says[a, b] = says[b, a] = border.length * border.affinity
+    group = np.arange(count, dtype=np.int32)
+    for border in sorted(wanted, key=lambda border: (-border.affinity, border.pieces)):
+        one, two = (group == group[piece] for piece in border.pieces)
+        if says[np.ix_(one, two)].sum() > -SURE * length[np.ix_(one, two)].sum():
+            group[two] = group[border.pieces[0]]
+    return group
+
+
+def _join_fragments(found: PicturePrediction, ids: IdImage, touching: set[tuple[int, ...]]) -> IdImage:
+    """Join what others hide the middle of: groups that lie apart and vote for one place.
+
+    A whole object votes for its own middle; the visible rest of a plate votes for where the plate's middle is.
+    """
+    fragments = []
+    for k in np.flatnonzero(np.bincount(ids.ravel()) >= MIN_OBJECT_PX // 2):
+        at = np.argwhere(ids == k)
+        middle, vote = at.mean(axis=0), (at + found.votes[::-1, at[:, 0], at[:, 1]].T).mean(axis=0)
+        if k > 0 and np.linalg.norm(vote - middle) > FRAGMENT * np.sqrt(len(at) / np.pi):
+            fragments.append((int(k), at, middle, vote))
+    result = ids.copy()
+    for (one, at, middle, vote), (two, other_at, other_middle, other_vote) in combinations(fragments, 2):
+        reach = float(np.linalg.norm(np.ptp(np.concatenate([at, other_at]), axis=0)))
+        towards = (vote - middle) @ (other_middle - middle) > 0.0
+        near = float(np.linalg.norm(vote - other_vote)) < ONE_MIDDLE * reach
+        if near and towards and (one, two) not in touching:
+            result[result == result[tuple(other_at[0])]] = result[tuple(at[0])]
+    return result
 
 
 def _group_votes(found: PicturePrediction, is_object: Mask) -> tuple[Float64[np.ndarray, "h w"], np.ndarray, IdImage]:

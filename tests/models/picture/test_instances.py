@@ -145,3 +145,34 @@ def test_ids_keep_their_places_at_another_size(factor: int) -> None:
     assert {*np.unique(large)} == {*np.unique(ids)}
     assert (large == plain).mean() > 0.98
     np.testing.assert_array_equal(upsample_ids(ids, ids.shape), ids)
+
+
+def test_a_chain_of_scraps_does_not_join_what_its_own_border_keeps_apart() -> None:
+    """A cup, its saucer and a shadow between them that agrees with both."""
+    found = draw_boundary(make_prediction(LEFT, RIGHT, (slice(60, 70), slice(50, 70))), 59, 60)
+    affinity = np.zeros_like(found.affinity)
+    affinity[0::2, :60] = -4.0  # to the right, across the border of cup and saucer
+    affinity[1::2] = 4.0  # downward, from both to the shadow
+    ids = segment(replace(found, affinity=affinity))
+    assert ids[40, 35] != ids[40, 80]
+
+
+def test_the_visible_parts_of_a_plate_are_joined_around_what_stands_on_it() -> None:
+    plate, cup = (slice(20, 70), slice(20, 110)), (slice(20, 70), slice(50, 80))
+    found = make_prediction(plate)
+    votes, depth, boundary = found.votes.copy(), found.depth.copy(), found.boundary.copy()
+    vote_for(votes, cup, 44.5, 62.0)
+    depth[cup] = 0.8
+    boundary[20:70, [49, 50, 79, 80]] = 1.0
+    hidden = replace(found, votes=votes, depth=depth, boundary=boundary, affinity=found.affinity - np.float32(3.0))
+    ids = segment(hidden)
+    assert ids[40, 30] == ids[40, 100] != ids[40, 65]
+    two = make_prediction((slice(20, 70), slice(20, 50)), (slice(20, 70), slice(80, 110)))
+    assert segment(two).max() == 2, "whole things that vote for their own middles are two"
+
+
+def test_what_is_unlikely_to_be_an_object_is_none() -> None:
+    found = make_prediction(LARGE)
+    label = found.label.copy()
+    label[:, *LARGE] = np.array([0.3, 0.25, 0.45], np.float32)[:, None, None]
+    assert segment(replace(found, label=label)).max() == 0

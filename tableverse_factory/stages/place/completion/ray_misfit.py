@@ -17,6 +17,10 @@ PAST_MARGIN_M = 0.004
 # Least cost of a ray that meets the shape though the picture shows something else there [m]: a sheet no higher than the
 # noise of the depth is wrong by its silhouette alone.
 SILHOUETTE_M = 0.003
+# Of estimated depth: how much errors of an object's relief count, and of its distance, and the most that one counts
+# [m]. It is bent by more than the thickness of a wall, and the silhouette and the support tell the distance better.
+RELIEF, DISTANCE, WORST_RELIEF_M = 0.25, 0.1, 0.008
+ESTIMATED_RAYS = 1600
 MISS_M = 1e6  # depth at which a ray meets nothing [m]; finite, so that it can be subtracted and weighted
 
 Depths = Float64[np.ndarray, " n"]
@@ -30,10 +34,12 @@ class RaySample(Frozen):
     directions: Float64[np.ndarray, "3 n"]  # scaled so that a parameter along a ray is the depth of the point
     end: Depths  # observed depth of the ray's end [m]; 0 where it is unknown
     facing: Float64[np.ndarray, " own"]  # cosine of incidence where the object was seen, 0 where the end is unknown
+    estimated: bool = False  # whether a model estimated the depth
 
 
-def sample_rays(view: ObjectView, count: int = RAYS) -> RaySample:
+def sample_rays(view: ObjectView, count: int | None = None) -> RaySample:
     """Sample about `count` rays of the window on a regular raster of pixels; those that tell nothing are left out."""
+    count = count or (ESTIMATED_RAYS if view.estimated else RAYS)
     step = max(1, int(np.ceil(np.sqrt(view.own.size / count))))
     raster = (slice(step // 2, None, step), slice(step // 2, None, step))
     own, past, end, facing = (of[raster].ravel() for of in (view.own, view.past, view.depth, view.facing))
@@ -45,6 +51,7 @@ def sample_rays(view: ObjectView, count: int = RAYS) -> RaySample:
         directions=rotation_matrix(view.camera_to_table.quaternion_wxyz) @ np.ascontiguousarray(unit.T),
         end=end[told],
         facing=np.where(end[seen] > 0.0, facing[seen], 0.0),
+        estimated=view.estimated,
     )
 
 
@@ -55,13 +62,22 @@ def compute_misfit(rays: RaySample, hit: Depths) -> float:
     """
     count = len(rays.facing)
     ahead = rays.end - hit
-    own = np.abs(ahead[:count])
+    own = _weigh_estimated(rays, ahead[:count], hit[:count]) if rays.estimated else np.abs(ahead[:count])
     own *= rays.facing
     own[hit[:count] == MISS_M] = WORST_M
     beyond = ahead[count:]
     past = np.minimum(np.maximum(beyond - PAST_MARGIN_M, SILHOUETTE_M), WORST_M)
     past *= beyond > 0.0
     return float(np.minimum(own, WORST_M).sum() + past.sum()) / max(count, 1)
+
+
+def _weigh_estimated(rays: RaySample, ahead: Depths, hit: Depths) -> Depths:
+    """Weigh the errors of estimated depth [m]: those of the relief, about their median, and the median itself."""
+    met = (hit != MISS_M) & (rays.facing > 0.0)
+    if not met.any():
+        return np.abs(ahead)
+    middle = float(np.median(ahead[met]))
+    return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle), WORST_RELIEF_M) + DISTANCE * abs(middle))
 
 
 def compute_mesh_misfit(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> float:

@@ -15,6 +15,8 @@ from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
+from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing
+from tableverse_factory.stages.place.completion.turned_profile import build_turned_mesh
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
@@ -23,6 +25,7 @@ BOX_DISCOUNT = 0.4
 BOX_DISCOUNT_M = 0.0008  # most forgiven to boxes [m]: flat faces carry all error of the depth, free shapes follow it
 HOLLOW_BONUS_M = 0.0012  # of a cavity seen [m]: a thin wall in noise must not lose to a solid that follows the noise
 UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedom alone costs more is not tried
+ESTIMATED_UNAVOIDABLE_M = 7e-4  # the same where a model estimated the depth
 
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
@@ -75,8 +78,9 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
     """Fit boxes, a surface of revolution, half-turn symmetric and inflated solids and columns, and select the best."""
     rays = sample_rays(view)
     search = _Search()
-    for method, freedom, make in KINDS:
-        if search.is_below(freedom + UNAVOIDABLE_M):
+    kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
+    for method, freedom, make in kinds:
+        if search.is_below(freedom + unavoidable):
             continue
         try:
             draft = make(view, rays)
@@ -97,6 +101,17 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
 def _discount_box(box: SolidBox) -> Draft:
     cost = box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
     return Draft(cost, lambda: (build_box_mesh(box), box.pose, cost))
+
+
+def _draft_box(box: SolidBox) -> Draft:
+    return Draft(box.misfit, lambda: (build_box_mesh(box), box.pose, box.misfit))
+
+
+def _draft_turned(shape: TurnedShape | None) -> Draft | None:
+    if shape is None:
+        return None
+    profile, misfit = shape
+    return Draft(misfit, lambda: (*build_turned_mesh(profile), misfit))
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
@@ -135,4 +150,15 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
     ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     ("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     ("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+)
+
+# The same for depth that a model estimated, whose errors a free shape follows.
+ESTIMATED_KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
+    ("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
+    ("carved/turned", 0.0, lambda view, rays: _draft_turned(fit_standing(view, rays))),
+    ("carved/lying", 3e-4, lambda view, rays: _draft_turned(fit_lying(view, rays))),
+    ("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
+    ("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    ("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    ("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )

@@ -26,6 +26,8 @@ SAMPLES, BLOCK = 400, 256
 NEAR = 12.0  # distance in CIELAB within which colours are alike
 RARITY = 4.0  # ratio of frequencies from which a colour is the background's; so is one that the object lacks
 INSET_PX = 2
+OUTLINE_PX = 4  # breadth of the band along an outline where estimated depth is no surface's [px]
+SMOOTH_SHARE = 0.04  # of the root of an object's area: standard deviation of the filter of its estimated depth
 
 
 def find_denoised_pixels(points_camera: Points, window: Camera, raw: DepthImage) -> Mask:
@@ -74,6 +76,26 @@ def _filter_depth(raw: DepthImage, trusted: Mask) -> DepthImage:
             total += w * np.where(w > 0.0, other, 0.0)
             weight += w
     return np.where(trusted, total / np.maximum(weight, 1e-12), 0.0)
+
+
+def drop_outline(own: Mask, trusted: Mask) -> Mask:
+    """Drop the pixels of an object next to its outline, where a model's depth runs over to what lies beside it.
+
+    Of narrow parts the middle stays.
+    """
+    inset = ndimage.distance_transform_edt(np.pad(own, 1))[1:-1, 1:-1]
+    widest = ndimage.maximum_filter(inset, size=2 * OUTLINE_PX + 1)
+    return trusted & (inset > np.minimum(OUTLINE_PX, 0.5 * widest))
+
+
+def smooth_depth(raw: DepthImage, trusted: Mask) -> DepthImage:
+    """Smooth estimated depth within the trusted pixels, over a share of the object's breadth: ripples are no shape."""
+    if not trusted.any():
+        return np.zeros(raw.shape)
+    width = SMOOTH_SHARE * float(np.sqrt(trusted.sum()))
+    weight = ndimage.gaussian_filter(trusted.astype(np.float64), width)
+    total = ndimage.gaussian_filter(np.where(trusted, raw, 0.0), width)
+    return np.where(trusted, total / np.maximum(weight, 1e-9), 0.0)
 
 
 def find_free_pixels(

@@ -15,11 +15,13 @@ from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps,
 from tableverse_factory.stages.place.view.object_pixels import (
     compute_outline_distance,
     compute_pixel_normals,
+    drop_outline,
     filter_depth,
     find_background_bleed,
     find_bounds,
     find_denoised_pixels,
     find_free_pixels,
+    smooth_depth,
 )
 from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 
@@ -46,6 +48,7 @@ class ObjectView(Frozen):
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
         outline_px: Distance of each pixel to the silhouette, the border of `past` [px]; negative within `past`.
+        estimated: Whether a model estimated the depth.
     """
 
     instance_id: int
@@ -60,6 +63,7 @@ class ObjectView(Frozen):
     past: Mask
     outline_px: DepthImage
     support: DepthSupport
+    estimated: bool = False
 
     @property
     def support_z(self) -> float:
@@ -87,7 +91,10 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     trusted = own & find_denoised_pixels(item.points_camera, window, raw)
     own, trusted = _remove_bleed(own, trusted, raw, window, pose, support.height)
     trusted &= ~find_depth_ramps(raw, own, trusted, window)
-    own_depth = filter_depth(raw, trusted)
+    estimated = scene.observation.bend > 0.0
+    if estimated:
+        trusted = drop_outline(own, trusted)
+    own_depth = smooth_depth(raw, trusted) if estimated else filter_depth(raw, trusted)
     past, end = find_free_pixels(raw, color, ids, own, trusted, window, pose)
     cloud = transform_points(pose, backproject(own_depth, window).reshape(-1, 3)).reshape(*own.shape, 3)
     normals = compute_pixel_normals(cloud, own_depth > 0.0, pose.position)
@@ -109,6 +116,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
         past=past,
         outline_px=compute_outline_distance(past),
         support=support,
+        estimated=estimated,
     )
 
 

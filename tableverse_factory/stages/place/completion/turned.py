@@ -1,0 +1,191 @@
+"""Turned shapes of few numbers, for depth that a model estimated: a profile of six radii, solid or hollow.
+
+Estimated depth is bent by more than a wall is thick, so that nothing can be carved by it. The silhouette is not: a
+shape of few numbers that has it, rests on its support and follows the depth roughly is nearer to the truth than what
+the depth shows. What another object hides goes on around the axis.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.optimize import minimize
+
+from schemas.geometry import Pose
+from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
+from tableverse_factory.geometry.math.transforms import (
+    quaternion_about_z,
+    quaternion_from_matrix,
+)
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit
+from tableverse_factory.stages.place.completion.turned_profile import Radii, TurnedProfile, intersect_turned
+from tableverse_factory.stages.place.view.object_view import ObjectView
+
+KNOTS = 6
+RADIUS_RANGE_M, HEIGHT_RANGE_M = (0.003, 0.4), (0.004, 0.6)
+WALL_SHARE, WALL_RANGE_M = 0.06, (0.0025, 0.006)  # thickness of a wall, as a share of the widest radius, and [m]
+MIN_HOLLOW = 0.25  # least depth of a cavity, as a share of the height
+BEND_M = 3e-4  # cost of bends of the profile by its widest radius [m]: it decides what was not seen
+CARRY_WEIGHT = 0.1  # weight of how far outside of the body stands what it carries
+CALLS, REFINING_CALLS = 50, 260  # of the search for the size of a template, and for all radii
+HOPELESS_M = 1e-3  # cost over the best template's from which a template is not refined [m]
+# Radii at the knots as shares of the widest, of which one is the start: a can, a ball, a cone; a beaker, a cup, a bowl
+# and a dish.
+STANDING = ((1.0,) * 6, (0.3, 0.62, 0.97, 0.97, 0.62, 0.25), (1.0, 0.97, 0.85, 0.65, 0.47, 0.4))
+HOLLOW = (
+    (1.0,) * 6,
+    (0.7, 0.75, 0.83, 0.91, 0.98, 1.0),
+    (0.4, 0.55, 0.76, 0.9, 0.98, 1.0),
+    (0.62, 0.68, 0.78, 0.9, 0.98, 1.0),
+)
+LYING = (
+    (1.0,) * 6,
+    (0.3, 0.62, 0.97, 0.97, 0.62, 0.25),
+    (0.3, 0.7, 1.0, 0.8, 0.5, 0.3),
+    (0.3, 0.5, 0.8, 1.0, 0.7, 0.3),
+)
+LONG = 1.15  # least length over breadth of what may lie
+FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
+
+# Heights of the knots as shares of the whole: denser at the ends, where a ball closes.
+_LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
+
+Kind = Literal["solid", "hollow", "lying"]
+# Middle x and y, logarithms of height and radii; then the height of a cavity's floor as a share of the whole, or the
+# heading of what lies.
+Numbers = Float64[np.ndarray, " n"]
+
+
+class TurnedShape(NamedTuple):
+    """A profile and its misfit to the picture [m]."""
+
+    profile: TurnedProfile
+    misfit: float
+
+
+def fit_standing(view: ObjectView, rays: RaySample) -> TurnedShape:
+    """Fit the best turned shape that stands on the object's support, solid or hollow.
+
+    Raises:
+        GeometryError: if too little was seen to start from.
+    """
+    if len(view.points) < KNOTS:
+        raise GeometryError("too few points for a turned shape")
+    return _fit_best(view, rays, (("solid", STANDING), ("hollow", HOLLOW)))
+
+
+def fit_lying(view: ObjectView, rays: RaySample) -> TurnedShape | None:
+    """Fit the best turned shape that lies on the object's support; None for what is not long.
+
+    Raises:
+        GeometryError: if too little was seen to start from.
+    """
+    if len(view.points) < KNOTS:
+        raise GeometryError("too few points for a turned shape")
+    half = fit_min_rectangle(view.points[:, :2]).half_size
+    return _fit_best(view, rays, (("lying", LYING),)) if max(half) > LONG * min(half) else None
+
+
+def _fit_best(
+    view: ObjectView, rays: RaySample, kinds: tuple[tuple[Kind, tuple[tuple[float, ...], ...]], ...]
+) -> TurnedShape:
+    found = []
+    for kind, templates in kinds:
+        sized = [_fit_size(view, rays, np.log(np.array(template)), kind) for template in templates]
+        cost, x = min(sized, key=lambda entry: entry[0])
+        found.append((cost, kind, x))
+    least = min(cost for cost, *_ in found)
+    shapes = [_refine(view, rays, x, kind) for cost, kind, x in found if cost < least + HOPELESS_M]
+    return min(shapes, key=lambda shape: shape.misfit)
+
+
+def _propose_centers(view: ObjectView) -> list[Float64[np.ndarray, "2"]]:
+    """Propose axes: the middle of what was seen, and places behind it, for what shows its front alone."""
+    rectangle = fit_min_rectangle(view.points[:, :2])
+    away = rectangle.center - view.eye[:2]
+    away = away / max(float(np.linalg.norm(away)), 1e-9)
+    reach = float(np.max(rectangle.half_size))
+    short = float(np.min(rectangle.half_size))
+    return [rectangle.center, rectangle.center + away * (reach - short), rectangle.center + 0.5 * away * reach]
+
+
+def _fit_size(view: ObjectView, rays: RaySample, template: Radii, kind: Kind) -> tuple[float, Numbers]:
+    """Fit place and size of a template; returns its cost [m] and all numbers of the shape."""
+    height = max(float(np.quantile(view.points[:, 2], 0.98)) - view.support_z, 2 * HEIGHT_RANGE_M[0])
+    footprint = fit_min_rectangle(view.points[:, :2])
+    short, long = np.clip(np.sort(footprint.half_size), 2 * RADIUS_RANGE_M[0], None)
+    size = (2 * long, short) if kind == "lying" else (height, long)
+    radius = float(size[1])
+    last: tuple[tuple[float, ...], ...] = ((),)
+    if kind == "hollow":
+        last = tuple((floor,) for floor in FLOORS)
+    elif kind == "lying":
+        last = ((footprint.yaw + (np.pi / 2 if footprint.half_size[1] > footprint.half_size[0] else 0.0),),)
+
+    def unfold(x: Numbers) -> Numbers:
+        return np.concatenate([x[:3], x[3] + template, x[4:]])
+
+    def cost(x: Numbers) -> float:
+        return _measure_cost(view, rays, unfold(x), kind)[0]
+
+    starts = [np.array([*center, *np.log(size), *number]) for center in _propose_centers(view) for number in last]
+    start = min(starts, key=cost)
+    steps = np.array([0.2 * radius, 0.2 * radius, -0.2, -0.15, 0.25])[: len(start)]
+    found = _minimize(cost, start, steps, CALLS)
+    return cost(found), unfold(found)
+
+
+def _refine(view: ObjectView, rays: RaySample, start: Numbers, kind: Kind) -> TurnedShape:
+    """Fit all numbers of a shape."""
+    size = float(np.exp(start[3 : 3 + KNOTS]).max())
+    steps = np.array([0.06 * size, 0.06 * size, 0.06, *([0.08] * KNOTS), 0.1])[: len(start)]
+    found = _minimize(lambda x: _measure_cost(view, rays, x, kind)[0], start, steps, REFINING_CALLS)
+    cost, profile = _measure_cost(view, rays, found, kind)
+    return TurnedShape(profile, cost)
+
+
+def _minimize(cost: Callable[[Numbers], float], start: Numbers, steps: Numbers, calls: int) -> Numbers:
+    simplex = np.vstack([start, start + np.diag(steps)])
+    options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 2e-6, "adaptive": len(start) > 5}
+    return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
+
+
+def _measure_cost(view: ObjectView, rays: RaySample, x: Numbers, kind: Kind) -> tuple[float, TurnedProfile]:
+    profile = _decode(view, x, kind)
+    bends = float(np.abs(np.diff(profile.radii, 2)).sum() / profile.radii.max())
+    cost = compute_misfit(rays, intersect_turned(rays, profile)) + BEND_M * bends
+    carried = view.support.carried
+    if len(carried) and kind != "lying":
+        outside = np.linalg.norm(carried - profile.frame.position[:2], axis=1) - float(profile.radii.max())
+        cost += CARRY_WEIGHT * float(np.maximum(outside, 0.0).mean())
+    return cost, profile
+
+
+def _decode(view: ObjectView, x: Numbers, kind: Kind) -> TurnedProfile:
+    height = float(np.clip(np.exp(x[2]), *HEIGHT_RANGE_M))
+    radii = np.clip(np.exp(x[3 : 3 + KNOTS]), *RADIUS_RANGE_M)
+    heights = height * _LEVELS
+    inner = np.zeros(0), np.zeros(0)
+    if kind == "lying":
+        along = np.array([np.cos(x[-1]), np.sin(x[-1]), 0.0])
+        start = np.array([*x[:2], view.support_z + float(radii.max())]) - along * height / 2
+        axes = np.stack([np.array([-along[1], along[0], 0.0]), np.array([0.0, 0.0, 1.0]), along], axis=1)
+        return TurnedProfile(Pose(start, quaternion_from_matrix(axes)), heights, radii, *inner)
+    if kind == "hollow":
+        inner = _build_cavity(heights, radii, float(x[-1]))
+    return TurnedProfile(Pose(np.array([*x[:2], view.support_z]), quaternion_about_z(0.0)), heights, radii, *inner)
+
+
+def _build_cavity(heights: Radii, radii: Radii, floor_share: float) -> tuple[Radii, Radii]:
+    """Build heights and radii of a cavity within a wall, down to a floor at a share of the height."""
+    wall = float(np.clip(WALL_SHARE * radii.max(), *WALL_RANGE_M))
+    inner = radii - wall * np.hypot(1.0, np.gradient(radii, heights))
+    height = float(heights[-1])
+    floor = max(float(np.clip(floor_share, 0.0, 1.0 - MIN_HOLLOW)) * height, min(wall, 0.5 * height))
+    above = heights > floor + 1e-6
+    at = np.concatenate([[floor], heights[above]])
+    found = np.maximum(np.concatenate([[np.interp(floor, heights, inner)], inner[above]]), 1e-3)
+    # The rim keeps a wall however steeply the profile opens.
+    return at, np.minimum(found, np.interp(at, heights, radii) - min(wall, 0.4 * float(radii.min())))

@@ -1,0 +1,117 @@
+"""Completion of estimated depth: whole things where the depth is bent, and what is hidden goes on around the axis."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from schemas.codec import encode
+from schemas.geometry import Pose, TriangleMesh
+from schemas.objects import PerceivedObjects
+from tableverse_factory.evaluation.bench.completion import render_noisy_view, stand_on_table
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.geometry.math.transforms import quaternion_about_z
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
+from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
+from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample
+from tableverse_factory.stages.place.completion.select_shape import complete_by_carving
+from tableverse_factory.stages.place.completion.turned_profile import TurnedProfile, build_turned_mesh, intersect_turned
+from tableverse_factory.stages.place.interfaces import Completion
+from tableverse_factory.stages.place.view.object_view import view_object
+from tableverse_factory.stages.place.view.support_from_depth import find_supports
+
+PLATE = [(0.0, 0.0), (0.06, 0.0), (0.1, 0.02), (0.097, 0.022), (0.057, 0.004), (0.0, 0.004)]
+MUG = [(0.0, 0.0), (0.035, 0.0), (0.04, 0.085), (0.036, 0.085), (0.032, 0.005), (0.0, 0.005)]
+
+
+def turn(profile: list[tuple[float, float]], height: float = 0.0) -> TriangleMesh:
+    solid = trimesh.creation.revolve(np.array(profile), sections=64)
+    mesh = from_trimesh(solid)
+    return TriangleMesh(mesh.vertices + np.array([0.0, 0.0, height]), mesh.faces)
+
+
+def bend(scene: PerceivedObjects, share: float = 0.012) -> PerceivedObjects:
+    """Bend each object's depth over the picture, and its distance, as a net does, by a share of the distance."""
+    depth = scene.observation.depth.astype(np.float64)
+    rows, columns = np.indices(depth.shape)
+    for item in scene.objects:
+        own = scene.instance_ids == item.instance_id
+        size = np.sqrt(own.sum())
+        wave = np.sin(columns / size * 2.0 + item.instance_id) * np.cos(rows / size * 2.5)
+        depth = np.where(own, depth * (1.0 + share * (wave + (-1) ** item.instance_id)), depth)
+    depth = depth.astype(np.float32)
+    points = backproject(depth, scene.observation.camera)
+    objects = tuple(
+        replace(item, points_camera=points[scene.instance_ids == item.instance_id]) for item in scene.objects
+    )
+    return replace(scene, observation=replace(scene.observation, depth=depth, bend=0.015), objects=objects)
+
+
+def complete(*meshes: TriangleMesh) -> list[Completion]:
+    scene = bend(render_noisy_view(meshes, 0.7, 0.85, np.random.default_rng(3), 0.0005))
+    supports = find_supports(scene.objects, scene.camera_to_table)
+    return [complete_by_carving(scene, view_object(scene, item, supports[item.object_id])) for item in scene.objects]
+
+
+def place(completion: Completion) -> TriangleMesh:
+    assert completion.pose is not None
+    return place_mesh(completion.mesh, completion.pose)
+
+
+def test_a_plate_under_a_mug_is_one_closed_piece_without_a_hole_and_the_mug_is_hollow() -> None:
+    plate, mug = complete(turn(PLATE), turn(MUG, 0.004))
+    assert [plate.method, mug.method] == ["carved/turned", "carved/turned"]
+    for completion in (plate, mug):
+        solid = to_manifold(completion.mesh)
+        assert (len(solid.decompose()), solid.genus()) == (1, 0)
+        inside = trimesh.Trimesh(completion.mesh.vertices, completion.mesh.faces).convex_hull.volume
+        assert solid.volume() < 0.8 * inside, "the hollow is filled"
+    down = pack_rays(
+        np.array([0.0, 0.0, 1.0]), np.array([[x, y, -1.0] for x in (-0.04, 0.0, 0.04) for y in (0.0, 0.03)])
+    )
+    hit = make_raycasting_scene(place(plate)).cast_rays(down, nthreads=1)["t_hit"].numpy()
+    assert np.isfinite(hit).all(), "what the mug hides is missing"
+    assert np.ptp(place(plate).vertices[:, :2], axis=0) == pytest.approx(0.2, rel=0.12)
+
+
+def test_a_ball_stays_round() -> None:
+    (ball,) = complete(stand_on_table(from_trimesh(trimesh.creation.icosphere(3, 0.04))))
+    assert ball.method == "carved/turned"
+    assert to_manifold(ball.mesh).volume() == pytest.approx(4 / 3 * np.pi * 0.04**3, rel=0.3)
+    size = np.ptp(ball.mesh.vertices, axis=0)
+    assert size == pytest.approx(0.08, rel=0.15)
+
+
+def test_a_box_is_a_box_and_a_lying_can_lies() -> None:
+    (box,) = complete(stand_on_table(from_trimesh(trimesh.creation.box((0.16, 0.1, 0.06)))))
+    assert box.method == "carved/box"
+    can = trimesh.creation.cylinder(0.03, 0.14)
+    can.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0.0, 1.0, 0.0]))
+    (lying,) = complete(stand_on_table(from_trimesh(can)))
+    assert lying.method == "carved/lying"
+    assert np.ptp(lying.mesh.vertices, axis=0)[2] == pytest.approx(0.14, rel=0.15)
+
+
+def test_the_same_picture_gives_the_same_bytes() -> None:
+    first, second = (complete(turn(PLATE), turn(MUG, 0.004)) for _ in range(2))
+    assert [encode(a.mesh) for a in first] == [encode(b.mesh) for b in second]
+
+
+def test_rays_meet_a_profile_where_they_meet_its_mesh() -> None:
+    rng = np.random.default_rng(5)
+    heights = np.array([0.0, 0.03, 0.08, 0.1])
+    frame = Pose(np.array([0.03, -0.02, 0.01]), quaternion_about_z(0.3))
+    profile = TurnedProfile(frame, heights, np.full(4, 0.05), np.array([0.02, 0.1]), np.full(2, 0.045))
+    mesh, pose = build_turned_mesh(profile)
+    eye = np.array([0.3, -0.2, 0.4])
+    directions = rng.uniform(-0.05, 0.12, (400, 3)) - eye
+    rays = RaySample(eye, np.ascontiguousarray(directions.T), np.ones(400), np.ones(400))
+    there = make_raycasting_scene(place_mesh(mesh, pose)).cast_rays(pack_rays(eye, directions), nthreads=1)
+    true = np.minimum(there["t_hit"].numpy().astype(np.float64), MISS_M)
+    found = intersect_turned(rays, profile)
+    both = (true < MISS_M) & (found < MISS_M)
+    assert both.sum() > 100
+    assert ((true < MISS_M) == (found < MISS_M)).mean() > 0.98
+    assert np.quantile(np.abs(true - found)[both], 0.95) < 0.005
