@@ -48,6 +48,7 @@ class ArmMeshes:
         except ValueError as error:
             raise InputError(f"the arm {arm.name} does not compile: {error}"[:300], "bad_arm") from None
         self._data = mujoco.MjData(self._model)
+        self._home = np.array([*arm.home, *arm.finger_positions(arm.max_opening_m)])
         joints = (*arm.joint_names, *arm.finger_joints)
         self._addresses = [int(self._model.joint(name).qposadr[0]) for name in joints]
         shown = _list_visual_geoms(self._model)
@@ -70,6 +71,10 @@ class ArmMeshes:
         self._data.qpos[self._addresses] = positions
         mujoco.mj_kinematics(self._model, self._data)
         return [compose_poses(base, _read_pose(self._data, body)) for body in self._bodies]
+
+    def home_poses(self, base: Pose) -> list[Pose]:
+        """Compute the meshes' poses with the arm at home and its fingers open."""
+        return self.poses(self._home, base)
 
 
 def build_recorded_scene(scene: Scene, x_id: str, figure: ArmMeshes, recording: Recording) -> RenderScene:

@@ -190,12 +190,6 @@ def find_nearest_point(a: MovingSolid, b: MovingSolid, reach_m: float) -> tuple[
 def complete_basis(direction: Vector3) -> Matrix3:
     """Complete a unit vector to an orthonormal basis, as columns."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    second = _cross(direction, helper)
+    second = np.cross(direction, helper)
     second /= np.linalg.norm(second)
-    return np.column_stack([direction, second, _cross(direction, second)])
-
-
-def _cross(a: Vector3, b: Vector3) -> Vector3:
-    """Compute `np.cross` of two vectors, in a tenth of its time."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return np.column_stack([direction, second, np.cross(direction, second)])

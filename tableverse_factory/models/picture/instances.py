@@ -82,16 +82,16 @@ def _merge_pieces(wanted: Sequence[_Border], borders: Sequence[_Border], count: 
     Two groups stay apart where most of their common border says so: else a chain of scraps in a shadow joins a cup to
     its saucer.
     """
-    length, says = np.zeros((count, count)), np.zeros((count, count))
-    for border in borders:
-        a, b = border.pieces
-        length[a, b] = length[b, a] = border.length
-        says[a, b] = says[b, a] = border.length * border.affinity
+    pairs = np.array([border.pieces for border in borders], dtype=np.int32).reshape(-1, 2)
+    length = np.array([border.length for border in borders])
+    says = length * np.array([border.affinity for border in borders])
     group = np.arange(count, dtype=np.int32)
     for border in sorted(wanted, key=lambda border: (-border.affinity, border.pieces)):
-        one, two = (group == group[piece] for piece in border.pieces)
-        if says[np.ix_(one, two)].sum() > -SURE * length[np.ix_(one, two)].sum():
-            group[two] = group[border.pieces[0]]
+        one, two = group[list(border.pieces)]
+        sides = group[pairs]
+        common = (sides == (one, two)).all(axis=1) | (sides == (two, one)).all(axis=1)
+        if says[common].sum() > -SURE * length[common].sum():
+            group[group == two] = one
     return group
 
 

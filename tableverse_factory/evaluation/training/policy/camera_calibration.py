@@ -16,7 +16,6 @@ from tableverse_factory.geometry.math.camera import PosedCamera, backproject
 from tableverse_factory.geometry.math.transforms import identity_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.render.raycast import Raycaster
-from tableverse_factory.robotics.robots.registry import load_arm
 
 REACHES_M = (*[0.09] * 8, *[0.06] * 6, *[0.03] * 5, *[0.015] * 5, *[0.008] * 4)  # to the arm, step by step
 ALIKE = 0.6  # least cosine between normals of points that are taken for the same
@@ -57,9 +56,8 @@ def load_surfaces(robot: str) -> tuple[ArmSurface, ...]:
 @cache
 def _load_home(robot: str) -> Raycaster:
     """Load an arm at home, its fingers open, on its pedestal."""
-    arm, figure, still = load_arm(robot), load_figure(robot), identity_pose()
-    positions = np.array([*arm.home, *arm.finger_positions(arm.max_opening_m)])
-    parts = [place_mesh(*part) for part in zip(figure.meshes, figure.poses(positions, still), strict=True)]
+    figure, still = load_figure(robot), identity_pose()
+    parts = [place_mesh(*part) for part in zip(figure.meshes, figure.home_poses(still), strict=True)]
     return Raycaster([figure.pedestal(still), *parts])
 
 

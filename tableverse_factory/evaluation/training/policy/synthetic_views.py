@@ -40,7 +40,7 @@ def take_synthetic_view(number: int, robot: str) -> View:
     placed, half_xy = arrange_scene(rng, f"table {number}")
     whole = Pose(np.zeros(3), quaternion_about_z(float(rng.uniform(0.0, 2 * np.pi))))
     placed = [PlacedModel(item.model, compose_poses(whole, item.pose)) for item in placed]
-    arm, figure, base = load_arm(robot), load_figure(robot), _draw_base(placed, robot, rng)
+    figure, base = load_figure(robot), _draw_base(placed, robot, rng)
     table = studio.make_table(rng, half_xy)
     board = PaintedMeshes(
         (place_mesh(table.mesh, whole), figure.pedestal(base)), (_turn_pattern(table.texture, whole), PEDESTAL_COLOR)
@@ -48,8 +48,7 @@ def take_synthetic_view(number: int, robot: str) -> View:
     meshes, paints = [item.model.mesh for item in placed], [item.model.texture for item in placed]
     moving = PaintedMeshes((*meshes, *figure.meshes), (*paints, *[None] * len(figure.meshes)))
     names = tuple(map(make_object_id, range(len(placed))))
-    positions = np.array([*arm.home, *arm.finger_positions(arm.max_opening_m)])
-    poses = [*(item.pose for item in placed), *figure.poses(positions, base)]
+    poses = [*(item.pose for item in placed), *figure.home_poses(base)]
     cast = RenderScene(board, moving, names, ())
     return take_view(PosedScene(cast, names, poses, base, _name_objects(placed), draw_lighting(rng)), robot)
 

@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.planes import fit_min_rectangle
+from tableverse_factory.geometry.math.planes import Rectangle, fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     quaternion_from_matrix,
@@ -71,9 +71,7 @@ def fit_standing(view: ObjectView, rays: RaySample) -> TurnedShape:
     Raises:
         GeometryError: if too little was seen to start from.
     """
-    if len(view.points) < KNOTS:
-        raise GeometryError("too few points for a turned shape")
-    return _fit_best(view, rays, (("solid", STANDING), ("hollow", HOLLOW)))
+    return _fit_best(view, rays, _measure_footprint(view), (("solid", STANDING), ("hollow", HOLLOW)))
 
 
 def fit_lying(view: ObjectView, rays: RaySample) -> TurnedShape | None:
@@ -82,18 +80,26 @@ def fit_lying(view: ObjectView, rays: RaySample) -> TurnedShape | None:
     Raises:
         GeometryError: if too little was seen to start from.
     """
+    footprint = _measure_footprint(view)
+    is_long = max(footprint.half_size) > LONG * min(footprint.half_size)
+    return _fit_best(view, rays, footprint, (("lying", LYING),)) if is_long else None
+
+
+def _measure_footprint(view: ObjectView) -> Rectangle:
     if len(view.points) < KNOTS:
         raise GeometryError("too few points for a turned shape")
-    half = fit_min_rectangle(view.points[:, :2]).half_size
-    return _fit_best(view, rays, (("lying", LYING),)) if max(half) > LONG * min(half) else None
+    return fit_min_rectangle(view.points[:, :2])
 
 
 def _fit_best(
-    view: ObjectView, rays: RaySample, kinds: tuple[tuple[Kind, tuple[tuple[float, ...], ...]], ...]
+    view: ObjectView,
+    rays: RaySample,
+    footprint: Rectangle,
+    kinds: tuple[tuple[Kind, tuple[tuple[float, ...], ...]], ...],
 ) -> TurnedShape:
     found = []
     for kind, templates in kinds:
-        sized = [_fit_size(view, rays, np.log(np.array(template)), kind) for template in templates]
+        sized = [_fit_size(view, rays, footprint, np.log(np.array(template)), kind) for template in templates]
         cost, x = min(sized, key=lambda entry: entry[0])
         found.append((cost, kind, x))
     least = min(cost for cost, *_ in found)
@@ -101,20 +107,20 @@ def _fit_best(
     return min(shapes, key=lambda shape: shape.misfit)
 
 
-def _propose_centers(view: ObjectView) -> list[Float64[np.ndarray, "2"]]:
+def _propose_centers(view: ObjectView, footprint: Rectangle) -> list[Float64[np.ndarray, "2"]]:
     """Propose axes: the middle of what was seen, and places behind it, for what shows its front alone."""
-    rectangle = fit_min_rectangle(view.points[:, :2])
-    away = rectangle.center - view.eye[:2]
+    away = footprint.center - view.eye[:2]
     away = away / max(float(np.linalg.norm(away)), 1e-9)
-    reach = float(np.max(rectangle.half_size))
-    short = float(np.min(rectangle.half_size))
-    return [rectangle.center, rectangle.center + away * (reach - short), rectangle.center + 0.5 * away * reach]
+    reach = float(np.max(footprint.half_size))
+    short = float(np.min(footprint.half_size))
+    return [footprint.center, footprint.center + away * (reach - short), footprint.center + 0.5 * away * reach]
 
 
-def _fit_size(view: ObjectView, rays: RaySample, template: Radii, kind: Kind) -> tuple[float, Numbers]:
+def _fit_size(
+    view: ObjectView, rays: RaySample, footprint: Rectangle, template: Radii, kind: Kind
+) -> tuple[float, Numbers]:
     """Fit place and size of a template; returns its cost [m] and all numbers of the shape."""
     height = max(float(np.quantile(view.points[:, 2], 0.98)) - view.support_z, 2 * HEIGHT_RANGE_M[0])
-    footprint = fit_min_rectangle(view.points[:, :2])
     short, long = np.clip(np.sort(footprint.half_size), 2 * RADIUS_RANGE_M[0], None)
     size = (2 * long, short) if kind == "lying" else (height, long)
     radius = float(size[1])
@@ -130,7 +136,9 @@ def _fit_size(view: ObjectView, rays: RaySample, template: Radii, kind: Kind) ->
     def cost(x: Numbers) -> float:
         return _measure_cost(view, rays, unfold(x), kind)[0]
 
-    starts = [np.array([*center, *np.log(size), *number]) for center in _propose_centers(view) for number in last]
+    starts = [
+        np.array([*center, *np.log(size), *number]) for center in _propose_centers(view, footprint) for number in last
+    ]
     start = min(starts, key=cost)
     steps = np.array([0.2 * radius, 0.2 * radius, -0.2, -0.15, 0.25])[: len(start)]
     found = _minimize(cost, start, steps, CALLS)

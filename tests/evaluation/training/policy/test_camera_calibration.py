@@ -14,7 +14,6 @@ from tableverse_factory.geometry.math.transforms import identity_pose, transform
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.mjcf.scenery import make_box_mesh
 from tableverse_factory.physics.render.raycast import Raycaster
-from tableverse_factory.robotics.robots.registry import load_arm
 
 
 def cast_depth(caster: Raycaster, eye: PosedCamera) -> DepthImage:
@@ -30,9 +29,8 @@ ROBOT = "panda"
 
 @pytest.fixture(scope="module")
 def caster() -> Raycaster:
-    arm, figure, still = load_arm(ROBOT), load_figure(ROBOT), identity_pose()
-    positions = np.array([*arm.home, *arm.finger_positions(arm.max_opening_m)])
-    parts = [place_mesh(mesh, pose) for mesh, pose in zip(figure.meshes, figure.poses(positions, still), strict=True)]
+    figure, still = load_figure(ROBOT), identity_pose()
+    parts = [place_mesh(mesh, pose) for mesh, pose in zip(figure.meshes, figure.home_poses(still), strict=True)]
     things = [
         make_box((x, x + 0.1), (y, y + 0.07), (0.0, height))
         for x, y, height in ((0.5, -0.1, 0.02), (0.62, 0.12, 0.11), (0.5, 0.2, 0.2))
