@@ -69,6 +69,7 @@ def test_a_build_is_measured_from_outside(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow  # starts Ray, for figures of a bench alone
 def test_a_payload_is_in_the_dataset_and_passes_by_the_driver(tmp_path):
     payload, n = 1_000_000, 70  # more than are handed over at once
     run = _run_once("ray", 1, n, NOOP, tmp_path, payload)

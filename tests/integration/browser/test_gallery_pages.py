@@ -132,7 +132,7 @@ def test_foreign_text_stays_text_in_pages_data_and_address(page, hostile):
     assert page.locator("#lost-3").is_visible()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.slow)])
 def test_axe_objects_to_nothing(page, hostile, filmed, axe, scheme, screenshots):
     page.emulate_media(color_scheme=scheme)
     scene = (filmed.parent / "scenes" / "a-1.html").as_uri()

@@ -143,6 +143,7 @@ def test_the_certificates_hold(made):
     assert [audit.problems for audit in audits if audit.problems] == []
 
 
+@pytest.mark.slow  # builds of other pipelines resume by the same code
 def test_stopped_and_gone_on_with_gives_the_same_bytes(made):
     for limit in (2, 5, None):
         build(made, "in-steps", limit=limit)
@@ -168,6 +169,7 @@ def test_a_dataset_that_was_built_anew_is_noticed(made, tmp_path):
     assert {row["reason"] for row in rows_of(build(tmp_path, "dropped"))} == {"content_changed"}
 
 
+@pytest.mark.slow  # three builds
 def test_cousins_of_a_damaged_parent_fail_and_are_made_once_it_is_restored(made, tmp_path, run):
     """A cut tar, as by a full disk, is no property of the scene: it must not pass for a finished dataset."""
     shutil.copytree(made / "out", tmp_path / "out")

@@ -49,7 +49,7 @@ def small_disk(tmp_path):
     [
         ("local", 100),
         pytest.param("local", 400, marks=pytest.mark.slow),
-        ("local", 900),
+        pytest.param("local", 900, marks=pytest.mark.slow),
         pytest.param("ray", 500, marks=pytest.mark.slow),
     ],
 )

@@ -61,7 +61,7 @@ def test_a_scene_that_moves_to_its_shard_while_it_is_looked_at_is_found_there(wh
     assert digests(tmp_path / "out") == digests(finished)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)])
 def test_what_is_done_can_be_read_after_any_stop(tmp_path, how):
     manifest = write_manifest(tmp_path / "m.parquet", ["slow_0.1"] * 30)
     process = start(manifest, tmp_path / "out", shard_size=64)

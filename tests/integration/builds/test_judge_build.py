@@ -109,6 +109,7 @@ def assert_key_nowhere(folder: Path) -> None:
         assert KEY.encode() not in path.read_bytes(), path
 
 
+@pytest.mark.slow  # three builds of real scenes; tests/stages/curate replays answers
 def test_the_recipe_of_the_docs_repeats_a_build_also_with_the_longest_answer(server, request_of, monkeypatch, tmp_path):
     monkeypatch.setenv("JUDGE_KEY", KEY)
     prose = "… “thinking”\r\n"

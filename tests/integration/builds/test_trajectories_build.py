@@ -185,6 +185,7 @@ def test_kill_9_and_the_same_command_again(tmp_path, marks, times):
     assert digests(tmp_path / "out") == digests(tmp_path / "whole")
 
 
+@pytest.mark.slow  # three builds; tests above do it in this process
 def test_a_build_from_the_command_line_with_stages_and_from_that_stage_again(copy, marks):
     arguments = ("build", copy / "m.parquet", copy / "told", "--executor", "local")
     sets = [f"run.{key}={value}" for key, value in PATIENT.items()]

@@ -59,7 +59,7 @@ OURS = ("tableverse_factory", "workers", "schemas")
 TESTED_BY_ITSELF = ("cookbook.md",)
 """Pages whose Python another test runs, on data of its own; their commands are run here."""
 
-SHORT = ("README.md", "captures.md")
+SHORT = ("README.md",)
 """Pages that `make test` runs; the commands of all others it only reads, and `make test-all` runs them."""
 
 

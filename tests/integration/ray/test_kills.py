@@ -60,6 +60,7 @@ def test_twenty_killed_actors_and_sandboxes_cost_nothing_but_time(tmp_path):
     _same(out, expected, n_scenes)
 
 
+@pytest.mark.slow  # test_ray_build.py kills actors; tests/workers/state stops commits
 def test_an_actor_killed_in_the_middle_of_a_commit_costs_nothing(tmp_path):
     manifest = write_manifest(tmp_path / "images.parquet", ["bulky"] * 6)
     run = {"memory_mb": 2000, "shard_size": 3}

@@ -47,6 +47,7 @@ def test_pools_of_their_own_give_the_same_bytes(tmp_path, monkeypatch):
     assert all(count >= 1 for count in seen.most.values())
 
 
+@pytest.mark.slow  # test_pool_capacity.py refuses them without Ray
 def test_pools_that_can_never_be_are_refused_before_anything_waits(tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", NAMES)
     asked = request(manifest, tmp_path / "out", deadline_s=60.0)

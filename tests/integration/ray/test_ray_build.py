@@ -71,6 +71,7 @@ def test_kill_minus_nine_of_the_driver_and_then_of_actors_gives_the_same_bytes(w
     assert {row["attempts"] for row in scenes(out) if row["error_kind"] != "crash"} == {1}
 
 
+@pytest.mark.slow  # the test above kills actors; test_again_stopped.py counts runs
 def test_a_stage_that_was_finished_before_its_actor_was_killed_is_not_run_again(tmp_path, monkeypatch):
     marks = tmp_path / "marks"
     marks.mkdir()
@@ -88,6 +89,7 @@ def test_a_stage_that_was_finished_before_its_actor_was_killed_is_not_run_again(
     assert [row["attempts"] for row in scenes(tmp_path / "out")] == [1, 1]
 
 
+@pytest.mark.slow  # test_growing_dataset.py stops one process; test_stops.py all of it
 def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, tmp_path):
     manifest, _ = whole
     process = start(manifest, tmp_path / "out", "ray", 1, **RUN)
@@ -103,6 +105,7 @@ def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, t
     wait_until(lambda: not any(is_alive(worker) for worker in workers), 30.0)
 
 
+@pytest.mark.slow  # tests/workers/executors/test_ray_cluster.py refuses them without Ray
 def test_more_workers_than_the_cluster_has_are_refused(whole, tmp_path):
     code, errors = finish(start(whole[0], tmp_path / "out", "ray", 10_000, **RUN))
     assert code != 0
