@@ -130,6 +130,7 @@ def test_the_recipe_of_the_docs_repeats_a_build_also_with_the_longest_answer(ser
     assert [row["status"] for row in first] == ["done", "done"]
 
 
+@pytest.mark.slow  # a build for a table that no build writes
 def test_a_figure_that_is_none_is_told_and_never_printed_as_json(server, request_of, monkeypatch, capsys):
     monkeypatch.setenv("JUDGE_KEY", KEY)
     server.say(chat(answer()))

@@ -106,7 +106,8 @@ def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(store, tmp_path)
 def test_a_second_driver_is_refused_by_name_while_the_first_lives(whole, store):
     with create_writer_lock(store / ".work" / "lock"), pytest.raises(BuildError, match="is being written by process"):
         build_in(whole[0], store)
-    build_in(whole[0], store)
+    with create_writer_lock(store / ".work" / "lock"):
+        pass  # it is free again
 
 
 def test_a_driver_that_lost_its_lease_writes_nothing_more(whole, store, proxy, monkeypatch):
@@ -173,6 +174,7 @@ def test_a_kill_between_any_two_writes_of_a_commit_is_repaired(whole, store, mon
     assert digests_in(store) == before
 
 
+@pytest.mark.slow  # test_commands.py does it on the disk, test_again_in_store.py begins again here
 def test_retry_computes_the_failed_scene_alone(whole, store):
     manifest, out = whole
     build_in(manifest, store)
@@ -183,6 +185,7 @@ def test_retry_computes_the_failed_scene_alone(whole, store):
     assert digests_in(store) == digests(out)
 
 
+@pytest.mark.slow  # a build under hundreds of faults; tests/core/storage has each kind
 def test_errors_lost_answers_and_cut_bodies_now_and_then_change_nothing(whole, store, proxy):
     manifest, out = whole
     rng = random.Random(3)

@@ -101,6 +101,7 @@ def test_a_dataset_whose_tables_cannot_be_listed_is_not_an_empty_one(store, prox
         open_dataset(str(store))
 
 
+@pytest.mark.slow  # tests above hold what a store's silence means
 def test_an_actor_whose_store_does_not_answer_is_lost_and_the_build_goes_on(store, proxy, impatient, tmp_path):
     proxy.fault = lambda method, path: "denied"
     records = str(tmp_path / "records")
