@@ -43,7 +43,7 @@ def started(source, stop=signal.SIGTERM):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("stop", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_it_prints_its_address_answers_and_ends_cleanly(tmp_path, dataset, stop):
     source = dataset
     if stop == signal.SIGTERM:

@@ -79,6 +79,7 @@ def test_a_table_that_cannot_be_read_fails_the_dataset(dataset, tmp_path, run, t
     assert "delete the file of that name in scenes/" in err
 
 
+@pytest.mark.slow  # tests/cli/test_exit_codes.py stops commands
 def test_a_stop_is_said_by_the_parent_alone(dataset) -> None:
     command = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()", "verify", str(dataset)]
     process = subprocess.Popen([*command, "--jobs", "2"], stderr=subprocess.PIPE, text=True, start_new_session=True)

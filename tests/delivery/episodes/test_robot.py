@@ -77,6 +77,7 @@ def test_no_export_and_no_gallery_opens_the_file_that_arrays_name(tmp_path, fifo
     assert sorted(path.name for path in tmp_path.iterdir()) == ["arm.xml", "out"]
 
 
+@pytest.mark.slow  # every command with an arm of a file
 @pytest.mark.heavy
 def test_the_arm_of_a_file_is_given_again_to_every_command(tmp_path, run):
     spec = load_arm("panda").spec()

@@ -131,6 +131,7 @@ def test_an_id_that_leaves_the_folder_is_refused(out, tmp_path):
         extract_scenes(str(out), tmp_path / "scenes")
 
 
+@pytest.mark.slow  # builds are killed in the fast run
 @pytest.mark.heavy
 def test_killed_and_run_again_it_has_every_scene_once(out, tmp_path):
     dest = tmp_path / "scenes"

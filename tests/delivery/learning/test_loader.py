@@ -23,7 +23,9 @@ def loaded(dataset, workers, context=None):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(("workers", "context"), [(0, None), (1, "fork"), (3, "fork"), (2, "spawn")])
+@pytest.mark.parametrize(
+    ("workers", "context"), [(0, None), (1, "fork"), (3, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]
+)
 def test_every_scene_comes_once_and_in_the_same_order_again(out, workers, context):
     dataset = SceneDataset(SceneStream(out, ("photograph", "poses", "motions"), columns=("licence",), seed=1))
     items = loaded(dataset, workers, context)

@@ -14,6 +14,7 @@ def out(tmp_path_factory):
     return two_scenes(tmp_path_factory.mktemp("cameras") / "out")
 
 
+@pytest.mark.slow  # figures of a bench
 def test_every_set_is_measured_at_every_size(run, out):
     small = ("--size", "32x24", "--size", "16x16", "--episodes", 2, "--frames", 3)
     code, said, _ = run("bench", "cameras", out, *small, "--json")

@@ -9,6 +9,7 @@ from tableverse_factory.evaluation.bench.placement import bench_placement
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
 
+@pytest.mark.slow  # figures of a bench, of real captures
 @pytest.mark.heavy
 @pytest.mark.shared
 def test_objects_of_real_captures_are_found_without_weights(shared_dir):

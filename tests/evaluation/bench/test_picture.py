@@ -119,6 +119,7 @@ def test_a_folder_without_other_pictures_is_refused(tmp_path, run) -> None:
     assert "notes.txt" in errors
 
 
+@pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 def test_a_capture_that_cannot_be_read_costs_its_own_row(tmp_path, run) -> None:
     good, bad = synthesize_captures(tmp_path / "captures", 2, 5)

@@ -12,6 +12,7 @@ from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 WAY = ("replay", "replay")
 
 
+@pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 def test_a_true_mesh_is_placed_where_and_as_large_as_it_is(tmp_path: Path) -> None:
     (capture,) = synthesize_captures(tmp_path, 1, seed=3)

@@ -225,7 +225,7 @@ print("over", flush=True)
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("serves", [False, True])
+@pytest.mark.parametrize("serves", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_ctrl_c_ends_a_served_policy_without_a_word_also_while_it_is_made(serves):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

@@ -78,6 +78,7 @@ def run(benchmark, dataset, policy, out, **settings):
     return run_benchmark(benchmark, dataset, policy, out, RunSettings(**settings))[1]
 
 
+@pytest.mark.slow  # the test below adds to a run; builds are killed in the fast run
 def test_a_killed_run_goes_on_and_the_number_of_processes_is_not_seen(benchmark, dataset, policies, tmp_path):
     alone, killed = tmp_path / "alone.jsonl", tmp_path / "killed.jsonl"
     name = PolicyName(f"{policies}:Slow")

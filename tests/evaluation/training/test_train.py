@@ -85,6 +85,7 @@ def learnt(views: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple
     return train_network(views, tmp_path_factory.mktemp("learnt"), settings, CPU, told.append), told
 
 
+@pytest.mark.slow  # many steps; tests/evaluation/training/policy learns in the fast run
 @pytest.mark.heavy
 def test_it_learns(learnt: tuple[object, list[TrainProgress]]) -> None:
     first, last = learnt[1][:6], learnt[1][-6:]

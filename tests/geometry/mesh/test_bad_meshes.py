@@ -37,7 +37,9 @@ def ended(bad: BadMesh, mesh: TriangleMesh, cache: Path) -> str:
     return pieces.repaired
 
 
-@pytest.mark.parametrize("name", BAD_MESHES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "needles" else []) for name in BAD_MESHES]
+)
 def test_a_bad_mesh_is_repaired_or_refused(name: str, tmp_path: Path) -> None:
     bad = BAD_MESHES[name]
     assert ended(bad, bad.make(), tmp_path) in (bad.ends if name not in REFUSED_FOR_THEIR_SIZE else {""})

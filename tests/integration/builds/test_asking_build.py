@@ -144,7 +144,9 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
     assert sum_costs(copy.out) == NO_COST
 
 
-@pytest.mark.parametrize(("death", "calls"), [("SIGSEGV", 2), pytest.param("SIGKILL", MAX_KILLS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("death", "calls"), [("SIGSEGV", 2), pytest.param("SIGKILL", MAX_KILLS, marks=pytest.mark.slow)]
+)
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
     request = replace(
         asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.crashing_pipeline:PIPELINES"

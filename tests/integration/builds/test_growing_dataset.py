@@ -79,7 +79,9 @@ def test_what_is_done_can_be_read_after_any_stop(tmp_path, how):
         assert "scene.xml" in growing.scene(scene_id).files()
 
 
-@pytest.mark.parametrize("damage", ["torn", *(pytest.param(damage, marks=pytest.mark.slow) for damage in ("flipped", "gone"))])
+@pytest.mark.parametrize(
+    "damage", ["torn", *(pytest.param(damage, marks=pytest.mark.slow) for damage in ("flipped", "gone"))]
+)
 def test_parts_that_a_loss_of_power_took_are_named_and_made_again(whole, tmp_path, damage, run):
     manifest, finished = whole
     out = tmp_path / "out"

@@ -42,6 +42,7 @@ def rewrite_dataset(out: Path, done: dict[str, dict[str, bytes]]) -> None:
     write_dataset(out, done, [])
 
 
+@pytest.mark.slow  # the test below stops it in the middle, and it goes on
 def test_a_killed_report_goes_on(tmp_path):
     out = write_dataset(tmp_path / "out", photographs("a", "b", "c"), [])
     whole = write_gallery(open_dataset(out), tmp_path / "whole", jobs=1).parent
@@ -83,7 +84,7 @@ def test_what_is_drawn_so_far_can_be_seen(tmp_path):
     assert "Drawn so far" not in Page(site / "index.html").text
 
 
-@pytest.mark.parametrize("renders", [None, 1])
+@pytest.mark.parametrize("renders", [pytest.param(None, marks=pytest.mark.slow), 1])
 def test_a_second_report_draws_nothing(tmp_path, renders):
     source = two_scenes(tmp_path / "out")
     site = write_gallery(open_dataset(source), tmp_path / "site", renders=renders, films=1).parent
@@ -109,6 +110,7 @@ def test_only_new_and_changed_scenes_are_drawn_and_others_go(tmp_path):
     assert not [name for name in after if "gone" in name or "pictures/b" in name]
 
 
+@pytest.mark.slow  # three galleries with all renders
 def test_other_options_draw_what_they_change(tmp_path):
     out = write_dataset(tmp_path / "out", photographs("a", "b"), [])
     site = write_gallery(open_dataset(out), tmp_path / "site").parent
@@ -120,7 +122,10 @@ def test_other_options_draw_what_they_change(tmp_path):
     assert not (site / "pictures" / "b-twin.jpg").exists()
 
 
-@pytest.mark.parametrize("damage", ["no json", "[]", "[" * 5000, '{"options": 3}', None])
+@pytest.mark.parametrize(
+    "damage",
+    ["no json", *(pytest.param(text, marks=pytest.mark.slow) for text in ("[]", "[" * 5000, '{"options": 3}')), None],
+)
 def test_a_drawing_that_is_damaged_or_lacks_a_picture_is_drawn_again(tmp_path, damage):
     out = write_dataset(tmp_path / "out", photographs("a"), [])
     site = write_gallery(open_dataset(out), tmp_path / "site", renders=0).parent

@@ -59,6 +59,7 @@ def train_thin(settings: PictureSettings, run: TrainRun, ranks: Ranks) -> int:
     return train_module._train_rank(settings, run, ranks)
 
 
+@pytest.mark.slow  # four trainings in two processes each
 @pytest.mark.usefixtures("thin")
 def test_two_processes_in_parts_give_the_weights_of_one_go(pool_file: Path, tmp_path: Path) -> None:
     settings = PictureSettings(2, **SMALL | {"fresh": 40.0}, gpus=2)

@@ -58,18 +58,20 @@ def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(pool_fil
     before = (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns
     train(tmp_path / "parts", pool_file)
     assert (tmp_path / "parts" / CHECKPOINT).stat().st_mtime_ns == before, "nothing is left to do"
-    train(tmp_path / "other", pool_file, replace(SETTINGS, seed=1))
-    with pytest.raises(AssertionError):
-        assert_same(tmp_path / "whole", tmp_path / "other")
 
 
+@pytest.mark.slow  # three trainings; the test above holds same weights, test_scenes.py same scenes
 def test_processes_that_make_scenes_change_no_weight(pool_file: Path, tmp_path: Path) -> None:
     for jobs in (0, 1, 2):
         train(tmp_path / str(jobs), pool_file, jobs=jobs)
     assert_same(tmp_path / "0", tmp_path / "1")
     assert_same(tmp_path / "0", tmp_path / "2")
+    train(tmp_path / "other", pool_file, replace(SETTINGS, seed=1))
+    with pytest.raises(AssertionError):
+        assert_same(tmp_path / "0", tmp_path / "other")
 
 
+@pytest.mark.slow  # forty steps; tests/evaluation/training/policy learns in the fast run
 def test_it_learns(pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train_module, "LOG_STEPS", 1)
     settings = replace(SETTINGS, steps=40, batch=4, first=16, fresh=0.0)
@@ -103,6 +105,7 @@ def test_checkpoints_of_other_settings_or_another_network_or_of_nothing_are_refu
                 train(tmp_path, pool_file) if name == CHECKPOINT else read_weights(tmp_path / WEIGHTS, make_network(0))
 
 
+@pytest.mark.slow  # the test above refuses other settings by the same check
 def test_a_checkpoint_is_continued_with_the_meshes_that_it_knows(
     pool: MeshPool, pool_file: Path, tmp_path: Path
 ) -> None:
@@ -123,6 +126,7 @@ def test_weights_are_the_averages_in_half_precision(pool_file: Path, tmp_path: P
     assert (tmp_path / WEIGHTS).stat().st_size < 2.2 * sum(p.numel() for p in network.parameters())
 
 
+@pytest.mark.slow  # two trainings
 def test_a_training_starts_from_the_weights_of_another_and_continues_from_no_others(
     pool_file: Path, tmp_path: Path
 ) -> None:
@@ -156,6 +160,7 @@ def test_held_out_views_are_measured_at_a_checkpoint(
         assert all(0 <= each[name] <= 1 for name in ("covered", "things", "table"))
 
 
+@pytest.mark.slow  # three trainings
 def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(pool_file: Path, tmp_path: Path) -> None:
     wild = replace(SETTINGS, rate=1e30)
     train(tmp_path, pool_file, wild, minutes=0.0)
@@ -183,6 +188,7 @@ def test_the_rate_rises_stays_and_falls() -> None:
     assert sizes == [(320, 240), (320, 240), (384, 288), (384, 288)]
 
 
+@pytest.mark.slow  # tests/evaluation/training/test_train.py runs the command
 def test_the_command_trains_exports_and_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     small = {name: SMALL[name] for name in ("width", "height", "packages", "patterns", "flat", "fresh")}
     where = "tableverse_factory.evaluation.training.picture.settings.PictureSettings"

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.heavy
 NEVER_DRAWN = 7_000_000  # numbers of tables from which on no training has seen them
 
 
+@pytest.mark.slow  # how good weights are; test_baselines.py runs them
 def test_they_mark_what_is_named_on_tables_that_no_training_saw() -> None:
     views = [(take_synthetic_view(NEVER_DRAWN + k, "panda"), True) for k in range(4)]
     shown = PictureTensors(join_views("panda", views), "cpu")

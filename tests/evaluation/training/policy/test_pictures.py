@@ -194,6 +194,7 @@ def test_damaged_pictures_are_told(pictures: Path) -> None:
         replace(packed, files=files).decode()
 
 
+@pytest.mark.slow  # a training; test_train.py learns in the fast run
 def test_sight_and_goals_are_learnt_and_motions_stay(
     packed: Path, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,6 +218,7 @@ def test_sight_and_goals_are_learnt_and_motions_stay(
     PicturePolicy(tmp_path / "whole" / WEIGHTS)
 
 
+@pytest.mark.slow  # three trainings; tests/evaluation/training/test_train.py runs the command
 def test_the_command_packs_trains_and_continues(
     dataset: Dataset, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
