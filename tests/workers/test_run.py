@@ -194,7 +194,7 @@ def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(tmp_path):
     assert digests(tmp_path / "out") == digests(tmp_path / "whole")
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("name", "code"), [pytest.param("SIGINT", 130, marks=pytest.mark.slow), ("SIGTERM", 143)])
 def test_a_signal_stops_within_three_seconds_and_the_same_command_goes_on(tmp_path, name, code):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "slow_2", "fine"])
     process = start(manifest, tmp_path / "out")

@@ -203,6 +203,7 @@ def test_a_build_from_the_command_line_with_stages_and_from_that_stage_again(cop
     assert digests(copy / "told") == digests(copy / "long")
 
 
+@pytest.mark.slow  # tests/stages/trajectories has the stage, test_poison.py the build
 def test_a_planner_that_crashes_or_hangs_costs_no_scene(tmp_path, marks):
     names = ["fine", "crash_plan", "hang_plan", "crash_plan_once", "drop_plan"]
     write_manifest(tmp_path / "m.parquet", names)
@@ -220,6 +221,7 @@ def test_a_planner_that_crashes_or_hangs_costs_no_scene(tmp_path, marks):
     assert run_build(asked, Silent()).tally.before == 5
 
 
+@pytest.mark.slow  # the test below stops where a model dies, and goes on
 def test_a_model_that_does_not_answer_leaves_scenes_for_a_later_run(tmp_path, marks, monkeypatch):
     write_manifest(tmp_path / "m.parquet", ["fine", "mute_plan", "fine", "empty"])
     asked = long(tmp_path, "out")

@@ -222,7 +222,16 @@ def test_an_empty_dataset_has_a_gallery_that_says_so(tmp_path):
     assert "No shard of this dataset is committed yet" in index.read_text()
 
 
-@pytest.mark.parametrize("meta", [b"{}", b"[]", b'{"assessment": [], "left_out": 3}', b"\xff", b"{" * 5000])
+@pytest.mark.parametrize(
+    "meta",
+    [
+        b"{}",
+        *(
+            pytest.param(meta, marks=pytest.mark.slow)
+            for meta in (b"[]", b'{"assessment": [], "left_out": 3}', b"\xff", b"{" * 5000)
+        ),
+    ],
+)
 def test_a_damaged_meta_costs_the_pictures_of_one_scene(tmp_path, meta):
     members = {**scene_members("scene", photographed=False), "meta.json": meta}
     out = write_dataset(tmp_path / "out", {"scene": members}, [])
