@@ -116,6 +116,7 @@ def test_five_hundred_tasks_over_a_hundred_tables(tmp_path):
     assert sum(relations >= 3 for _, relations, _ in found) >= 95
 
 
+@pytest.mark.slow  # the tests above hold the constraints on other tables
 @pytest.mark.shared
 def test_tasks_of_scanned_clutter_hold_every_constraint(shared_dir, tmp_path):
     for number in (0,):

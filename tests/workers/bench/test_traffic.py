@@ -73,6 +73,7 @@ def test_files_and_both_ends_of_sockets_count():
     assert 0 <= nothing < 20_000, "what was counted stays when connections end"
 
 
+@pytest.mark.slow  # starts Ray, for a figure of a bench
 def test_what_goes_to_ray_and_comes_back_counts_but_not_what_passes_by():
     small, large, referred = _measure(ON_RAY)
     assert small == pytest.approx(2 * 20 * 50_000, rel=0.05), "sent with the call"
