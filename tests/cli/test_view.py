@@ -90,6 +90,7 @@ def test_mistakes_are_told_in_one_line(dataset, run, arguments, said):
     assert complained.count("\n") == 2, "the error, and where to read on"
 
 
+@pytest.mark.slow  # a process more
 @pytest.mark.heavy
 def test_a_damaged_scene_is_skipped_in_one_line(tmp_path, dataset):
     out = tmp_path / "out"

@@ -61,6 +61,7 @@ def test_what_was_built_again_is_opened_again(tmp_path) -> None:
         assert all("drift_m" in audit.measured for audit in found), "a scene was not there"
 
 
+@pytest.mark.slow  # verifies a dataset once more
 def test_a_damaged_table_of_trajectories_costs_its_scenes_alone(dataset, tmp_path, run) -> None:
     out = shutil.copytree(dataset, tmp_path / "out")
     (out / "trajectories" / "shard-00001.parquet").write_bytes(b"PAR1 no more")

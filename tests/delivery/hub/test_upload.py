@@ -89,6 +89,7 @@ def test_again_sends_nothing(hub, dataset, run):
     assert (dict(hub.put), len(hub.repositories[NAME].commits)) == (puts, commits)
 
 
+@pytest.mark.slow  # builds are killed in the fast run
 @pytest.mark.heavy
 def test_killed_in_the_middle_it_goes_on_with_what_is_missing(hub, tmp_path):
     """A real process, and a real kill -9 while a file is under way in the second commit of shards."""

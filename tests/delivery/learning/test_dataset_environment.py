@@ -34,6 +34,7 @@ def test_scenes_of_one_picture_share_a_split_and_the_shares_are_kept():
     assert len({find_split(f"{name}-0123456789ab") for name in ("cup", "mug-2", "0")}) == 1
 
 
+@pytest.mark.slow  # test_environment.py asks a checker
 def test_both_checkers_of_gymnasium_are_content(out):
     env = gymnasium.make(ID, dataset=str(out), **PICTURES, render_mode="rgb_array", render_size=(48, 64))
     check_env(env.unwrapped)
@@ -87,6 +88,7 @@ def test_vectorised_by_its_name(out, mode):
     assert set(info["scene_id"]) <= {"s-0", "s-1"}
 
 
+@pytest.mark.slow  # test_environment.py starts such a process
 def test_the_name_is_enough_for_a_process_that_imports_gymnasium_alone(out):
     code = "import sys, gymnasium; print(gymnasium.make(sys.argv[1], dataset=sys.argv[2]).reset(seed=0)[1]['task_id'])"
     done = subprocess.run([sys.executable, "-c", code, ID, str(out)], capture_output=True, text=True, check=False)

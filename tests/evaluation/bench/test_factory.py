@@ -60,6 +60,7 @@ def test_ratios_leave_out_what_is_done_once():
     assert all(math.isnan(value) for value in (compare_runs(runs[:2]).ray_ms, compare_runs(runs[:2]).speed_up))
 
 
+@pytest.mark.slow  # figures of a bench
 def test_a_build_is_measured_from_outside(tmp_path):
     run = _run_once("local", 1, 70, NOOP, tmp_path, payload=0)
     assert run.scenes == 70
@@ -93,6 +94,7 @@ def test_the_meter_counts_the_cpu_of_children_and_says_what_failed():
         measure_command([sys.executable, "-c", "raise SystemExit('no such thing')"], {}, str)
 
 
+@pytest.mark.slow  # figures of a bench
 def test_the_dataset_written_for_queries_is_one_and_is_measured(tmp_path):
     assert write_query_dataset(tmp_path / "out", 130, 64) == 3
     write_query_dataset(tmp_path / "again", 130, 64)

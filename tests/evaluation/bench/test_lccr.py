@@ -206,6 +206,7 @@ def bowl_of_balls(folder: Path) -> Path:
     return folder / "bowl.json"
 
 
+@pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 def test_every_method_starts_from_filled_containers_and_copies_count_only_where_they_can(bowl_of_balls: Path) -> None:
     config, cache = Config(), bowl_of_balls.parent.parent / "cache"

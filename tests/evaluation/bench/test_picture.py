@@ -76,6 +76,7 @@ def test_the_summary_counts_what_was_dropped_and_averages_the_rest() -> None:
     assert total.scale_error == pytest.approx((abs(math.expm1(-0.1)) + math.expm1(0.3)) / 2)
 
 
+@pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 @pytest.mark.shared
 def test_the_table_of_a_real_capture(tmp_path, run, shared_dir) -> None:
@@ -106,6 +107,7 @@ def test_a_folder_without_captures_is_refused(tmp_path, run) -> None:
     assert "camera.json" in errors
 
 
+@pytest.mark.slow  # measures a picture first
 @pytest.mark.heavy
 def test_a_folder_without_other_pictures_is_refused(tmp_path, run) -> None:
     synthesize_captures(tmp_path / "captures", 1, 0)

@@ -100,6 +100,7 @@ def test_lost_and_unknown_scenes_are_named(tmp_path):
     assert line.startswith(f"lost, {ids[0]}:")
 
 
+@pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 def test_a_build_that_fails_by_itself_ends_the_test_with_its_own_words(tmp_path):
     plan = soak.SoakPlan(tmp_path, 3, 1, 1.0, 5.0, 0)

@@ -19,6 +19,7 @@ def scenes(dataset):
     return dataset.scene("s-0"), dataset.scene("s-1")
 
 
+@pytest.mark.slow  # compares scenes of all episodes
 def test_the_scene_stays_and_the_object_is_that_of_its_own_scene(scenes):
     scene, donor = scenes
     before, theirs = scene.model(), donor.model()

@@ -14,6 +14,7 @@ def choose(benchmark, *names):
     return [episode for episode in benchmark.episodes if episode.episode_id in names]
 
 
+@pytest.mark.slow  # plans and plays three times
 def test_the_planner_succeeds_where_the_trajectory_did_also_from_a_moved_start_and_in_clutter(benchmark, dataset):
     planner = load_policy(PolicyName("planner"))
     for episode in choose(benchmark, "test_0000", "test_0000_start", "test_0000_clutter"):

@@ -93,6 +93,7 @@ def test_it_learns(learnt: tuple[object, list[TrainProgress]]) -> None:
     assert sum(p.offset_m for p in last) < 0.85 * sum(p.offset_m for p in first)
 
 
+@pytest.mark.slow  # a training
 @pytest.mark.heavy
 def test_what_seconds_of_training_find_are_things(
     learnt: tuple[object, list[TrainProgress]], scene: list[TrainingView], tmp_path: Path

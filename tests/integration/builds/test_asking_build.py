@@ -178,6 +178,7 @@ def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(s
     assert "answers of the detector's model: 2 calls, 1800 tokens read, 80 written" in words
 
 
+@pytest.mark.slow  # real retries wait; tests/models/remote counts them too
 def test_retries_silence_repairs_and_lost_scenes_count_too(server, asking):
     said = {
         "perceive busy": [Scripted(status=503), chat('{"a": 1}')],

@@ -84,6 +84,7 @@ def check(rows: dict[str, dict[str, Any]], name: str) -> None:
         assert row["repaired"] in BAD_MESHES[name].ends
 
 
+@pytest.mark.slow  # tests/geometry/mesh has the meshes, test_real_line.py a build with one
 def test_some_bad_meshes_through_a_build(tmp_path: Path) -> None:
     rows = build(write_layouts(tmp_path, {name: BAD_MESHES[name].make() for name in SOME}), Config())
     for name in SOME:

@@ -47,7 +47,7 @@ def small_disk(tmp_path):
 @pytest.mark.parametrize(
     ("executor", "kilobytes"),
     [
-        ("local", 100),
+        pytest.param("local", 100, marks=pytest.mark.slow),  # the test below meets a limit by the same code
         pytest.param("local", 400, marks=pytest.mark.slow),
         pytest.param("local", 900, marks=pytest.mark.slow),
         pytest.param("ray", 500, marks=pytest.mark.slow),

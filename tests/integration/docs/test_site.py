@@ -65,6 +65,7 @@ def site(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow  # builds the site, as `make docs` does
 def test_the_site_loads_nothing_from_other_hosts(site: Path) -> None:
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 15

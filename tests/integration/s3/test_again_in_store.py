@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 from tableverse_factory.core.storage.files import list_names
 from tests.helpers.builds import Silent, build, digests, request, write_manifest
 from tests.helpers.store_contents import digests_in
@@ -12,6 +14,7 @@ from workers.state.checkpoint_store import CHECKPOINTS
 WHOLE_TIMES = {"deadline_s": 60.0}
 
 
+@pytest.mark.slow  # test_again_stopped.py does it on the disk
 def test_a_stopped_beginning_again_goes_on(store, tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "sad", "fine", "fine", "fine"])
     build(manifest, tmp_path / "out", **WHOLE_TIMES)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tableverse_factory.core.storage.files import get_store
 from tests.helpers.builds import Silent, request, write_manifest
@@ -12,6 +13,7 @@ from workers.run import run_build
 POOL_OF = {"look": "perception", "cut": "geometry", "fall": "physics", "pack": "curation"}
 
 
+@pytest.mark.slow  # tests/workers/progress measures on the disk
 def test_the_same_of_a_dataset_in_a_store(store, tmp_path):
     """Two shards, one of them open: its results are read from the segments of its journal."""
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "empty", "fell", "sad"] * 2)

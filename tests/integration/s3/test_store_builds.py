@@ -68,6 +68,7 @@ def test_the_same_bytes_as_on_the_disk_also_with_the_manifest_in_the_store(whole
     assert BuildFollower(store / "out").read_tally().committed == found.shards == 2
 
 
+@pytest.mark.slow  # tests/workers/test_run.py does it on the disk
 def test_a_second_run_changes_nothing_and_another_build_is_refused(whole, store, proxy):
     manifest, _ = whole
     build_in(manifest, store)
@@ -214,7 +215,7 @@ def test_a_silent_store_is_asked_again(whole, store, proxy):
 @pytest.mark.parametrize(
     ("fault", "why"),
     [
-        ("error", "the store answers (InternalError|500)"),
+        pytest.param("error", "the store answers (InternalError|500)", marks=pytest.mark.slow),
         pytest.param("refused", "the store does not answer", marks=pytest.mark.slow),
         pytest.param("silent", "the store does not answer", marks=pytest.mark.slow),
     ],

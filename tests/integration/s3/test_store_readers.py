@@ -87,6 +87,7 @@ def test_a_store_that_fails_makes_no_rows(store, proxy, tmp_path, monkeypatch):
         make_manifest([f"{store}/nothing"], ObserveConfig())
 
 
+@pytest.mark.slow  # test_commands.py does it on the disk
 def test_status_failures_and_export_of_a_build_in_a_store(store, run, tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["fine", "sad", "fell", "fine", "fine"])
     run_build(replace(request(manifest, tmp_path / "x", deadline_s=60.0), out=store / "out"), Silent())

@@ -193,6 +193,7 @@ def test_a_prediction_is_remembered_for_this_picture_and_camera_alone() -> None:
     assert predict(spotted) is not again
 
 
+@pytest.mark.slow  # two predictions
 @pytest.mark.heavy
 def test_the_depth_of_a_sensor_is_another_question() -> None:
     seen = look(THINGS, floor_z=-0.7, wall_y=1.5)[0]

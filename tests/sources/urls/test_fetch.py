@@ -426,6 +426,7 @@ def test_a_long_list_costs_little(tmp_path):
     assert time.process_time() - began < 2
 
 
+@pytest.mark.slow  # builds are killed in the fast run
 @pytest.mark.heavy
 def test_killed_and_run_again_fetches_only_the_rest(pictures, tmp_path):
     """Half of the pictures never come in the first run, which is killed while it waits for them."""

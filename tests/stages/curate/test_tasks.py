@@ -68,12 +68,12 @@ def judge_and_referee(scene: SettledScene, tmp_path) -> tuple[int, int, list[str
 
 def test_tasks_of_random_tables_hold_every_constraint(tmp_path):
     total = 0
-    for seed in range(8):
+    for seed in range(4):
         tasks, relations, found = judge_and_referee(random_scene(seed), tmp_path)
         assert not found
         assert relations >= min(3, tasks)
         total += tasks
-    assert total > 80
+    assert total > 40
 
 
 def synthetic_scene(number: int) -> SettledScene:

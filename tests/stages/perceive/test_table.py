@@ -196,6 +196,7 @@ def errors(observation, camera, scale):
 FLOORS = [(0.8, 0.9, 40.0, -0.45), (1.0, 1.1, 40.0, -0.72), (0.9, 1.3, 35.0, -0.72), (1.2, 1.0, 50.0, -0.7)]
 
 
+@pytest.mark.slow  # many bends
 def test_gravity_of_a_bent_picture_is_that_of_table_and_floor_together():
     angles = []
     for height, distance, pitch, floor in FLOORS:

@@ -292,6 +292,7 @@ def test_an_untouched_record_survives_the_codec() -> None:
     assert isinstance(decode(encode(seen(box(0.06, 0.05, 0.1)))).objects[0], PerceivedObject)
 
 
+@pytest.mark.slow  # six seconds for one shape
 def test_a_can_whose_middle_a_spoon_hides_is_round(tmp_path: Path) -> None:
     capture = synthesize_captures(tmp_path / "in", 2, seed=7)[1]
     value: Any = make_manifest([str(capture)], Config().observe).rows[0]

@@ -113,6 +113,7 @@ def test_what_is_left_out_takes_its_pixels_along_and_frees_its_contents(tmp_path
     assert layout.poses[1].position[2] == pytest.approx(0.02, abs=0.002)
 
 
+@pytest.mark.slow  # test_relaxation.py has a heap
 @pytest.mark.heavy
 def test_many_objects_in_one_place_end_free(tmp_path: Path) -> None:
     items = [placed(f"obj_{k:03d}", box(0.05, 0.05, 0.05 + 0.001 * k), (0, 0, 0), 0.1 * k) for k in range(12)]
@@ -127,7 +128,7 @@ def colliding(score: LayoutScore) -> tuple[int, int]:
 
 @pytest.mark.heavy
 @pytest.mark.shared
-@pytest.mark.parametrize("method", ["LCCR", "joint"])
+@pytest.mark.parametrize("method", [pytest.param("LCCR", marks=pytest.mark.slow), "joint"])
 def test_a_real_layout_ends_free_on_pieces_and_on_meshes(shared_dir: Path, tmp_path: Path, method: str) -> None:
     folder = shared_dir / "layouts"
     scores = bench_lccr([folder / "clutter_051.json"], folder / "truth", Config(), tmp_path, ("Direct", method))

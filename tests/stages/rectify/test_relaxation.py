@@ -32,7 +32,7 @@ def heap(count: int) -> list[PlacedObject]:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(("count", "method"), [(10, "joint"), (80, "radial")])
+@pytest.mark.parametrize(("count", "method"), [(10, "joint"), pytest.param(80, "radial", marks=pytest.mark.slow)])
 def test_many_things_in_one_place_end_free_and_it_is_told_how(count: int, method: str) -> None:
     result = rectify_jointly([part(item) for item in heap(count)], CONFIG)
     assert result.method == method

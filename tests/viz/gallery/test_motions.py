@@ -109,6 +109,7 @@ def test_films_can_be_left_out(out, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow  # a gallery more
 def test_a_page_without_films_does_not_speak_of_them(out, tmp_path, scene):
     page = write_gallery(open_dataset(out), tmp_path / "gallery", renders=1, films=0).parent / "scenes" / "both.html"
     assert "Press one to play it." in " ".join(scene.text.split())

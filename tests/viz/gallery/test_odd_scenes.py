@@ -112,7 +112,7 @@ def test_a_page_that_cannot_be_made_says_so_in_its_place(tmp_path):
     assert "tableverse view out scene" in page
 
 
-@pytest.mark.parametrize("unseen", ["obj_000", "obj_001"])
+@pytest.mark.parametrize("unseen", ["obj_000", pytest.param("obj_001", marks=pytest.mark.slow)])
 def test_an_object_that_the_picture_did_not_show_is_not_in_the_view_before(tmp_path, unseen):
     """One of several alike, counted and not seen by itself: its scene keeps its pictures."""
     members = scene_members("alike", photographed=False)

@@ -84,7 +84,7 @@ def test_what_is_drawn_so_far_can_be_seen(tmp_path):
     assert "Drawn so far" not in Page(site / "index.html").text
 
 
-@pytest.mark.parametrize("renders", [pytest.param(None, marks=pytest.mark.slow), 1])
+@pytest.mark.parametrize("renders", [*(pytest.param(n, marks=pytest.mark.slow) for n in (None, 1)), 0])
 def test_a_second_report_draws_nothing(tmp_path, renders):
     source = two_scenes(tmp_path / "out")
     site = write_gallery(open_dataset(source), tmp_path / "site", renders=renders, films=1).parent

@@ -86,6 +86,7 @@ def differs(page, before: np.ndarray, share: float = 0.004) -> bool:
     return bool((np.abs(canvas(page) - before).max(axis=2) > 24).mean() > share)
 
 
+@pytest.mark.slow  # draws without a GPU; test_session.py and test_panel_parts.py hold the controls
 @pytest.mark.heavy
 def test_a_scene_is_seen_as_the_controls_say_and_texts_stay_texts(small, viewer, screenshots):
     visit(small, viewer.url)

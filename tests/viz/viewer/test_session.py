@@ -35,6 +35,7 @@ def goes_on(session: Session) -> bool:
     return until(lambda: session.simulated_s > then + 0.1, 30.0)
 
 
+@pytest.mark.slow  # plays two motions
 @pytest.mark.heavy
 def test_another_task_may_be_chosen_while_one_plays(alone):
     browser, session = looker(alone)

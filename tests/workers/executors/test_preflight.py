@@ -94,6 +94,7 @@ def test_a_few_inputs_are_tried_from_first_to_last(n):
     assert not tried or int(tried[-1]) >= n - n // 8 - 1
 
 
+@pytest.mark.slow  # starts Ray; test_ray_build.py has a build that asks its node
 def test_a_real_node_is_asked(nodes, tmp_path):
     check_nodes(nodes, [str(tmp_path)], tmp_path)
     (found,) = probe_nodes(nodes, ["/nowhere/at/all"], tmp_path / "gone")

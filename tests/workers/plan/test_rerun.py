@@ -257,6 +257,7 @@ def _target(link: Path) -> str:
         return ""
 
 
+@pytest.mark.slow  # waits for deadlines; tests/workers/sandbox has them
 def test_deadlines_belong_to_their_stage(tmp_path):
     manifest = write_manifest(tmp_path / "m.parquet", ["slow_1", "fine"])
     asked = changed(

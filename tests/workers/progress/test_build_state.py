@@ -166,6 +166,7 @@ def test_journals_take_precedence_over_shards(tmp_path):
     assert few.scenes["status"].to_pylist() == half.scenes["status"].to_pylist()
 
 
+@pytest.mark.slow  # starts processes to read thousands of rows
 @pytest.mark.heavy
 def test_processes_read_what_one_process_reads(tmp_path, monkeypatch):
     manifest, out = write_manifest(tmp_path / "m.parquet", ["fine", "empty", "sad"] * 8), tmp_path / "out"

@@ -41,6 +41,7 @@ def test_a_failure_of_every_scene_does_not_bury_the_table():
     assert b"\x1b[31mTypeError" not in seen.raw
 
 
+@pytest.mark.slow  # a build for a line of the display
 def test_a_cold_start_is_seen_to_be_one():
     seen = watch([*PRETEND, "2.5", "well"])
     assert any("preparing, 2 s" in "\n".join(look) and "starting Ray" in "\n".join(look) for look in seen.looks)
@@ -93,6 +94,7 @@ def test_a_dumb_terminal_gets_lines_too():
     assert "220/400 scenes" in "\n".join(seen.screen)
 
 
+@pytest.mark.slow  # test_follow.py follows a build to its end
 def test_watching_ends_with_the_build_and_ctrl_c_is_clean(tmp_path):
     rows = [{"scene_id": f"s{i}", "kind": "capture", "uri": "/x", "rejected": "unreadable_color"} for i in range(70)]
     pq.write_table(pa.Table.from_pylist(rows), tmp_path / "m.parquet")

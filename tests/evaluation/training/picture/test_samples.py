@@ -37,7 +37,7 @@ def views(world: Any) -> Views:
     return ring.get(slice(0, 48))
 
 
-@pytest.mark.parametrize("size", [None, (80, 64), (96, 64)])
+@pytest.mark.parametrize("size", [pytest.param(None, marks=pytest.mark.slow), (80, 64), (96, 64)])
 def test_what_is_table_stays_on_its_plane_however_it_is_cropped(views: Views, size: tuple[int, int] | None) -> None:
     torch.manual_seed(3)
     sample = make_sample(views, augment=True, size=size)
@@ -133,6 +133,7 @@ def test_votes_lead_from_every_pixel_to_one_middle_of_its_thing(views: Views) ->
         assert set(edge.unique().tolist()) <= {0.0, 1.0}
 
 
+@pytest.mark.slow  # draws many views
 def test_flat_pictures_take_the_place_of_some_samples_without_a_sensor(views: Views, world: Any) -> None:
     torch.manual_seed(0)
     flat = torch.zeros(3, 3, 32, 32, dtype=torch.uint8)

@@ -34,6 +34,7 @@ def same(one: SceneTables, other: SceneTables) -> bool:
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in SceneTables.__slots__)
 
 
+@pytest.mark.slow  # makes a pool three times
 @pytest.mark.heavy
 def test_a_pool_is_the_same_from_any_number_of_processes_and_comes_back_from_its_file(
     pool: MeshPool, pool_file: Path

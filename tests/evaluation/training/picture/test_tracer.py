@@ -64,6 +64,7 @@ def cast(world: Any, pack: Any) -> Exposure:
     return CpuRenderer(world.tables, (WIDTH, HEIGHT)).render(pack)
 
 
+@pytest.mark.slow  # draws views twice
 def test_both_renderers_say_the_same_of_almost_every_pixel(traced: Exposure, cast: Exposure) -> None:
     assert {0, 1, 2, TABLE_TOP, TABLE_SIDE} <= {*np.unique(traced.ids)}
     same = traced.ids == cast.ids
@@ -89,6 +90,7 @@ def test_the_table_is_at_height_zero(traced: Exposure, pack: Any) -> None:
     assert np.median(np.abs(all_heights)) < 1e-4
 
 
+@pytest.mark.slow  # traces many rays
 def test_light_is_finite_the_same_again_and_its_mean_does_not_depend_on_the_number_of_rays(
     tracer: ctypes.CDLL, world: Any, pack: Any, traced: Exposure
 ) -> None:

@@ -47,6 +47,7 @@ def assert_same(one: Path, other: Path) -> None:
         assert torch.equal(tensor, second[name]), name
 
 
+@pytest.mark.slow  # four trainings; tests/evaluation/training/policy resumes in the fast run
 def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(pool_file: Path, tmp_path: Path) -> None:
     whole = train(tmp_path / "whole", pool_file)
     assert sum(" samples/s" in line for line in whole) == 1
@@ -143,6 +144,7 @@ def test_a_training_starts_from_the_weights_of_another_and_continues_from_no_oth
         train(second, pool_file, settings, start=second / WEIGHTS)
 
 
+@pytest.mark.slow  # forty views
 def test_held_out_views_are_measured_at_a_checkpoint(
     pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -61,6 +61,7 @@ def pictures(dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path
     return path
 
 
+@pytest.mark.slow  # draws many pictures
 def test_they_show_the_first_sample_and_name_its_objects(dataset: Dataset, pictures: Path) -> None:
     packed, scene = PackedPictures.read(pictures), dataset.scene("s-0")
     done = next(iter(scene.trajectories()))
@@ -97,6 +98,7 @@ def test_instructions_are_those_of_tasks() -> None:
     assert number_words("Pick up the mug!", 9).tolist() == number_words("pick up THE mug", 9).tolist()
 
 
+@pytest.mark.slow  # draws many pictures
 def test_synthetic_tables_show_what_is_named() -> None:
     view = take_synthetic_view(3, "panda")
     again = take_synthetic_view(3, "panda")

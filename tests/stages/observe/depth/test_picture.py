@@ -121,6 +121,7 @@ def test_the_coffee_cup_stands_on_a_table() -> None:
     assert (seen.camera.cx, seen.camera.cy) == (299.5, 199.5)
 
 
+@pytest.mark.slow  # two predictions, for one comparison
 @pytest.mark.heavy
 def test_the_least_probability_decides() -> None:
     taken = see(DATA / "rocket.jpg", min_table_probability=0.0)

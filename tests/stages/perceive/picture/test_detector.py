@@ -125,6 +125,7 @@ def test_weights_that_are_missing_stop_the_build_and_drop_no_picture(view: tuple
             see(view[0], **section)
 
 
+@pytest.mark.slow  # how good the net is, on several captures
 @pytest.mark.heavy
 def test_the_colour_of_synthetic_captures_shows_most_of_their_objects(tmp_path: Path) -> None:
     overlaps: list[float] = []

@@ -60,6 +60,14 @@ KNOWN = {
 }
 
 
+TYPICAL = ("across the table", "a4", "the height of the box")
+"""The fast run takes one of each kind where a case takes seconds."""
+
+
+def typical(names):
+    return [pytest.param(name, marks=[] if name in TYPICAL else [pytest.mark.slow]) for name in names]
+
+
 @cache
 def view():
     return look(THINGS, POSE)[0]
@@ -94,7 +102,7 @@ def test_a_known_length_brings_metres_back(name, factor):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", typical(KNOWN))
 def test_what_is_known_of_bent_depth_is_as_sure_as_it_says(name):
     """Over smooth bends of 1.2 %, the error stays within three of the stated deviations.
 
@@ -112,7 +120,7 @@ def test_what_is_known_of_bent_depth_is_as_sure_as_it_says(name):
 
 @pytest.mark.heavy
 @pytest.mark.parametrize("factor", [0.8, 1.3])
-@pytest.mark.parametrize("name", ["across the table", "the height of the box", "the camera's height"])
+@pytest.mark.parametrize("name", typical(["across the table", "the height of the box", "the camera's height"]))
 def test_scaling_depth_and_length_alike_scales_the_scene(name, factor):
     known = KNOWN[name]
     larger = known.model_copy(update={"length_m": factor * known.length_m})
@@ -133,7 +141,7 @@ def test_a_factor_beyond_its_bounds_is_dropped(name, factor):
     assert "outside 0.2 to 5" in detail
 
 
-@pytest.mark.parametrize("name", ["across the table", "a4", "the height of the box", "the camera's height"])
+@pytest.mark.parametrize("name", typical(["across the table", "a4", "the height of the box", "the camera's height"]))
 def test_a_known_length_says_how_far_it_is_from_what_was_estimated(name):
     """A depth 0.7 of the truth, stated to 15 %, is made larger by 2.4 deviations; what tells no deviation has none."""
     for factor in (0.7, 1.4):
@@ -142,7 +150,7 @@ def test_a_known_length_says_how_far_it_is_from_what_was_estimated(name):
     assert perceived(estimated(0.7, KNOWN[name])).value.observation.scale_deviation is None
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", typical(KNOWN))
 def test_a_sensor_that_agrees_is_left_as_it_is(name):
     item = estimated(1.03, KNOWN[name], scale_source="sensor")
     found = perceived(item).value.observation
@@ -217,6 +225,7 @@ def test_a_distance_on_any_plane_is_measured_as_it_is(x, y, offset_m, factor, en
     assert np.isfinite(found.sigma)
 
 
+@pytest.mark.slow  # forty random depths
 @settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 3.0))
 def test_any_depth_gives_a_finite_length_or_a_reason(seed, factor):

@@ -116,9 +116,9 @@ def test_one_process_serves_scene_after_scene_and_nothing_is_made_twice(make: Ma
     [
         ("crash", "exit code 1; it says: RuntimeError: the GPU is on fire"),
         ("hang", "silent for 0.5 s"),
-        ("drip", "silent for 0.5 s"),
-        ("half", "exit code 0"),
-        ("close", "the connection failed: RemoteProtocolError"),
+        pytest.param("drip", "silent for 0.5 s", marks=pytest.mark.slow),
+        pytest.param("half", "exit code 0", marks=pytest.mark.slow),
+        pytest.param("close", "the connection failed: RemoteProtocolError", marks=pytest.mark.slow),
         ("refuse", "it knows no model 'tetra' at this address (HTTP 404)"),
         ("list", "no whole JSON object"),
         ("nothing", "not as many 'meshes' as objects"),
@@ -171,6 +171,7 @@ def test_a_scene_for_which_nothing_was_made_fails_and_is_not_left_empty(make: Ma
         make("crash", BAD)
 
 
+@pytest.mark.slow  # asks for twenty objects, of processes that crash
 def test_what_is_kept_changes_no_result(make: Make):
     cold = make("crash", 1, BAD, 2)
     assert make("crash", 1, BAD, 2) == cold
