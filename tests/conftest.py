@@ -17,6 +17,7 @@ pytest_plugins = ["tests.helpers.browser_harness", "tests.helpers.tiny_pipeline_
 
 # The same examples on every machine. `--hypothesis-profile=default` looks further.
 hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadline=None)
+hypothesis.settings.register_profile("fewer", derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile("same-everywhere")
 
 PROCESS_EVENTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"}
@@ -30,6 +31,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--fast"):
         config.option.markexpr = "not slow and not heavy"
         sys.addaudithook(refuse_processes)
+    if "not slow" in config.option.markexpr and config.option.hypothesis_profile is None:
+        hypothesis.settings.load_profile("fewer")  # where slow tests run, the examples are twice as many
 
 
 def refuse_processes(event: str, arguments: tuple[object, ...]) -> None:
