@@ -67,7 +67,7 @@ format: develop ## rewrite the code as `check` wants it
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-test: develop browser ## the tests, within 12 minutes on 2 cores
+test: develop browser ## the tests but the slow ones, a quarter of an hour on 2 cores
 	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m 'not slow'
 
 test-fast: develop ## what to run while typing: no processes, at most 90 s

@@ -42,7 +42,7 @@ def test_the_nearest_demonstration_of_training_is_replayed(benchmark, dataset):
         ReplayPolicy()
 
 
-@pytest.mark.parametrize("name", ["state", "picture"])
+@pytest.mark.parametrize("name", ["state", pytest.param("picture", marks=pytest.mark.slow)])
 def test_policies_with_weights_of_the_package_reach_for_x(benchmark, dataset, name):
     pytest.importorskip("torch", reason="the extra `models` is not installed")
     result = play_episode(benchmark, benchmark.episodes[0], dataset, load_policy(PolicyName(name)))

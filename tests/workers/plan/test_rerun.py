@@ -100,6 +100,7 @@ def test_from_a_stage_without_any_change_computes_it_again(built, marks):
     assert digests(out) == before
 
 
+@pytest.mark.slow  # tests/integration/builds/test_again_stopped.py counts runs after a kill
 def test_a_stage_that_was_finished_before_a_kill_is_not_run_again(tmp_path, marks):
     manifest, out = write_manifest(tmp_path / "m.parquet", ["fine", "slow_2", "fine"]), tmp_path / "out"
     process = start(manifest, out)

@@ -89,7 +89,7 @@ def refusal(outcome):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("factor", [0.7, 1.0, 3.0])
+@pytest.mark.parametrize("factor", [0.7, pytest.param(1.0, marks=pytest.mark.slow), 3.0])
 @pytest.mark.parametrize("name", [name for name in KNOWN if name != "its upright edge"])
 def test_a_known_length_brings_metres_back(name, factor):
     found = perceived(estimated(factor, KNOWN[name])).value
