@@ -99,7 +99,9 @@ def by_trimesh(data: bytes, mass: float) -> _Body | None:
     return _Body(mass, mesh.center_mass, mesh.moment_inertia * np.sign(mesh.volume))
 
 
-@pytest.mark.parametrize(("count", "seed"), [(1, 31), pytest.param(100, 47, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("count", "seed"), [(1, 31), *(pytest.param(*more, marks=pytest.mark.slow) for more in ((3, 31), (100, 47)))]
+)
 def test_built_scenes_simulate_and_weigh_as_predicted(count, seed, tmp_path):
     compared = objects = 0
     for scene in build(tmp_path, count, seed):

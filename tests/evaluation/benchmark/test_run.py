@@ -121,7 +121,6 @@ def test_a_choice_is_run_and_a_wider_one_later_adds_to_it(benchmark, dataset, po
         run(benchmark, dataset, name, out, splits=("validation",))
 
 
-@pytest.mark.slow  # waits for a policy that hangs; the tests below have a policy that fails
 def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies, tmp_path, capfd):
     rows = run(benchmark, dataset, PolicyName(f"{policies}:Unlucky"), tmp_path / "u.jsonl", jobs=2, episode_s=15.0)
     assert [row.episode_id for row in rows] == [episode.episode_id for episode in benchmark.episodes]

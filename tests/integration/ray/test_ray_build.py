@@ -89,7 +89,6 @@ def test_a_stage_that_was_finished_before_its_actor_was_killed_is_not_run_again(
     assert [row["attempts"] for row in scenes(tmp_path / "out")] == [1, 1]
 
 
-@pytest.mark.slow  # test_growing_dataset.py stops one process; test_stops.py all of it
 def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, tmp_path):
     manifest, _ = whole
     process = start(manifest, tmp_path / "out", "ray", 1, **RUN)

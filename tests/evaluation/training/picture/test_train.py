@@ -162,7 +162,6 @@ def test_held_out_views_are_measured_at_a_checkpoint(
         assert all(0 <= each[name] <= 1 for name in ("covered", "things", "table"))
 
 
-@pytest.mark.slow  # three trainings
 def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(pool_file: Path, tmp_path: Path) -> None:
     wild = replace(SETTINGS, rate=1e30)
     train(tmp_path, pool_file, wild, minutes=0.0)

@@ -79,9 +79,10 @@ def test_without_the_depth_of_a_sensor_there_is_nothing_to_choose_from(bend: flo
 
 
 @pytest.mark.heavy
-def test_ids_are_dense_and_containers_come_first(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_ids_are_dense_and_containers_come_first(tmp_path: Path, count: int) -> None:
     services, config = Services(Path()), Config()
-    for folder in synthesize_captures(tmp_path / "captures", 1, 11):
+    for folder in synthesize_captures(tmp_path / "captures", count, 11):
         row = ImageRow(scene_id="x", kind=SceneKind.CAPTURE, uri=str(folder))
         seen = observe(row, config, np.random.default_rng(0), services)
         assert isinstance(seen, Done), seen
