@@ -19,6 +19,12 @@ from tests.helpers.docs_pages import PAGES, SHELL, Block, Command, blocks, comma
 from tests.helpers.docs_workspace import Room, prepare
 from tests.helpers.paths import ROOT
 
+
+def needs(module: str, pattern: str, reason: str) -> tuple[tuple[str, str], ...]:
+    """What cannot run where an optional module is missing: nothing where it is installed."""
+    return () if importlib.util.find_spec(module) else ((pattern, reason),)
+
+
 CANNOT = (
     (r"make |git |pip |source ", "sets up the environment that this test runs in"),
     (r"sbatch |ray |RAY_AUTH", "needs a cluster, containers or an account"),
@@ -37,6 +43,7 @@ CANNOT = (
     (r"tableverse estimate ", "needs fifty scenes that were built"),
     (r"tableverse evaluate (collisions|tables|layout out)", "needs other methods' scenes; tests/evaluation has some"),
     (r"tableverse textures index ", "needs textures that somebody photographed"),
+    *needs("pxr", r".* --format usd", "usd-core is an extra; tests/delivery/formats has tests for it"),
 )
 """What a test cannot run, and why. A `tableverse` command among it is still read by the real command line."""
 
@@ -48,6 +55,8 @@ PYTHON_CANNOT = (
     (r"mani_skill", "ManiSkill brings torch and SAPIEN; tests/delivery/learning has a test for it"),
     (r"import pybullet", "pybullet compiles for minutes; tests/delivery/formats has a test for it"),
     (r"serve_forever|serve_policy", "serves until it is stopped"),
+    *needs("datasets", r"from datasets", "datasets is no dependency; tests/delivery/formats has a test for it"),
+    *needs("webdataset", r"import webdataset", "webdataset is no dependency; tests/delivery/formats has a test for it"),
     (r"open_library", "needs textures that somebody photographed"),
     (r"(hf|s3|https?)://", "needs a server"),
     (r"\btargets\b", "a fragment: the reader has the targets"),
