@@ -101,7 +101,7 @@ def test_every_failure_ends_as_designed(server, tmp_path, monkeypatch, case, doo
     server.say(SPEAK[dialect](said) if isinstance(said, str) else said)
     services = Services(tmp_path)
     with pytest.raises(ModelError) as caught:
-        ask_of(door, dialect, server, services, case, 0.7 if failure in SHORT else 60.0)()
+        ask_of(door, dialect, server, services, case, 2.0 if failure in SHORT else 60.0)()
     assert type(caught.value) is kind
     if isinstance(caught.value, AnswerInvalidError):
         assert caught.value.reason == words
