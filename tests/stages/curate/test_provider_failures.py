@@ -64,8 +64,8 @@ FAILURES = {
 }
 
 
-SHORT_S = {"429 without a time": 2.0, "time-out in the middle of the body": 0.7}
-"""How long those may take that would wait for long otherwise [s]."""
+SHORT = ("429 without a time", "time-out in the middle of the body")
+"""Those that would wait for long otherwise."""
 
 
 @pytest.fixture(scope="module")
@@ -101,13 +101,13 @@ def test_every_failure_ends_as_designed(server, tmp_path, monkeypatch, case, doo
     server.say(SPEAK[dialect](said) if isinstance(said, str) else said)
     services = Services(tmp_path)
     with pytest.raises(ModelError) as caught:
-        ask_of(door, dialect, server, services, case, SHORT_S.get(failure, 60.0))()
+        ask_of(door, dialect, server, services, case, 0.7 if failure in SHORT else 60.0)()
     assert type(caught.value) is kind
     if isinstance(caught.value, AnswerInvalidError):
         assert caught.value.reason == words
     else:
         caught.match(words)
-    if failure not in SHORT_S:  # within a short time, drawn waits and the machine's load decide how often it asks
+    if failure not in SHORT:  # within a short time, drawn waits and the machine's load decide how often it asks
         assert len(server.asked) == requests
     assert services.meter.paid.calls == len(server.asked)
     assert_nowhere(tmp_path, str(caught.value))
