@@ -23,7 +23,7 @@ def main(results: list[Path], dest: Path) -> None:
     for path in results:
         header, rows = read_results(path)
         scenes, motions = map(int, re.fullmatch(r"s(\d+)m(\d+)_\d+", header.policy).groups())
-        played = [row.success for row in rows.values() if row.split == "test" and row.axis == "none"]
+        played = [row.success for row in rows.values() if row.split != "unseen_kinds" and row.axis == "none"]
         shares[motions, scenes].append(100 * sum(played) / len(played))
     figure, axes = pyplot.subplots(figsize=(5.6, 3.6), layout="constrained")
     for scenes in sorted({scenes for _, scenes in shares}):
