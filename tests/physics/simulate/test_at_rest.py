@@ -107,7 +107,7 @@ def test_drift_of_free_fall_is_half_g_t_squared() -> None:
     drift = measure_drift(model_of([(CUBE, (0.0, 0.0, 5.0))]), 0.5)
     assert drift.distance_m[0] == pytest.approx(9.81 * 0.125, rel=0.01)
     assert drift.sunk_m[0] == pytest.approx(drift.distance_m[0], rel=1e-6)
-    assert drift.angle_rad[0] == pytest.approx(0.0, abs=1e-5)
+    assert drift.angle_rad[0] == pytest.approx(0.0, abs=5e-5)
 
 
 STANDING = """
@@ -172,8 +172,8 @@ def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyP
     assert (int(model.opt.enableflags), float(model.opt.sleep_tolerance)) == own
     monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 0.0)
     awake = measure_drift(model, 5.0)
-    np.testing.assert_allclose(drift.distance_m, awake.distance_m, atol=1e-8)
-    np.testing.assert_allclose(drift.angle_rad, awake.angle_rad, atol=1e-7)
+    np.testing.assert_allclose(drift.distance_m, awake.distance_m, atol=5e-6)
+    np.testing.assert_allclose(drift.angle_rad, awake.angle_rad, atol=5e-6)
     monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 1e-4)
     frozen = measure_drift(model, 5.0)
     assert frozen.distance_m[1] < 0.5 * awake.distance_m[1], "else this ball proves nothing"
