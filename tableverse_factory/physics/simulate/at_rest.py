@@ -23,9 +23,11 @@ STEPS_PER_SLEEP_CHECK = 25  # steps between checks whether all bodies sleep
 # Velocities that every body is given before its drift is measured, and again `NUDGE_INTERVAL_S` later [m/s, rad/s].
 # Friction stops them within a step or two, but a body on its tip or edge falls, which would depend on rounding errors
 # otherwise. No direction across the table is at right angles to both.
-NUDGES = 1e-5 * np.array([[1.0, 1, 1, 1, 1, 1], [1, -1, 1, 1, -1, 1]])
-NUDGE_INTERVAL_S = 0.1  # sleep is allowed after it
-DRIFT_SLEEP_TOLERANCE = 1e-6  # a tenth of a nudge; sleeping bodies would move by 5 µm in the certificate's 5 s
+NUDGES = 1e-6 * np.array([[1.0, 1, 1, 1, 1, 1], [1, -1, 1, 1, -1, 1]])
+NUDGE_INTERVAL_S = 0.1
+# Sleeping bodies would move by 5 µm in the certificate's 5 s. What falls off its tip is faster when sleep is allowed, and
+# what a nudge holds up for so long, such as a ball that it sends up a slope, accelerates by 2 µm/s² at most: 20 µm.
+DRIFT_SLEEP_TOLERANCE, SLEEP_AFTER_S = 1e-6, 0.5
 UNSTABLE = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -118,10 +120,12 @@ def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
     bodies = find_free_bodies(model)
     start_centers, start = data.xipos[bodies].copy(), read_body_poses(model, data, bodies)
     dofs = _list_velocity_indices(model, bodies)
-    steps, awake = (round(seconds / model.opt.timestep) for seconds in (duration_s, min(NUDGE_INTERVAL_S, duration_s)))
+    times = (NUDGE_INTERVAL_S, SLEEP_AFTER_S, duration_s)
+    first, awake, steps = (round(min(seconds, duration_s) / model.opt.timestep) for seconds in times)
     data.qvel[dofs] += NUDGES[0]
-    mujoco.mj_step(model, data, nstep=awake)
+    mujoco.mj_step(model, data, nstep=first)
     data.qvel[dofs] += NUDGES[1]
+    mujoco.mj_step(model, data, nstep=awake - first)
     with allow_sleep(model, DRIFT_SLEEP_TOLERANCE):
         for done in range(awake, steps, STEPS_PER_SLEEP_CHECK):
             mujoco.mj_step(model, data, nstep=min(STEPS_PER_SLEEP_CHECK, steps - done))
@@ -154,7 +158,10 @@ def make_quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
 
 @contextmanager
 def allow_sleep(model: mujoco.MjModel, tolerance: float) -> Iterator[None]:
-    """Let MuJoCo put bodies slower than the tolerance [m/s, rad/s] for ten steps to sleep, with all that they touch."""
+    """Let MuJoCo put bodies slower than the tolerance [m/s] for ten steps to sleep, with all that they touch.
+
+    Rotation counts by the speed of the body's surface.
+    """
     option = model.opt
     own = int(option.enableflags), float(option.sleep_tolerance)
     option.enableflags, option.sleep_tolerance = own[0] | int(mujoco.mjtEnableBit.mjENBL_SLEEP), tolerance

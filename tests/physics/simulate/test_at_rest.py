@@ -107,7 +107,7 @@ def test_drift_of_free_fall_is_half_g_t_squared() -> None:
     drift = measure_drift(model_of([(CUBE, (0.0, 0.0, 5.0))]), 0.5)
     assert drift.distance_m[0] == pytest.approx(9.81 * 0.125, rel=0.01)
     assert drift.sunk_m[0] == pytest.approx(drift.distance_m[0], rel=1e-6)
-    assert drift.angle_rad[0] == pytest.approx(0.0, abs=5e-5)
+    assert drift.angle_rad[0] == pytest.approx(0.0, abs=1e-5)
 
 
 STANDING = """
@@ -155,28 +155,30 @@ def test_what_stands_on_an_edge_falls_whatever_its_heading(heading: float) -> No
 
 ROLLING = """
 <mujoco>
-  <option gravity="1e-4 0 -9.81"/>
+  <option gravity="{slope} -9.81" timestep="{step}" cone="elliptic"/>
   <worldbody>
     <geom type="plane" size="1 1 0.1" friction="1 0 0"/>
     <body pos="0 0 0.05"><freejoint/><geom type="box" size="0.05 0.05 0.05"/></body>
-    <body pos="0.4 0 0.05"><freejoint/><geom type="sphere" size="0.05"/></body>
+    <body pos="0.4 0 0.03"><freejoint/><geom type="sphere" size="0.03"/></body>
   </worldbody>
 </mujoco>"""
 
 
-def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ball begins to roll down a slope of 1 in 100,000: a millimetre in the end, at less than 0.4 mm/s."""
-    model = mujoco.MjModel.from_xml_string(ROLLING)
+@pytest.mark.parametrize("step", [0.001, 0.002])
+@pytest.mark.parametrize("slope", ["1e-4 0", "-1e-4 0", "0 1e-4", "0 -1e-4", "-2e-5 0", "-3e-6 0"])
+def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyPatch, slope: str, step: float) -> None:
+    """A ball begins to roll down a slope of 1 in 100,000, or first up: a millimetre in the end, at up to 0.4 mm/s."""
+    model = mujoco.MjModel.from_xml_string(ROLLING.format(slope=slope, step=step))
     own = int(model.opt.enableflags), float(model.opt.sleep_tolerance)
     drift = measure_drift(model, 5.0)
     assert (int(model.opt.enableflags), float(model.opt.sleep_tolerance)) == own
     monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 0.0)
     awake = measure_drift(model, 5.0)
-    np.testing.assert_allclose(drift.distance_m, awake.distance_m, atol=5e-6)
-    np.testing.assert_allclose(drift.angle_rad, awake.angle_rad, atol=5e-6)
-    monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 1e-4)
-    frozen = measure_drift(model, 5.0)
-    assert frozen.distance_m[1] < 0.5 * awake.distance_m[1], "else this ball proves nothing"
+    np.testing.assert_allclose(drift.distance_m, awake.distance_m, atol=25e-6)
+    if "1e-4" in slope:
+        monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 1e-3)
+        frozen = measure_drift(model, 5.0)
+        assert frozen.distance_m[1] < 0.5 * awake.distance_m[1], "else this ball proves nothing"
 
 
 def test_what_moves_is_followed_to_the_end_though_others_sleep() -> None:
