@@ -61,13 +61,13 @@ def cousins(
     overrides = [*(overrides or []), f"run.seed={seed}"]
     load_config(config, overrides)  # what is refused leaves no manifest behind
     rows = ImageRows.from_rows(list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind))
-    begun = (place / "plan.parquet").exists() and manifest.exists()
-    if begun and digest_manifest(read_manifest(manifest)) != digest_manifest(rows):
+    if not manifest.exists():
+        write_manifest(manifest, rows)
+    elif digest_manifest(read_manifest(manifest)) != digest_manifest(rows):
         raise InputError(
-            f"{dest} was begun with other cousins than {per_scene} of each scene with seed {seed}: give --per-scene "
-            "and --seed as then, or another folder"
+            f"{manifest} lists other rows than {per_scene} cousins of each scene with seed {seed}: give --per-scene "
+            "and --seed as when it was written, or another DEST"
         )
-    write_manifest(manifest, rows)
     summary = build(
         str(manifest),
         dest,

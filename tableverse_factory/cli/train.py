@@ -159,8 +159,12 @@ def train_policy(
     ] = None,
     minutes: TrainMinutes = None,
     goals: Annotated[int, typer.Option(min=1, max=65_536, help="Goals per step.")] = 128,
-    chunks: Annotated[int, typer.Option(min=1, max=65_536, help="Chunks of motion per step, on states.")] = 512,
-    views: Annotated[int, typer.Option(min=1, max=65_536, help="Views per step, on pictures.")] = 64,
+    chunks: Annotated[
+        int | None, typer.Option(min=1, max=65_536, help="Chunks of motion per step, on states; by default 512.")
+    ] = None,
+    views: Annotated[
+        int | None, typer.Option(min=1, max=65_536, help="Views per step, on pictures; by default 64.")
+    ] = None,
     scenes: Annotated[int | None, typer.Option(min=1, help="Number of scenes to learn from; all without.")] = None,
     motions: Annotated[
         int | None, typer.Option(min=1, help="Number of motions to learn, from these scenes in turn; all without.")
@@ -172,6 +176,7 @@ def train_policy(
     tables: Annotated[
         int | None, typer.Option(min=0, max=50_000, help="Synthetic tables that pictures show too; 2,000 by default.")
     ] = None,
+    robot: Annotated[str, typer.Option(metavar="ARM", help="The arm whose motions are packed.")] = "panda",
     seed: TrainSeed = 0,
     device: TrainDevice = "auto",
 ) -> None:
@@ -189,27 +194,38 @@ def train_policy(
 
     where = _prepare_training(device, ("torch", "safetensors")).kind
     from tableverse_factory.evaluation.training.policy.settings import PolicySettings
-    from tableverse_factory.evaluation.training.policy.train import TrainRun, train_picture_policy, train_state_policy
+    from tableverse_factory.evaluation.training.policy.train import (
+        TrainRun,
+        load_teacher,
+        train_picture_policy,
+        train_state_policy,
+    )
 
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
-    demonstrations = _provide_packed(folder / "demonstrations.npz", datasets or [])
-    run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
-    if state is None and tables is not None:
-        raise ConfigError("--tables is for a policy on pictures: give --pictures-from too")
+    if state is None and not (tables is None and views is None):
+        raise ConfigError("--tables and --views are for a policy on pictures: give --pictures-from too")
+    if state is not None and chunks is not None:
+        raise ConfigError("--chunks is for a policy on states: one on pictures takes its motions from --pictures-from")
     steps = steps or (3_000 if state is None else 8_000)
-    settings = PolicySettings(steps, seed, goals, chunks=chunks, views=views, scenes=scenes, motions=motions)
+    settings = PolicySettings(
+        steps, seed, goals, chunks=chunks or 512, views=views or 64, scenes=scenes, motions=motions
+    )
+    if state is not None:
+        load_teacher(settings, state)  # what is refused is, before hours of packing
+    demonstrations = _provide_packed(folder / "demonstrations.npz", datasets or [], robot)
+    run = TrainRun(folder, demonstrations, where, math.inf if minutes is None else minutes)
     if state is None:
         done = train_state_policy(settings, run, say)
     else:
-        pictures = _provide_pictures(folder / "pictures.npz", datasets or [], tables)
+        pictures = _provide_pictures(folder / "pictures.npz", datasets or [], robot, tables)
         done = train_picture_policy(settings, run, pictures, state, say)
     print(f"{done} of {steps} steps" + ("" if done >= steps else "; the same command continues"))
     print(f"{folder / 'weights.safetensors'}: give it to `tableverse benchmark run --weights`")
 
 
-def _provide_packed(path: Path, datasets: list[str]) -> Path:
+def _provide_packed(path: Path, datasets: list[str], robot: str) -> Path:
     """Pack the datasets' motions, unless an earlier command did, and return their file."""
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.dataset.dataset import open_dataset
@@ -217,11 +233,11 @@ def _provide_packed(path: Path, datasets: list[str]) -> Path:
 
     if not _is_packed(path, datasets):
         with count_progress("scenes") as done:
-            pack_demonstrations([*map(open_dataset, datasets)], on_scene=done.update).write(path)
+            pack_demonstrations([*map(open_dataset, datasets)], robot=robot, on_scene=done.update).write(path)
     return path
 
 
-def _provide_pictures(path: Path, datasets: list[str], tables: int | None) -> Path:
+def _provide_pictures(path: Path, datasets: list[str], robot: str, tables: int | None) -> Path:
     """Pack pictures of the datasets' scenes and of synthetic tables, unless an earlier command did."""
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.process_pool import count_available_cpus
@@ -235,7 +251,8 @@ def _provide_pictures(path: Path, datasets: list[str], tables: int | None) -> Pa
         return path
     opened, wanted = [*map(open_dataset, datasets)], TABLES if tables is None else tables
     with count_progress("scenes and tables") as done:
-        pack_pictures(opened, on_scene=done.update, jobs=count_available_cpus(), tables=wanted).write(path)
+        jobs = count_available_cpus()
+        pack_pictures(opened, robot=robot, on_scene=done.update, jobs=jobs, tables=wanted).write(path)
     return path
 
 

@@ -24,7 +24,6 @@ from tableverse_factory.dataset.splits import find_split
 
 Row = Mapping[str, Any]
 
-MAX_PER_SCENE = 1000
 THEMES: Sequence[tuple[Change, ...]] = (  # each cousin of a scene takes the next one; things move in all of them
     (Change.MOVE, Change.TURN),
     (Change.SWAP, Change.MOVE),

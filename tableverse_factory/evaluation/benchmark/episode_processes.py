@@ -7,6 +7,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -64,10 +65,16 @@ class _Player:
         """Whether it loads or plays."""
         return self.description is None or self.episode is not None
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether its process ended between episodes."""
+        return not self.is_waited_for and self._process.exitcode is not None
+
     def play(self, episode: Episode, limit_s: float) -> None:
         """Begin an episode, which has to end within `limit_s`."""
         self.episode, self.until, self._limit_s = episode, time.monotonic() + limit_s, limit_s
-        self.connection.send_bytes(episode.episode_id.encode())
+        with suppress(OSError):  # `poll` says how the process ended
+            self.connection.send_bytes(episode.episode_id.encode())
 
     def poll(self) -> EpisodeResult | None:
         """Return the result of the episode if it has ended, also by the end of the process.
@@ -80,7 +87,7 @@ class _Player:
                 return self._receive(json.loads(self.connection.recv_bytes(MAX_MESSAGE_BYTES)))
         except (EOFError, OSError):
             return self._lose("policy_crash", self._describe_end())
-        except ValueError:  # JSON, or a row, that only a policy can have sent that writes to our pipe
+        except (ValueError, KeyError, TypeError):  # only a policy can have sent it that writes to our pipe
             return self._lose("policy_crash", "its process sends no result")
         if self.is_waited_for and time.monotonic() > self.until:
             return self._lose("policy_timeout", f"took longer than {self._limit_s:g} s" if self.episode else "")
@@ -154,6 +161,9 @@ class EpisodeProcesses:
         """
         left, players = deque(episodes), self._players
         while left or any(player.episode for player in players):
+            for player in [player for player in players if player.has_ended]:
+                player.end()
+                players.remove(player)
             wanted = min(jobs, len(left) + sum(player.episode is not None for player in players))
             players += [_Player(self._plan) for _ in range(wanted - len(players))]
             for player in players:
@@ -161,7 +171,7 @@ class EpisodeProcesses:
                     player.play(left.popleft(), self._limit_s)
             _wait(players)
             for player in tuple(players):
-                if (result := player.poll()) is not None:
+                if player.is_waited_for and (result := player.poll()) is not None:
                     yield result
                 if player.is_lost:
                     player.end()

@@ -1,9 +1,11 @@
 """Policies by name: ours, classes of modules and files, and processes behind an HTTP address."""
 
+import hashlib
 import importlib
 import importlib.util
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -40,9 +42,12 @@ class PolicyName:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the name, the file of the class and that of the weights, so that other weights are another run."""
-        files = [self.name.rpartition(":")[0], self.weights or str(SHIPPED.get(self.name, ""))]
-        return content_hash(self.name.encode(), *(_read_if_file(file) for file in files))
+        """SHA-256 of the name, the class's own file and the weights, a file or folder: others are another run.
+
+        Of a process behind an address only the address is known.
+        """
+        files = [_find_source(self.name), Path(self.weights or SHIPPED.get(self.name) or "")]
+        return content_hash(self.name.encode(), *map(_hash_path, files))
 
     @property
     def shown(self) -> str:
@@ -52,8 +57,24 @@ class PolicyName:
         return sanitize_line(self.name.rpartition("/")[2] if not self.name.startswith("http") else self.name, 300)
 
 
-def _read_if_file(path: str) -> bytes:
-    return Path(path).read_bytes() if path and Path(path).is_file() else path.encode()
+def _find_source(name: str) -> Path:
+    """Find the file of a class by its name; a module that is not found does not load either."""
+    source = name.rpartition(":")[0]
+    if name in SHORT_NAMES or name.startswith(("http://", "https://")) or source.endswith(".py"):
+        return Path(source)
+    with suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(source)
+        return Path((spec and spec.origin) or source)
+    return Path(source)
+
+
+def _hash_path(path: Path) -> bytes:
+    """Hash a file, all files of a folder with their names, or else the path."""
+    if path.is_file():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").digest()
+    inside = sorted(each for each in path.rglob("*") if each.is_file()) if path.name and path.is_dir() else []
+    return content_hash(str(path).encode(), *(_hash_path(each) for each in inside)).encode()
 
 
 def load_policy(name: PolicyName) -> Policy:

@@ -1,5 +1,6 @@
 """One episode played by a policy: the environment, what the policy is told, and what came of it."""
 
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -137,9 +138,9 @@ def _ask(question: Callable[[Told], Answer], told: Told) -> Answer:
     """Ask a policy; whatever it raises is its failure."""
     try:
         return question(told)
-    except PolicyError:
-        raise
     except Exception as error:  # of foreign code, whose failure is a result
+        if isinstance(error, PolicyError) and re.fullmatch("[a-z_]{1,60}", str(error.reason)):
+            raise
         text = type(error).__name__
         with suppress(Exception):  # even the text of an error may be one
             text = f"{text}: {error}"

@@ -83,7 +83,7 @@ class Policy(Protocol):
 
 
 class PolicyError(Exception):
-    """A policy failed: `reason` is `policy_error`, `bad_action` or `policy_timeout`; the message is one line."""
+    """A policy failed: `reason` is a word of small letters and underscores; the message is one line."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(detail)

@@ -33,18 +33,21 @@ class ReplayPolicy:
     pictures: tuple[str, ...] = ()
     picture_size = (96, 128)
 
-    def __init__(self, dataset: str | None = None, robot: str = "panda") -> None:
-        """List the training tasks of a dataset (`splits.list_split_tasks`) from its tables."""
+    def __init__(self, dataset: str | None = None) -> None:
+        """Open a dataset, of which the training tasks (`splits.list_split_tasks`) of the episodes' arm are replayed."""
         if dataset is None:
             raise ConfigError("the policy replay needs a dataset to replay: give its OUT as --weights")
         self._dataset = open_dataset(dataset)
-        self._tasks: dict[str, list[tuple[Task, Features]]] = {}
-        for relation, task, features in _list_demonstrations(self._dataset, robot):
-            self._tasks.setdefault(relation, []).append((task, features))
+        self._tasks: dict[tuple[str, str], list[tuple[Task, Features]]] = {}  # by arm and relation
+        self._robots: set[str] = set()
 
     def reset(self, start: EpisodeStart) -> None:
         """Begin an episode."""
-        if not (found := self._tasks.get(start.relation.value)):
+        if start.robot not in self._robots:
+            self._robots.add(start.robot)
+            for relation, task, features in _list_demonstrations(self._dataset, start.robot):
+                self._tasks.setdefault((start.robot, relation), []).append((task, features))
+        if not (found := self._tasks.get((start.robot, start.relation.value))):
             raise PolicyError("no_demonstration", f"no training task of the relation {start.relation.value!r}")
         self._start, self._candidates = start, found
         self._actions: list[np.ndarray] = []

@@ -16,7 +16,7 @@ GROUP_NOTES: dict[Group, str] = {
     "split": "unperturbed episodes",
     "tier": "unperturbed episodes of unseen pictures",
     "relation": "unperturbed episodes of unseen pictures",
-    "axis": "the same episodes of unseen pictures along each axis; none: as they were exported",
+    "axis": "episodes of unseen pictures along each axis; none: those of them as they were exported",
 }
 
 

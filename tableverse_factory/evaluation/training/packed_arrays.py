@@ -25,7 +25,7 @@ def refuse_damaged(path: Path, what: str, remedy: str) -> Iterator[None]:
     """Raise an `InputError` if what is read from a file meanwhile is not `what`; `remedy` is what to do then."""
     try:
         yield
-    except (OSError, ValueError, KeyError, EOFError, TypeError, BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, KeyError, EOFError, TypeError, MemoryError, BadZipFile, zlib.error) as error:
         said = " ".join(f"{type(error).__name__}: {error}".split())[:300]
         raise InputError(f"{path} is not {what} ({said}): {remedy}") from error
 

@@ -25,7 +25,7 @@ STEPS_PER_SLEEP_CHECK = 25  # steps between checks whether all bodies sleep
 # otherwise. No direction across the table is at right angles to both.
 NUDGES = 1e-6 * np.array([[1.0, 1, 1, 1, 1, 1], [1, -1, 1, 1, -1, 1]])
 NUDGE_INTERVAL_S = 0.1
-# Sleeping bodies would move by 5 µm in the certificate's 5 s. What falls off its tip is faster when sleep is allowed, and
+# Sleeping bodies would move by 5 µm in the certificate's 5 s. What falls off its tip is faster when sleep is allowed;
 # what a nudge holds up for so long, such as a ball that it sends up a slope, accelerates by 2 µm/s² at most: 20 µm.
 DRIFT_SLEEP_TOLERANCE, SLEEP_AFTER_S = 1e-6, 0.5
 UNSTABLE = (

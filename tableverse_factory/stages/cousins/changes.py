@@ -1,4 +1,7 @@
-"""Changes of an arrangement, drawn at random where there is room: nothing comes into another thing or off the table."""
+"""Changes of an arrangement, drawn at random where there is room: nothing comes into another thing.
+
+What is moved stays on the table; it grows where what is turned, greater or swapped in needs it.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -112,7 +112,10 @@ def _read_file(scene: Scene, name: str) -> bytes:
 def _read_color(scene: Scene, object_id: str) -> tuple[int, ...]:
     """Read the colour of an object's visual geom, sRGB."""
     found = re.search(rf'<geom [^>]*name="{re.escape(object_id)}"[^>]*rgba="([0-9. e-]+)"', scene.xml)
-    values = [float(value) for value in found[1].split()[:3]] if found else []
+    try:
+        values = [float(value) for value in found[1].split()[:3]] if found else []
+    except ValueError:
+        values = []
     if len(values) != 3:
         raise InputError(f"scene {scene.scene_id}: scene.xml has no colour of {object_id}", "bad_mjcf")
     return tuple(int(np.clip(np.rint(255.0 * value), 0, 255)) for value in values)

@@ -90,8 +90,23 @@ def test_other_code_or_weights_are_another_policy(file, tmp_path):
     file.write_text(CLASSES + "\n")
     digests.append(PolicyName(f"{file}:Good", str(weights)).digest)
     assert len(set(digests)) == 3
+    for content in (b"3", b"4"):
+        (tmp_path / "folder/part").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "folder/part/weights.pt").write_bytes(content)
+        digests.append(PolicyName(f"{file}:Good", str(tmp_path / "folder")).digest)
+    assert len(set(digests)) == 5
     assert PolicyName(f"{file}:Good").shown == "classes.py:Good"
     assert PolicyName(f"{file}:Good", title="good\x1b[2J").shown == "good\\x1b[2J"
+
+
+def test_other_code_of_a_module_is_another_policy(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    file = tmp_path / "policies_of_a_package.py"
+    file.write_text(CLASSES)
+    before = PolicyName("policies_of_a_package:Good").digest
+    file.write_text(CLASSES + "\n")
+    assert PolicyName("policies_of_a_package:Good").digest != before
+    assert PolicyName("absent_module:Good").digest != PolicyName("http://127.0.0.1:1").digest
 
 
 def test_actions_are_checked_and_clipped():

@@ -15,6 +15,7 @@ import pytest
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import BuildError, InputError
 from tableverse_factory.evaluation.benchmark.benchmark import Benchmark
+from tableverse_factory.evaluation.benchmark.episode_processes import EpisodeProcesses, PlayPlan
 from tableverse_factory.evaluation.benchmark.journal import open_journal
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
 from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_results, read_results
@@ -60,6 +61,22 @@ class Slow(Quick):
     def act(self, observation):
         time.sleep(0.05)
         return super().act(observation)
+
+class Sly(Quick):
+    def reset(self, start):
+        from tableverse_factory.evaluation.benchmark.policy import PolicyError
+
+        if start.episode_id == "test_0001":
+            raise PolicyError("", "all is well")
+        if start.episode_id == "test_0000":
+            raise PolicyError("Not a word", "")
+        super().reset(start)
+
+class Mortal(Quick):
+    def act(self, observation):
+        import threading
+        threading.Timer(0.3, os._exit, [0]).start()
+        raise RuntimeError("soon gone")
 
 class Absent(Quick):
     def __init__(self):
@@ -195,3 +212,19 @@ def test_only_one_run_at_a_time_has_the_journal(tmp_path):
         thread.join()
     assert len(runs) > 10
     assert all(runs)
+
+
+def test_no_word_of_a_policy_makes_a_failure_a_success(benchmark, dataset, policies, tmp_path):
+    results = run(benchmark, dataset, PolicyName(f"{policies}:Sly"), tmp_path / "sly.jsonl", jobs=1, splits=("test",))
+    found = {row.episode_id: (row.success, row.reason) for row in results if row.axis == "none"}
+    assert found["test_0001"] == found["test_0000"] == (False, "policy_error")
+
+
+def test_a_process_that_ends_between_episodes_costs_none(benchmark, dataset, policies, tmp_path):
+    processes = EpisodeProcesses(PlayPlan(benchmark, dataset.path, PolicyName(f"{policies}:Mortal")), 60.0)
+    with processes:
+        processes.describe_policy()
+        first = list(processes.play(benchmark.episodes[:1], 1))
+        time.sleep(1.0)
+        second = list(processes.play(benchmark.episodes[:1], 1))
+    assert [row.reason for row in first + second] == ["policy_error"] * 2

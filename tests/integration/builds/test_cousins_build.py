@@ -223,7 +223,12 @@ def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
     manifest = (tmp_path / "dest.parquet").read_bytes()
     code, _, errors = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 3, "--executor", "local")
     assert (code, (tmp_path / "dest.parquet").read_bytes()) == (1, manifest)
-    assert "begun with other cousins" in errors
+    assert "dest.parquet lists other rows than 3 cousins of each scene" in errors
+    photographs = tmp_path / "photographs.parquet"
+    photographs.write_bytes((made / "cousins.parquet").read_bytes())
+    code, _, errors = run("cousins", made / "out", tmp_path / "photographs", "--executor", "local")
+    assert (code, photographs.read_bytes()) == (1, (made / "cousins.parquet").read_bytes())
+    assert "or another DEST" in errors
     code, _, errors = run("cousins", made / "out", made / "out", "--executor", "local")
     assert code == 1
     assert "is the dataset of the parents" in errors

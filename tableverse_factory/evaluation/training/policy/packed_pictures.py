@@ -33,7 +33,7 @@ class PackedPictures(Frozen):
     """Views (v) of scenes by the cameras (c) of an arm at home, and phrases that each name one of their objects.
 
     The first views are those of the demonstrations, in their order; in them X is object 1, and Y is 2. A view holds the
-    `WINDOW` of each camera's picture that `place_window` chose: a JPEG file of its colours, and PNG files of its depth
+    `WINDOW` of each camera's picture that `find_window` chose: a JPEG file of its colours, and PNG files of its depth
     [`DEPTH_M`] and of its objects, one after the other.
     """
 

@@ -1,4 +1,4 @@
-"""Training of the policy on states from packed demonstrations; it needs numpy and torch alone."""
+"""Training of policies from packed demonstrations and pictures; it needs numpy, torch and safetensors alone."""
 
 import copy
 import hashlib
@@ -75,16 +75,21 @@ def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int
 def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path, state: Path, log: Log) -> int:
     """Train sight and goals on the pictures of the same demonstrations; `state` are the weights of a policy on states.
 
-    Goals are trained on from its own; its motions are taken over as they are. InputError if fewer scenes or motions are
-    wanted: sight learns from all views.
+    Goals are trained on from its own; its motions are taken over as they are.
     """
-    if settings.scenes is not None or settings.motions is not None:
-        raise InputError("--scenes and --motions are for a policy on states: pack fewer datasets instead")
+    teacher = load_teacher(settings, state)
     data, packed = _load(settings, run), PackedPictures.read(pictures)
-    teacher = make_network(0)
-    read_weights(state, teacher)
     lesson = PictureLesson(data, PictureTensors(packed, run.device), teacher)
     return _train(data, lesson, settings, run, log, _hash_files(run.demonstrations, pictures, state))
+
+
+def load_teacher(settings: PolicySettings, state: Path) -> Any:
+    """Load a policy on states to train one on pictures; InputError if it cannot be, or fewer motions are wanted."""
+    if settings.scenes is not None or settings.motions is not None:  # sight learns from all views
+        raise InputError("--scenes and --motions are for a policy on states: pack fewer datasets instead")
+    teacher = make_network(0)
+    read_weights(state, teacher)
+    return teacher
 
 
 def _load(settings: PolicySettings, run: TrainRun) -> DemonstrationTensors:
