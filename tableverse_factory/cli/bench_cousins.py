@@ -46,7 +46,7 @@ def bench_cousins(
     )
     print(f"done: {score.done} of {score.of} ({score.done / score.of:.1%})")
     rest = f"{score.cpu_median_s:.2f} median, {score.cpu_p95_s:.2f} p95, {score.cpu_max_s:.2f} most"
-    print(f"CPU s of a cousin: {score.cpu_mean_s:.2f} mean, {rest}")
+    print(f"CPU s of a cousin: {score.cpu_mean_s:.2f} mean, {rest}".replace("nan", "–"))
     print("changes: " + ", ".join(f"{count} {kind}" for kind, count in score.changes))
     layouts = [its.layout_m for its in score.families if not np.isnan(its.layout_m)]
     relations = [its.relations for its in score.families if not np.isnan(its.relations)]

@@ -57,7 +57,7 @@ class CousinsScore:
     done: int
     of: int
     lost: tuple[tuple[str, int], ...]  # reasons of drops and kinds of failures, with their number
-    cpu_mean_s: float
+    cpu_mean_s: float  # as the next three NaN where no stage was timed: all cousins were dropped before it
     cpu_median_s: float
     cpu_p95_s: float
     cpu_max_s: float
@@ -81,15 +81,14 @@ def measure_cousins(out: str, most: int | None, jobs: int) -> CousinsScore:
     seconds = _sum_cpu(out, {row["shard"] for row in rows})
     compare = partial(_compare_family, out)
     families = tuple(parallel_map(compare, list(by_parent.items())[:most], jobs, "compares cousins"))
-    median, high, most_s = (float(np.percentile(seconds, percent)) for percent in (50.0, 95.0, 100.0))
     return CousinsScore(
         done=len(done),
         of=len(rows),
         lost=tuple(lost.most_common()),
-        cpu_mean_s=float(np.mean(seconds)),
-        cpu_median_s=median,
-        cpu_p95_s=high,
-        cpu_max_s=most_s,
+        cpu_mean_s=_reduce(np.mean, seconds),
+        cpu_median_s=_reduce(np.median, seconds),
+        cpu_p95_s=_reduce(partial(np.percentile, q=95.0), seconds),
+        cpu_max_s=_reduce(np.max, seconds),
         changes=tuple(kinds.most_common()),
         families=families,
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from schemas.config import Config
@@ -211,6 +212,14 @@ def test_cousins_of_a_family_differ_and_the_bench_says_so(made):
     assert all(family.layout_m > 0.01 and family.from_parent_m > 0.01 for family in score.families)
     assert sum(family.alike for family in score.families) == 0
     assert {kind for kind, _ in score.changes} <= {change.value for change in Change}
+
+
+def test_the_bench_counts_cousins_that_no_stage_was_timed_of(made, tmp_path):
+    shutil.copytree(made / "cousins", tmp_path / "untimed")
+    for file in (tmp_path / "untimed" / "timings").glob("*.parquet"):
+        pq.write_table(pq.read_table(file).slice(0, 0), file)
+    score = measure_cousins(str(tmp_path / "untimed"), 1, 1)
+    assert (score.of, np.isnan(score.cpu_mean_s)) == (PER_SCENE * len(SCENES), True)
 
 
 def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
