@@ -6,7 +6,7 @@ import typer
 
 from tableverse_factory.cli import options
 from tableverse_factory.cli.build import make_display, report_summary
-from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.errors import InputError, TableverseError
 
 
 def cousins(
@@ -61,27 +61,32 @@ def cousins(
     overrides = [*(overrides or []), f"run.seed={seed}"]
     load_config(config, overrides)  # what is refused leaves no manifest behind
     rows = ImageRows.from_rows(list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind))
-    if not manifest.exists():
+    if written := not manifest.exists():
         write_manifest(manifest, rows)
     elif digest_manifest(read_manifest(manifest)) != digest_manifest(rows):
         raise InputError(
             f"{manifest} lists other rows than {per_scene} cousins of each scene with seed {seed}: give --per-scene "
             "and --seed as when it was written, or another DEST"
         )
-    summary = build(
-        str(manifest),
-        dest,
-        config=config,
-        overrides=overrides,
-        executor=executor,
-        workers=workers,
-        address=address,
-        pools=pools,
-        limit=limit,
-        shards=shards,
-        max_usd=max_usd,
-        max_calls=max_calls,
-        display=make_display(dest, metrics),
-        signals=StopSignals(),
-    )
+    try:
+        summary = build(
+            str(manifest),
+            dest,
+            config=config,
+            overrides=overrides,
+            executor=executor,
+            workers=workers,
+            address=address,
+            pools=pools,
+            limit=limit,
+            shards=shards,
+            max_usd=max_usd,
+            max_calls=max_calls,
+            display=make_display(dest, metrics),
+            signals=StopSignals(),
+        )
+    except TableverseError:
+        if written and not (place / "plan.parquet").exists():
+            manifest.unlink()  # a build that was refused leaves no manifest behind
+        raise
     report_summary(summary, dest)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 from jaxtyping import Float64
 
 from schemas.geometry import Points, Pose
@@ -38,6 +39,8 @@ class ReplayPolicy:
         if dataset is None:
             raise ConfigError("the policy replay needs a dataset to replay: give its OUT as --weights")
         self._dataset = open_dataset(dataset)
+        if not self._dataset.trajectories.to_table(["scene_id"], filter=pc.field("success")).num_rows:
+            raise InputError(f"{dataset}: no motion to replay: build trajectories", "no_trajectories")
         self._tasks: dict[tuple[str, str], list[tuple[Task, Features]]] = {}  # by arm and relation
         self._robots: set[str] = set()
 

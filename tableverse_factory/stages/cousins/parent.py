@@ -1,5 +1,6 @@
 """Scene of a dataset as a layout again: its meshes with their colours, convex pieces and poses, from its own files."""
 
+import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -106,6 +107,12 @@ def _read_file(scene: Scene, name: str) -> bytes:
     files = scene.files()
     if name not in files:
         raise InputError(f"scene {scene.scene_id} has no {name}", "bad_scene")
+    try:
+        exported = scene.meta["files"][name]["sha256"]
+    except (KeyError, TypeError):
+        exported = None
+    if hashlib.sha256(files[name]).hexdigest() != exported:
+        raise InputError(f"scene {scene.scene_id}: {name} is not the file that was exported: restore it", "bad_scene")
     return files[name]
 
 

@@ -1,8 +1,11 @@
 """Baselines: the planner and a replayed motion reach what is known to be possible, chance does not."""
 
+import shutil
+
+import pyarrow.parquet as pq
 import pytest
 
-from tableverse_factory.core.errors import ConfigError
+from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName, load_policy
 from tableverse_factory.evaluation.benchmark.play import play_episode
 from tableverse_factory.evaluation.benchmark.replay import ReplayPolicy
@@ -40,6 +43,14 @@ def test_the_nearest_demonstration_of_training_is_replayed(benchmark, dataset):
     assert (result.reason, result.steps) == ("no_demonstration", 0)
     with pytest.raises(ConfigError, match="give its OUT as --weights"):
         ReplayPolicy()
+
+
+def test_a_dataset_without_motions_is_refused_before_anything_is_played(dataset, tmp_path):
+    shutil.copytree(dataset.path, tmp_path / "out")
+    for file in (tmp_path / "out" / "trajectories").glob("*.parquet"):
+        pq.write_table(pq.read_table(file).slice(0, 0), file)
+    with pytest.raises(InputError, match="no motion to replay"):
+        ReplayPolicy(str(tmp_path / "out"))
 
 
 @pytest.mark.parametrize("name", ["state", pytest.param("picture", marks=pytest.mark.slow)])

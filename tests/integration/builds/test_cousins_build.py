@@ -170,6 +170,22 @@ def test_a_dataset_that_was_built_anew_is_noticed(made, tmp_path):
     assert {row["reason"] for row in rows_of(build(tmp_path, "dropped"))} == {"content_changed"}
 
 
+def test_a_digit_of_a_mesh_that_changed_fails_its_cousins(made, tmp_path):
+    """It would otherwise be certified anew, under digests of its own."""
+    shutil.copytree(made / "out", tmp_path / "out")
+    for tar in (tmp_path / "out" / "mjcf").glob("*.tar"):
+        content = bytearray(tar.read_bytes())
+        start = content.index(b"\nv ") + 3
+        place = next(k for k in range(start, start + 40) if content[k : k + 1].isdigit())
+        content[place] = ord("1") if content[place] != ord("1") else ord("2")
+        tar.write_bytes(bytes(content))
+    rows = [row.model_copy(update={"uri": str(tmp_path / "out")}) for row in plan(made / "out", 1)]
+    write_manifest(tmp_path / "cousins.parquet", rows)
+    failed = [row for row in rows_of(build(tmp_path, "dest")) if row["status"] == "failed"]
+    assert failed
+    assert all("is not the file that was exported" in row["detail"] for row in failed)
+
+
 @pytest.mark.slow  # three builds
 def test_cousins_of_a_damaged_parent_fail_and_are_made_once_it_is_restored(made, tmp_path, run):
     """A cut tar, as by a full disk, is no property of the scene: it must not pass for a finished dataset."""
@@ -238,6 +254,10 @@ def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
     code, _, errors = run("cousins", made / "out", tmp_path / "photographs", "--executor", "local")
     assert (code, photographs.read_bytes()) == (1, (made / "cousins.parquet").read_bytes())
     assert "or another DEST" in errors
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("kept")
+    assert run("cousins", made / "out", tmp_path / "mine", "--executor", "local")[0] == 1
+    assert not (tmp_path / "mine.parquet").exists()
     code, _, errors = run("cousins", made / "out", made / "out", "--executor", "local")
     assert code == 1
     assert "is the dataset of the parents" in errors
