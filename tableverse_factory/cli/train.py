@@ -209,9 +209,8 @@ def train_policy(
     if state is not None and chunks is not None:
         raise ConfigError("--chunks is for a policy on states: one on pictures takes its motions from --pictures-from")
     steps = steps or (3_000 if state is None else 8_000)
-    settings = PolicySettings(
-        steps, seed, goals, chunks=chunks or 512, views=views or 64, scenes=scenes, motions=motions
-    )
+    given = {name: value for name, value in (("chunks", chunks), ("views", views)) if value is not None}
+    settings = PolicySettings(steps, seed, goals, scenes=scenes, motions=motions, **given)
     if state is not None:
         load_teacher(settings, state)  # what is refused is, before hours of packing
     demonstrations = _provide_packed(folder / "demonstrations.npz", datasets or [], robot)

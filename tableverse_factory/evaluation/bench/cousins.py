@@ -57,7 +57,7 @@ class CousinsScore:
     done: int
     of: int
     lost: tuple[tuple[str, int], ...]  # reasons of drops and kinds of failures, with their number
-    cpu_mean_s: float  # as the next three NaN where no stage was timed: all cousins were dropped before it
+    cpu_mean_s: float  # NaN, like the next three, while no cousin of a committed shard was timed
     cpu_median_s: float
     cpu_p95_s: float
     cpu_max_s: float

@@ -175,6 +175,7 @@ def test_sleep_hides_no_drift_and_is_over_afterwards(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 0.0)
     awake = measure_drift(model, 5.0)
     np.testing.assert_allclose(drift.distance_m, awake.distance_m, atol=25e-6)
+    np.testing.assert_allclose(drift.angle_rad, awake.angle_rad, atol=25e-6 / 0.03)
     if "1e-4" in slope:
         monkeypatch.setattr(at_rest, "DRIFT_SLEEP_TOLERANCE", 1e-3)
         frozen = measure_drift(model, 5.0)
