@@ -21,7 +21,7 @@ from schemas.address import is_loopback
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.evaluation.benchmark.json_arrays import encode_array, encode_start
-from tableverse_factory.evaluation.benchmark.policy import EpisodeStart, PolicyError, check_policy
+from tableverse_factory.evaluation.benchmark.policy import EpisodeStart, PolicyError, PolicyGoneError, check_policy
 
 ANSWER_S = 60.0  # time limit of an answer [s]
 MAX_ANSWER_BYTES = 1024 * 1024
@@ -50,7 +50,7 @@ class HttpPolicy:
         check_policy(self, address)
 
     def reset(self, start: EpisodeStart) -> None:
-        """Begin an episode."""
+        """Begin an episode; PolicyGoneError if nothing listens any more."""
         self._ask("/reset", {"session": self._session, "start": encode_start(start)})
 
     def act(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -78,6 +78,12 @@ class HttpPolicy:
                 self._close()
                 if fresh:
                     raise _connection_error(path, error) from None
+            except ConnectionRefusedError as error:
+                self._close()
+                if path == "/reset":  # no episode has begun that could be lost
+                    problem = f"nothing answers at http://{self._host}:{self._port} any more: start the policy again"
+                    raise PolicyGoneError(f"{problem}, and the same command goes on", "bad_policy") from None
+                raise _connection_error(path, error) from None
             except (OSError, http.client.HTTPException) as error:
                 self._close()
                 raise _connection_error(path, error) from None

@@ -22,6 +22,7 @@ from tableverse_factory.evaluation.benchmark.policy import (
     EpisodeStart,
     Policy,
     PolicyError,
+    PolicyGoneError,
     check_action,
     is_privileged,
     sample_points,
@@ -139,6 +140,8 @@ def _ask(question: Callable[[Told], Answer], told: Told) -> Answer:
     try:
         return question(told)
     except Exception as error:  # of foreign code, whose failure is a result
+        if isinstance(error, PolicyGoneError):
+            raise
         if isinstance(error, PolicyError) and re.fullmatch("[a-z_]{1,60}", str(error.reason)):
             raise
         text = type(error).__name__

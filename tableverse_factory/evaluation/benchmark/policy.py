@@ -90,6 +90,10 @@ class PolicyError(Exception):
         self.reason = reason
 
 
+class PolicyGoneError(InputError):
+    """The process of a policy has ended between episodes: the run ends, and the same command goes on with it."""
+
+
 def is_privileged(policy: Policy) -> bool:
     """Return whether a policy asks for the environment itself."""
     return bool(getattr(policy, "privileged", False))

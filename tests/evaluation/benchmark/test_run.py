@@ -18,6 +18,7 @@ from tableverse_factory.evaluation.benchmark.benchmark import Benchmark
 from tableverse_factory.evaluation.benchmark.episode_processes import EpisodeProcesses, PlayPlan
 from tableverse_factory.evaluation.benchmark.journal import open_journal
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
+from tableverse_factory.evaluation.benchmark.policy_server import PolicyServer
 from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_results, read_results
 from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
 from tests.helpers.learnable_dataset import write_learnable_dataset
@@ -228,3 +229,32 @@ def test_a_process_that_ends_between_episodes_costs_none(benchmark, dataset, pol
         time.sleep(1.0)
         second = list(processes.play(benchmark.episodes[:1], 1))
     assert [row.reason for row in first + second] == ["policy_error"] * 2
+
+
+def test_a_served_policy_that_is_gone_ends_the_run_and_loses_no_episode(benchmark, dataset, policies, tmp_path):
+    class Fails:
+        pictures, picture_size = (), (96, 128)
+
+        def reset(self, start):
+            threading.Thread(target=server.shutdown).start()
+            raise RuntimeError("first and last")
+
+        def act(self, observation):
+            raise NotImplementedError
+
+    out = tmp_path / "served.jsonl"
+    with PolicyServer(Fails, 0) as server:
+        name = PolicyName(f"http://127.0.0.1:{server.server_port}")
+
+        def serve():
+            server.serve_forever(0.02)
+            server.server_close()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(InputError, match="start the policy again, and the same command goes on"):
+            run(benchmark, dataset, name, out, jobs=1)
+        thread.join()
+    assert not out.exists()
+    journal = (tmp_path / "served.jsonl.journal").read_text()
+    assert journal.count("policy_error") == 1
