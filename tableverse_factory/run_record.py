@@ -106,7 +106,7 @@ def map_parts_to_stages() -> dict[str, str]:
 
 
 def _list_recorders() -> dict[str, tuple[Stage, RecordFunction]]:
-    from tableverse_factory.pipeline import WITH_TRAJECTORIES  # imports all stages, which readers need not load
+    from tableverse_factory.pipeline import WITH_TRAJECTORIES  # what stages check and record is not for readers
 
     stages = (stage for line in WITH_TRAJECTORIES.values() for stage in line)
     return {part: (stage, record) for stage in stages for part, record in stage.recorded.items()}

@@ -1,5 +1,7 @@
 """A stage reads of the configuration what it says and nothing else: by this its records are found again, or not."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +56,13 @@ def test_stages_read_what_they_declare(entries, tmp_path, kind):
         undeclared = read - set(stage.select_values(Config()))
         assert not undeclared, f"{stage.name} reads {undeclared} and does not say so"
         item = outcome.value
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("module", ["tableverse_factory.pipeline", "workers.api"])
+def test_whoever_only_plans_a_build_imports_no_native_code_of_stages(module):
+    line = f"import sys, {module}; print(*({{'open3d', 'mujoco', 'scipy', 'trimesh', 'coal'}} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", line], check=True, capture_output=True, text=True).stdout.split() == []
 
 
 def test_what_a_stage_declares_is_there():

@@ -18,7 +18,6 @@ from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
 from tableverse_factory.dataset.shard_plan import parse_shards
 from tableverse_factory.rebuild import config_from_run
 from tableverse_factory.run_record import read_run
-from tableverse_factory.stages.trajectories.preflight import check_trajectory_models
 from workers.driver.budget import SpendingLimits
 from workers.driver.signals import StopSignals
 from workers.executors.ray_address import parse_host_port
@@ -100,6 +99,9 @@ def build(
     else:
         settings = load_config(None if config is None else Path(config), _format_overrides(overrides))
     if pipeline == WITH_TRAJECTORIES:
+        # Imports MuJoCo and the planners, which other builds do not need in this process.
+        from tableverse_factory.stages.trajectories.preflight import check_trajectory_models
+
         check_trajectory_models(settings.trajectories, here=executor == "local" or address is None)
     request = BuildRequest(
         manifest=None if manifest is None else parse_path(os.fspath(manifest)),

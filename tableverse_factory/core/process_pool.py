@@ -17,6 +17,7 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.open3d_import import stub_plotly
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -90,11 +91,15 @@ def _translate_death(doing: str) -> Iterator[None]:
 
 
 def prepare_child() -> None:
-    """Limit a child to one thread, and end it with its parent: it would wait for work forever."""
+    """Limit a child to one thread, and end it with its parent: it would wait for work forever.
+
+    Children work for this package alone, so that plots need not be imported there.
+    """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
     if parent is None or os.getppid() != parent.pid:
         os._exit(1)  # it was killed just before
+    stub_plotly()
     threadpool_limits(1)
 
 

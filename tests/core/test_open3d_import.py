@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from tableverse_factory.core.process_pool import parallel_map
+
 pytestmark = pytest.mark.heavy
 
 CAST = """
@@ -24,6 +26,16 @@ def run_import(before: str) -> list[str]:
 def test_rays_hit_without_a_web_server_in_the_process():
     ours = run_import("from tableverse_factory.core.open3d_import import stub_plotly; stub_plotly()")
     assert ours == ["1.0", "False"]
+
+
+def find_web_server(_: int) -> bool:
+    import open3d  # noqa: F401 - the process of a pool imports it here
+
+    return "werkzeug" in sys.modules
+
+
+def test_processes_of_a_pool_load_no_web_server():
+    assert list(parallel_map(find_web_server, [0, 1], 2, "imports")) == [False, False]
 
 
 def test_importing_us_leaves_the_plots_of_others_alone():

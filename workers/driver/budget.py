@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from schemas.config import Config, RemoteModelSection
 from schemas.outcome import NO_COST, Allowance, ModelCost
-from tableverse_factory.models.remote.client import MOST_CALLS
+from tableverse_factory.models.remote.endpoint import MOST_CALLS
 from tableverse_factory.stage import Stage
 
 

@@ -30,7 +30,7 @@ from tableverse_factory.dataset.parts import PartWriter
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.models.services import Services
-from tableverse_factory.stage import Pipelines, Stage
+from tableverse_factory.stage import Pipelines, Stage, import_stages
 from workers.sandbox.channel import Channel, ChannelClosedError
 from workers.sandbox.error_text import bound_drop, bound_failure, make_failure
 from workers.sandbox.messages import InputMissing, StageDone, encode_message
@@ -62,8 +62,9 @@ class StageRunner:
     """Runner of any stage of the pipelines, in this process and on one thread."""
 
     def __init__(self, setup: SandboxSetup) -> None:
-        """Import the pipelines and create the services."""
+        """Import the pipelines with their stages, and create the services."""
         self._pipelines = load_pipelines(setup.pipeline)
+        import_stages(self._pipelines.values())  # counts in no deadline, and in the time of no scene
         self._config = Config.model_validate_json(setup.config_json)
         folder = parse_path(setup.records_dir)
         self._spending = CostLog(folder.parent)

@@ -25,6 +25,7 @@ from tableverse_factory.dataset.shards import TarShard, check_exported
 from tableverse_factory.evaluation.bench.measurement import Stopwatch
 from tableverse_factory.models.services import Services
 from tableverse_factory.pipeline import PIPELINES
+from tableverse_factory.stage import import_stages
 
 RECORDS, COMMIT = "records", "commit"  # coding of the records between the stages, and writing a shard of one scene
 
@@ -54,6 +55,7 @@ def bench_stages(
 
     The in-memory caches of this process and of MuJoCo are cleared before each scene; `on_scene` is called after each.
     """
+    import_stages(PIPELINES[row.kind] for row in rows)
     costs = []
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         for cache in ("cold", "warm"):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tableverse_factory.models.local.device import Tensor, import_torch
-from tableverse_factory.stages.perceive.learned.features import CHANNELS, OUTPUTS
+from tableverse_factory.stages.perceive.learned.net_format import CHANNELS, OUTPUTS
 
 WIDTHS = (32, 64, 128, 224)  # channels at 1/2, 1/4, 1/8 and 1/16 of the height and width of the input
 

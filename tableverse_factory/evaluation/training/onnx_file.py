@@ -9,7 +9,7 @@ from tableverse_factory.core.errors import ModelError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.evaluation.training.network import ConvLayer, fold_batch_norm, forward, list_layers
 from tableverse_factory.models.local.device import import_torch
-from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS
+from tableverse_factory.stages.perceive.learned.net_format import CHANNELS, FORMAT, OUTPUTS
 from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet
 
 OPSET = 17

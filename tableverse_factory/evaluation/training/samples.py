@@ -10,7 +10,8 @@ from schemas.geometry import Frozen, IdImage, Mask
 from tableverse_factory.evaluation.training.views import TrainingView
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
-from tableverse_factory.stages.perceive.learned.features import OFFSET_UNIT_M, THINNING, compute_features
+from tableverse_factory.stages.perceive.learned.features import OFFSET_UNIT_M, compute_features
+from tableverse_factory.stages.perceive.learned.net_format import THINNING
 
 TILT_RAD = 0.012
 LIFT_M = 0.002

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 from tableverse_factory.core.errors import AnswerInvalidError, ModelError
 from tableverse_factory.core.retry import TransientError
 from tableverse_factory.models.remote.answers import AnswerCache, compute_answer_key
-from tableverse_factory.models.remote.endpoint import ATTEMPTS, Endpoint
+from tableverse_factory.models.remote.endpoint import Endpoint
 from tableverse_factory.models.remote.exchange import ChatCompletion, Message, Usage, replace_lone_surrogates
 from tableverse_factory.models.remote.gemini_chat import complete_gemini
 from tableverse_factory.models.remote.http import BoundedClient, send_with_retries
@@ -28,7 +28,6 @@ _KEY_HEADERS: dict[str, Callable[[str], dict[str, str]]] = {
     "gemini": lambda key: {"x-goog-api-key": key},
 }
 
-MOST_CALLS = 2 * ATTEMPTS  # maximum number of requests for one question: two rounds, each with all its retries
 _REPAIR_CHARS = 20_000  # maximum length of an answer that is sent back for repair
 _REPAIR_PROMPT = (
     "That answer cannot be used: {}. Give the whole answer again, corrected, as one JSON object in the schema, "

@@ -12,6 +12,7 @@ from tableverse_factory.models.remote.exchange import Usage
 Dialect = Literal["openai", "gemini", "grasps", "meshes"]
 GEMINI_URL = "https://generativelanguage.googleapis.com/v1beta"
 ATTEMPTS = 5
+MOST_CALLS = 2 * ATTEMPTS  # maximum number of requests for one question: two rounds, each with all its retries
 MAX_BODY_BYTES = 4 * 1024 * 1024
 
 

@@ -6,8 +6,7 @@ from schemas.config import Config
 from schemas.manifest import SceneKind
 from tableverse_factory.models.local.preflight import check_weights
 from tableverse_factory.models.picture.net import check_picture_net
-from tableverse_factory.stages.observe.depth import moge
-from tableverse_factory.stages.observe.depth.from_git import check_git_package
+from tableverse_factory.stages.observe.depth.from_git import MOGE_CHECKPOINT, check_git_package
 
 _KEY = "observe.depth_weights"
 _GIT_PACKAGES = {
@@ -27,5 +26,5 @@ def check_depth_model(config: Config, kinds: Collection[SceneKind], here: bool) 
         return
     if here and backend in _GIT_PACKAGES:
         check_git_package(_GIT_PACKAGES[backend])
-    pattern = {"pattern": moge.CHECKPOINT} if backend == "moge_2" else {}
+    pattern = {"pattern": MOGE_CHECKPOINT} if backend == "moge_2" else {}
     check_weights(_KEY, backend, weights, config.models, here, **pattern)

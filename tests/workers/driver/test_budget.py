@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from schemas.config import Config, CurateConfig, PerceiveConfig, RemoteModelSection
 from schemas.outcome import NO_COST, UNLIMITED, Allowance, ModelCost
 from tableverse_factory.core.errors import BudgetSpentError, ModelAccessError
-from tableverse_factory.models.remote.client import MOST_CALLS
 from tableverse_factory.models.remote.cost_meter import Meter
+from tableverse_factory.models.remote.endpoint import MOST_CALLS
 from tableverse_factory.pipeline import PIPELINES
 from workers.driver.budget import NO_LIMITS, Budget, SpendingLimits, calls_model, resume_budget
 from workers.state.cost_log import CostLog, sum_costs, sum_costs_by_grant

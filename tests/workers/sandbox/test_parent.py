@@ -143,9 +143,18 @@ def test_the_clock_of_the_deadline_starts_with_the_stage_not_with_the_import(tmp
     assert report.wall_s < 0.5 * (time.monotonic() - started), "most of the time is the import"
 
 
-def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path):
+def test_what_a_stage_defers_is_imported_before_its_clock_starts(tmp_path):
+    sandbox = Sandbox(_setup(tmp_path, attempts=1, pipeline="tests.helpers.deferred_pipeline:PIPELINES"))
+    report, _ = _run_one(sandbox, 0, "fine", deadline_s=0.9)
+    sandbox.close()
+    assert report.outcome is None
+    assert report.wall_s < 0.9, "its import alone takes a second"
+
+
+@pytest.mark.parametrize("pipeline", ["no_such_module:PIPELINES", "tests.helpers.deferred_pipeline:MISSING"])
+def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path, pipeline):
     with pytest.raises(BuildError, match="no_such_module"):
-        _run_one(Sandbox(_setup(tmp_path, pipeline="no_such_module:PIPELINES")), 0, "fine")
+        _run_one(Sandbox(_setup(tmp_path, pipeline=pipeline)), 0, "fine")
 
 
 def test_close_leaves_no_process(sandbox):

@@ -11,6 +11,7 @@ PACKAGES = {
     "depth_anything_3": ("Depth Anything 3", "git+https://github.com/ByteDance-Seed/Depth-Anything-3"),
     "moge": ("MoGe-2", "git+https://github.com/microsoft/MoGe"),
 }
+MOGE_CHECKPOINT = "model.pt"  # in a local folder; names on the hub the package resolves itself
 
 
 def check_git_package(package: str) -> None:

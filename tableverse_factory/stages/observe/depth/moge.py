@@ -20,11 +20,10 @@ from tableverse_factory.models.local.hf_weights import resolve_source
 from tableverse_factory.models.local.weights import load_foreign, load_once
 from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, build_capture, parse_intrinsics
-from tableverse_factory.stages.observe.depth.from_git import import_git_package
+from tableverse_factory.stages.observe.depth.from_git import MOGE_CHECKPOINT, import_git_package
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
 
 KEY = "observe.depth_weights"
-CHECKPOINT = "model.pt"  # in a local folder; names on the hub the package resolves itself
 
 
 def estimate_moge_2(item: ImageRow, config: Config) -> Capture:
@@ -36,7 +35,7 @@ def estimate_moge_2(item: ImageRow, config: Config) -> Capture:
     name, at = resolve_source(weights, KEY)
 
     def make() -> Any:
-        checkpoint = str(Path(name) / CHECKPOINT) if Path(name).is_dir() else name
+        checkpoint = str(Path(name) / MOGE_CHECKPOINT) if Path(name).is_dir() else name
         return model_type.from_pretrained(checkpoint, **at).to(device.torch_device).eval()
 
     model = load_once(("moge_2", weights, device), lambda: load_foreign(make, weights, KEY))

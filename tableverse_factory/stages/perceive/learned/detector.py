@@ -21,14 +21,9 @@ from tableverse_factory.stages.perceive.base.table_view import ImageWindow, Tabl
 from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
 from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_holes, to_detections
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
-from tableverse_factory.stages.perceive.learned.features import (
-    MULTIPLE,
-    OFFSET_UNIT_M,
-    PIXELS,
-    THINNING,
-    compute_features,
-)
+from tableverse_factory.stages.perceive.learned.features import MULTIPLE, OFFSET_UNIT_M, PIXELS, compute_features
 from tableverse_factory.stages.perceive.learned.mean_shift import cluster_votes
+from tableverse_factory.stages.perceive.learned.net_format import THINNING
 from tableverse_factory.stages.perceive.learned.onnx import SegmentationNet, load_net
 
 MIN_VOTES = 24

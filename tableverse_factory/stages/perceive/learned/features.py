@@ -7,12 +7,9 @@ from jaxtyping import Float, Float32
 from scipy import ndimage
 
 from schemas.geometry import Mask
+from tableverse_factory.stages.perceive.learned.net_format import CHANNELS
 
-FORMAT: Final = "tableverse-segmenter-1"  # in the ONNX file's metadata; changes with the meaning of its input or output
-CHANNELS: Final = 7
-OUTPUTS: Final = 4  # logit of being an object, then the offset to its centre in the table frame in `OFFSET_UNIT_M`
 MULTIPLE: Final = 16  # height and width of the input are multiples of it
-THINNING: Final = 2  # rows and columns of the input per one of the output, whose pixel k is the input's pixel 2k
 PIXELS: Final = 80_000  # approximate size of the training pictures; larger ones are thinned to it
 ALONG_UNIT_M: Final = 0.3
 HEIGHT_UNIT_M: Final = 0.15

@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from tableverse_factory.core.errors import ModelError, WeightsError
 from tableverse_factory.models.local.onnx_session import open_onnx_session, shorten_onnx_error
-from tableverse_factory.stages.perceive.learned.features import CHANNELS, FORMAT, OUTPUTS, THINNING
+from tableverse_factory.stages.perceive.learned.net_format import CHANNELS, FORMAT, OUTPUTS, THINNING
 
 MAX_BYTES = 64 * 1024 * 1024
 _KEY = "perceive.detector_weights"
