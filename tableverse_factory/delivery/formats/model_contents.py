@@ -24,9 +24,9 @@ from tableverse_factory.delivery.formats.model_views import (
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.physics.mjcf.geom_meshes import body_name, make_geom_mesh
 from tableverse_factory.physics.mjcf.scenery import Rgb, make_geom_box, make_geom_plane, read_geom_color, read_geom_mesh
 from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
-from tableverse_factory.physics.simulate.model_solids import body_name, make_geom_mesh
 
 # Lowercase names of supports, which are never taken for objects
 TABLE_NAMES = frozenset({"table", "tabletop", "table_top", "table-top", "ground", "floor", "groundplane", "desk"})

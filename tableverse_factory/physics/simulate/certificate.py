@@ -12,9 +12,10 @@ from schemas.scene import Certificate
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh
 from tableverse_factory.geometry.relations.containers import make_hollow_vessel
+from tableverse_factory.physics.mjcf.geom_meshes import body_name
 from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, measure_drift, read_body_poses, set_poses
-from tableverse_factory.physics.simulate.model_solids import ModelBody, body_name, find_deepest_overlaps, load_bodies
+from tableverse_factory.physics.simulate.model_solids import ModelBody, find_deepest_overlaps, load_bodies
 
 DRIFT_TIME_S = 5.0
 DRIFT_LIMIT_M = 0.001

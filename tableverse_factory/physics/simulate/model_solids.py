@@ -7,7 +7,6 @@ from functools import cached_property
 import manifold3d
 import mujoco
 import numpy as np
-import trimesh
 
 from schemas.geometry import Frozen, Points, Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
@@ -23,17 +22,15 @@ from tableverse_factory.geometry.math.transforms import (
     transform_points,
 )
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
-from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, from_trimesh, place_mesh
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, place_mesh
 from tableverse_factory.geometry.mesh.repair import MIN_FILL_SHARE, make_closed_solid, mesh_to_solid
 from tableverse_factory.geometry.mesh.shells import is_one_shell
+from tableverse_factory.physics.mjcf.geom_meshes import body_name, make_geom_mesh
 from tableverse_factory.physics.mjcf.inertia import is_closed
-from tableverse_factory.physics.mjcf.scenery import read_mesh
 from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies
 
 _MIN_CROPPED_FACES = 500  # of fewer the whole solid is made
-_SEGMENTS = 48
-_PLANE_REACH_M = 50.0
 
 
 class GeomSolid:
@@ -107,11 +104,6 @@ def load_bodies(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody
     own = ((body_name(model, root), root, np.flatnonzero(roots == root)) for root in free)
     moving = tuple(_load_body(model, data, *body) for body in own)
     return moving, _load_body(model, data, "world", 0, np.flatnonzero(~np.isin(roots, free)))
-
-
-def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Name of a body, or `#` and its id where it has none."""
-    return model.body(body).name or f"#{body}"
 
 
 def find_deepest_overlaps(
@@ -190,25 +182,3 @@ def _close_mesh(mesh: TriangleMesh) -> tuple[manifold3d.Manifold, str]:
         return make_closed_solid(mesh)
     except GeometryError:
         return manifold3d.Manifold.hull_points(mesh.vertices.copy()), "hull"
-
-
-def make_geom_mesh(model: mujoco.MjModel, geom: int) -> TriangleMesh | None:
-    """Make a geom's triangles in its own frame; None for types without volume of their own (height fields)."""
-    kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return read_mesh(model, int(model.geom_dataid[geom]))
-    if kind == mujoco.mjtGeom.mjGEOM_PLANE:
-        slab = trimesh.creation.box((2 * _PLANE_REACH_M, 2 * _PLANE_REACH_M, _PLANE_REACH_M))
-        slab.apply_translation([0, 0, -_PLANE_REACH_M / 2])
-        return from_trimesh(slab)
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return from_trimesh(trimesh.creation.box(2 * size))
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return from_trimesh(trimesh.creation.cylinder(size[0], 2 * size[1], sections=_SEGMENTS))
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return from_trimesh(trimesh.creation.capsule(2 * size[1], size[0], count=[_SEGMENTS // 2, _SEGMENTS]))
-    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
-        radii = np.full(3, size[0]) if kind == mujoco.mjtGeom.mjGEOM_SPHERE else size
-        ball = from_trimesh(trimesh.creation.icosphere(4))
-        return TriangleMesh(ball.vertices * radii, ball.faces)
-    return None

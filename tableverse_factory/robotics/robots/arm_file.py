@@ -15,8 +15,8 @@ from schemas.trajectories import JointVector
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.physics.mjcf.file_check import check_files
+from tableverse_factory.physics.mjcf.geom_meshes import make_geom_mesh
 from tableverse_factory.physics.simulate.at_rest import make_quiet_data
-from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import Arm, list_bodies_between
 from tableverse_factory.robotics.robots.gripper import measure_gripper, robot_error
 

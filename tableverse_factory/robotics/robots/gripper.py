@@ -8,8 +8,8 @@ import numpy as np
 from schemas.geometry import Frozen, Points
 from schemas.trajectories import JointVector
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.physics.mjcf.geom_meshes import make_geom_mesh
 from tableverse_factory.physics.simulate.at_rest import make_quiet_data
-from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import GripperShape
 
 SETTLE_S = 3.0

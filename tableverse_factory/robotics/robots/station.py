@@ -14,8 +14,8 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.geometry.relations.relations import Points2, compute_outline
 from tableverse_factory.physics.mjcf.file_check import check_references
+from tableverse_factory.physics.mjcf.geom_meshes import make_geom_mesh
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, make_quiet_data
-from tableverse_factory.physics.simulate.model_solids import make_geom_mesh
 from tableverse_factory.robotics.robots.arm import Arm
 
 PREFIX = "robot/"  # prefix of the arm's names in the scene's model

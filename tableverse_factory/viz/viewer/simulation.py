@@ -9,8 +9,8 @@ import numpy as np
 
 from schemas.geometry import Frozen, Points, Pose, Vector3
 from schemas.trajectories import Numbers
+from tableverse_factory.physics.mjcf.geom_meshes import body_name
 from tableverse_factory.physics.simulate.at_rest import UNSTABLE, find_free_bodies, make_quiet_data, read_body_poses
-from tableverse_factory.physics.simulate.model_solids import body_name
 
 MAX_CONTACTS = 1000  # most contacts shown, the strongest first
 
