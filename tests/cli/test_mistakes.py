@@ -151,6 +151,35 @@ def test_another_configuration_names_the_key_and_both_values(tableverse, home, t
         assert words in answer.err
 
 
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("out out", "DEST out is the dataset of the parents, out: give a folder apart from it, such as "),
+        ("out ./more/../out", "DEST more/../out is the dataset"),
+        ("out out/cousins", "DEST out/cousins lies within the dataset of the parents, out: "),
+        ("out link", "DEST link, a link to "),
+        ("out link/cousins", "DEST link/cousins lies within the dataset"),
+        ("out inside", "/out/scenes, lies within the dataset"),
+        ("out out/away", "lies within the dataset of the parents"),
+        ("out .", "DEST . holds the dataset of the parents"),
+        ("link out", "DEST out is the dataset of the parents, link: "),
+        ("out round", "round: a link that leads nowhere; give another folder"),
+    ],
+)
+def test_cousins_go_nowhere_into_the_dataset_of_their_parents(tableverse, home, tmp_path, monkeypatch, line, says):
+    shutil.copytree(home / "out", tmp_path / "out")
+    for name, target in (("link", "out"), ("inside", "out/scenes"), ("out/away", "../else"), ("round", "round")):
+        (tmp_path / name).symlink_to(target)
+    for name in ("else", "more"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    answer = tableverse("cousins", *line.split(" "))
+    assert answer.code == 1
+    assert says in answer.err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_a_robot_is_held_against_the_dataset(tableverse, home, tmp_path):
     """One that has no effect, and one that is missing, are said before anything is replayed."""
     out = tmp_path / "out"
