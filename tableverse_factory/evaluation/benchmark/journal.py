@@ -21,6 +21,8 @@ from tableverse_factory.evaluation.benchmark.results import (
 def open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
     """Open the journal of the results `out`, with the rows that both hold; the run removes it when `out` is written.
 
+    If the run ends before, it stays with its rows; without any it is removed.
+
     Raises:
         BuildError: if another process has it open.
         InputError: `other_results` if either is of another benchmark or policy.
@@ -31,14 +33,25 @@ def open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, d
         data = file.read()
         whole = data[: data.rfind(b"\n") + 1]  # a killed process may have torn its last line
         file.truncate(len(whole))
-        if whole:
-            found, rows = decode_results(whole, file.name)
+        found, rows = decode_results(whole, file.name) if whole else (header, {})
+        if rows:
             _check_header(Path(file.name), found, header)
             known |= rows
         else:
+            file.truncate(0)
             file.write(encode_line(header))
             file.flush()
-        yield file, known
+        try:
+            yield file, known
+        finally:
+            _drop_header(file)
+
+
+def _drop_header(file: BinaryIO) -> None:
+    """Empty a journal that holds a header and no whole row."""
+    file.seek(0)
+    if not (file.readline() and file.readline().endswith(b"\n")):
+        file.truncate(0)
 
 
 @contextmanager
@@ -54,7 +67,11 @@ def _lock_file(out: Path) -> Iterator[BinaryIO]:
                     f"{out}: another process writes these results; wait for it, or give another --out"
                 ) from None
             if _is_at(path, file):
-                yield file
+                try:
+                    yield file
+                finally:  # others that wait for the lock see then that the file is gone
+                    if _is_at(path, file) and not path.stat().st_size:
+                        path.unlink()
                 return
 
 

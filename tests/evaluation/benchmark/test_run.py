@@ -19,7 +19,7 @@ from tableverse_factory.evaluation.benchmark.episode_processes import EpisodePro
 from tableverse_factory.evaluation.benchmark.journal import open_journal
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
 from tableverse_factory.evaluation.benchmark.policy_server import PolicyServer
-from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_results, read_results
+from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_line, encode_results, read_results
 from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
 from tests.helpers.learnable_dataset import write_learnable_dataset
 from tests.helpers.paths import ROOT
@@ -183,10 +183,36 @@ def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, datase
     out.write_bytes(encode_results(header.model_copy(update={"benchmark": other.digest}), rows.values()))
     with pytest.raises(InputError, match=r"another run \(benchmark differ\)"), open_journal(out, header):
         pass
+    assert [path.name for path in tmp_path.iterdir()] == ["r.jsonl"], "no journal without rows stays"
     with (tmp_path / "r.jsonl.journal").open("ab") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(BuildError, match="another process writes these results"), open_journal(out, header):
             pass
+
+
+def test_a_journal_without_rows_goes_with_its_run_and_one_with_rows_stays(benchmark, dataset, policies, tmp_path):
+    out, journal = tmp_path / "r.jsonl", tmp_path / "r.jsonl.journal"
+    (row,) = run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+    header, _ = read_results(out)
+    out.unlink()
+    for line in (b"", encode_line(row)):
+        with suppress(KeyboardInterrupt), open_journal(out, header) as (file, _):
+            assert journal.read_bytes() == encode_line(header)
+            file.write(line)
+            raise KeyboardInterrupt
+        assert journal.exists() == bool(line)
+    with suppress(KeyboardInterrupt), open_journal(out, header) as (_, known):
+        assert list(known) == [row.episode_id]
+        raise KeyboardInterrupt
+    assert journal.read_bytes() == encode_line(header) + encode_line(row)
+    journal.write_bytes(b"notes of mine\n")
+    with pytest.raises(InputError, match="is no results file"), open_journal(out, header):
+        pass
+    assert journal.read_bytes() == b"notes of mine\n"
+    journal.write_bytes(encode_line(header.model_copy(update={"policy": "killed before its first row"})))
+    with open_journal(out, header) as (file, known):
+        assert (known, journal.read_bytes()) == ({}, encode_line(header))
+    assert not journal.exists()
 
 
 def test_only_one_run_at_a_time_has_the_journal(tmp_path):
