@@ -92,6 +92,12 @@ def policies(tmp_path_factory):
     return path
 
 
+@pytest.fixture
+def run_command(run):
+    """The command line of `tests/conftest.py`: `run` is a run of a policy here."""
+    return run
+
+
 def run(benchmark, dataset, policy, out, **settings):
     return run_benchmark(benchmark, dataset, policy, out, RunSettings(**settings))[1]
 
@@ -143,7 +149,8 @@ def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies
     rows = run(benchmark, dataset, PolicyName(f"{policies}:Unlucky"), tmp_path / "u.jsonl", jobs=2, episode_s=15.0)
     assert [row.episode_id for row in rows] == [episode.episode_id for episode in benchmark.episodes]
     found = {row.episode_id: (row.reason, row.detail) for row in rows}
-    assert found["test_0000"] == ("policy_error", "RuntimeError: five steps")
+    line = POLICIES.splitlines().index('            raise RuntimeError("five\\nsteps")') + 1
+    assert found["test_0000"] == ("policy_error", f"RuntimeError: five steps (policies.py:{line})")
     assert found["test_0001"][0] == "bad_action"
     assert "give 8 finite numbers" in found["test_0001"][1]
     assert found["test_0000_texture"][0] == "bad_action"
@@ -151,6 +158,43 @@ def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies
     assert found["test_0000_camera"] == ("policy_crash", "its process ended with 3")
     assert found["test_0000_light"] == ("policy_timeout", "took longer than 15 s")
     assert capfd.readouterr().out == ""
+
+
+def test_a_run_ends_with_its_reasons_and_where_the_policy_raised(benchmark, dataset, tmp_path, run_command):
+    """What a policy says of itself moves no cursor, and a thousand reasons are some lines."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (folder / "helper.py").write_text("import json\n\n\ndef parse():\n    return json.loads('\\x1b[2J')\n")
+    policy = tmp_path / "says.py"
+    policy.write_text(
+        "from mine.helper import parse\n"
+        "from tableverse_factory.evaluation.benchmark.policy import PolicyError\n"
+        "class Says:\n"
+        "    pictures, picture_size = (), (96, 128)\n"
+        "    def reset(self, start):\n"
+        "        if start.episode_id == 'test_0000': parse()\n"
+        "        if start.episode_id == 'test_0001': raise ValueError('[bold]' + '\\x1b[2J' * 500)\n"
+        "        raise PolicyError(start.episode_id.replace('0', 'o').replace('1', 'i'), 'no')\n"
+        "    def act(self, observation): pass\n"
+    )
+    file = tmp_path / "benchmark.json"
+    file.write_bytes(benchmark.encode())
+    arguments = ("--dataset", dataset.path, "--policy", f"{policy}:Says", "--out", tmp_path / "says.jsonl", "--jobs", 1)
+    code, text, errors = run_command("benchmark", "run", file, *arguments)
+    assert code == 0, errors
+    said = text.splitlines()
+    assert said[0].startswith("0 of 9 episodes succeed; ")
+    assert said[1].split() == ["reason", "episodes", "for", "example"]
+    assert "policy_error" in said[2]
+    assert text.replace("\n", "").isprintable()
+    assert len(said) <= 30
+    rows = read_results(tmp_path / "says.jsonl")[1]
+    assert rows["test_0000"].detail.endswith(" (mine/helper.py:5)")
+    assert rows["test_0000"].detail.startswith("JSONDecodeError: ")
+    assert rows["test_0001"].detail.startswith("ValueError: [bold]\\x1b[2J")
+    assert rows["test_0001"].detail.endswith("… (says.py:7)")
+    assert len(rows["test_0001"].detail) <= 300
 
 
 def test_a_policy_that_does_not_load_ends_the_run_with_one_line(benchmark, dataset, policies, tmp_path):
