@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.results import (
     EpisodeResult,
     ResultsHeader,
@@ -91,10 +92,22 @@ def _is_of_run(out: Path, header: ResultsHeader) -> bool:
 
 
 def _check_header(path: Path, found: ResultsHeader, header: ResultsHeader) -> None:
-    if found == header:
+    """Refuse results of another run; weights that were moved are the same ones."""
+    if found.model_copy(update={"weights": header.weights}) == header:
         return
-    names = [name for name in ResultsHeader.model_fields if getattr(found, name) != getattr(header, name)]
+    changes = [
+        f"{name} {_was_and_is(getattr(found, name), getattr(header, name))}"
+        for name in ResultsHeader.model_fields
+        if name != "policy_digest" and getattr(found, name) != getattr(header, name)
+    ]
+    if found.policy_digest != header.policy_digest and found.weights[:19] == header.weights[:19]:  # up to the path
+        changes.append(f"the policy's code {_was_and_is(found.policy_digest[:12], header.policy_digest[:12])} (digest)")
     raise InputError(
-        f"{path} holds results of another run ({', '.join(names)} differ): give another --out, or remove it",
+        f"{path} holds results of another run: {'; '.join(changes)}. Give the same, or another --out, or remove it",
         "other_results",
     )
+
+
+def _was_and_is(old: object, new: object) -> str:
+    shown = (sanitize_line(str(value), 200) if value not in ("", ()) else "none" for value in (old, new))
+    return "was {}, and is now {}".format(*shown)

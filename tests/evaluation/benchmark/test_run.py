@@ -1,6 +1,7 @@
 """Runs: the same bytes from any number of processes and after a kill; a policy's failures are rows."""
 
 import fcntl
+import hashlib
 import os
 import signal
 import subprocess
@@ -220,18 +221,36 @@ def test_other_scenes_are_refused_before_anything_is_played(benchmark, tmp_path)
 def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, dataset, policies, tmp_path):
     out = tmp_path / "r.jsonl"
     run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
-    with pytest.raises(InputError, match=r"another run \(policy, policy_digest differ\)"):
+    with pytest.raises(
+        InputError, match=r"another run: policy was policies\.py:Quick, and is now random; the policy's code was "
+    ):
         run(benchmark, dataset, PolicyName("random"), out, splits=("train",))
     header, rows = read_results(out)
     other = Benchmark.model_validate(benchmark.model_dump() | {"seed": 5})
     out.write_bytes(encode_results(header.model_copy(update={"benchmark": other.digest}), rows.values()))
-    with pytest.raises(InputError, match=r"another run \(benchmark differ\)"), open_journal(out, header):
+    with pytest.raises(InputError, match=rf"run: benchmark was {other.digest}, and is now "), open_journal(out, header):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["r.jsonl"], "no journal without rows stays"
     with (tmp_path / "r.jsonl.journal").open("ab") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(BuildError, match="another process writes these results"), open_journal(out, header):
             pass
+
+
+def test_other_weights_are_named_with_their_digests_and_moved_ones_are_the_same(benchmark, dataset, tmp_path):
+    policy, out = tmp_path / "weighed.py", tmp_path / "r.jsonl"
+    policy.write_text(POLICIES + "\nclass Weighed(Quick):\n    def __init__(self, weights): pass\n")
+    first, moved, other = tmp_path / "first.pt", tmp_path / "moved.pt", tmp_path / "other.pt"
+    for path, content in ((first, b"1"), (moved, b"1"), (other, b"2")):
+        path.write_bytes(content)
+    run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(first)), out, splits=("train",))
+    run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(moved)), out, splits=("train",))
+    with pytest.raises(InputError, match="holds results of another run") as caught:
+        run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(other)), out, splits=("train",))
+    old, new = (hashlib.sha256(content).hexdigest()[:12] for content in (b"1", b"2"))
+    for words in (f"weights was sha256 {old}, ", f", and is now sha256 {new}, ", "moved.pt", "other.pt"):
+        assert words in str(caught.value)
+    assert "code" not in str(caught.value)
 
 
 def test_a_journal_without_rows_goes_with_its_run_and_one_with_rows_stays(benchmark, dataset, policies, tmp_path):
