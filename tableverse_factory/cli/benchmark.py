@@ -1,20 +1,24 @@
 """`tableverse benchmark`: frozen episodes for policies, runs of policies on them, and their scores."""
 
 import sys
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from tableverse_factory.cli.options import AsJson, FinishedOut, Jobs, require_local_path
-from tableverse_factory.cli.tables import print_figures, print_json
+from tableverse_factory.cli.tables import make_table, print_figures, print_json
 from tableverse_factory.core.errors import ConfigError
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
+    from tableverse_factory.evaluation.benchmark.results import EpisodeResult
     from tableverse_factory.evaluation.benchmark.score import Rate, Score
 
 Name = TypeVar("Name", bound=str)
+MAX_REASONS = 10  # that a run prints
 
 benchmark = typer.Typer(name="benchmark", help="Test policies on frozen episodes of a dataset.", no_args_is_help=True)
 
@@ -110,6 +114,7 @@ def run(
             read_benchmark(path), open_dataset(dataset), PolicyName(policy, weights, title), out, settings, done.update
         )
     print(f"{sum(row.success for row in rows)} of {pluralize(len(rows), 'episode')} succeed; {out}")
+    _print_reasons(rows)
 
 
 @benchmark.command("score")
@@ -145,6 +150,24 @@ def score(
             print()
     for name, reasons in zip(name_policies(found), found.reasons, strict=True):
         print(f"{name}: {', '.join(f'{count} {reason}' for reason, count in reasons) or 'no failures'}")
+
+
+def _print_reasons(rows: Sequence["EpisodeResult"]) -> None:
+    """Print why episodes failed, the most frequent reasons, each with the detail that most of its episodes have."""
+    from rich.console import Console
+
+    counts = Counter(row.reason for row in rows if row.reason).most_common()
+    if not counts:
+        return
+    table = make_table("reason", figures=["episodes"])
+    table.add_column("for example", overflow="fold")
+    for reason, count in counts[:MAX_REASONS]:
+        detail = Counter(row.detail for row in rows if row.reason == reason).most_common(1)[0][0]
+        example = next(row for row in rows if (row.reason, row.detail) == (reason, detail))
+        table.add_row(reason, str(count), sanitize_line(f"{example.episode_id}{detail and ': '}{detail}", 400))
+    Console(markup=False, highlight=False).print(table)
+    if more := counts[MAX_REASONS:]:
+        print(f"and {pluralize(sum(count for _, count in more), 'episode')} for {pluralize(len(more), 'other reason')}")
 
 
 def _choose(option: str, given: list[str] | None, known: tuple[Name, ...]) -> tuple[Name, ...]:

@@ -1,12 +1,17 @@
 """`tableverse cousins`: new scenes from those of a finished dataset."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tableverse_factory.cli import options
 from tableverse_factory.cli.build import make_display, report_summary
 from tableverse_factory.core.errors import InputError, TableverseError
+from tableverse_factory.core.text import sanitize_line
+
+if TYPE_CHECKING:
+    from tableverse_factory.core.storage.files import StoragePath
 
 
 def cousins(
@@ -55,8 +60,7 @@ def cousins(
     from workers.plan.read_manifest import read_manifest
 
     source, place = parse_path(out), parse_path(dest)
-    if place == source:
-        raise InputError(f"{dest} is the dataset of the parents: give another folder for the cousins")
+    _check_apart(source, place)
     manifest = place.parent / f"{place.name}.parquet"
     overrides = [*(overrides or []), f"run.seed={seed}"]
     load_config(config, overrides)  # what is refused leaves no manifest behind
@@ -90,3 +94,29 @@ def cousins(
             manifest.unlink()  # a build that was refused leaves no manifest behind
         raise
     report_summary(summary, dest)
+
+
+def _check_apart(parents: "StoragePath", dest: "StoragePath") -> None:
+    """Refuse a destination that is, holds or lies within the dataset of the parents, also through a link."""
+    root, folder, beside = _resolve(parents), _resolve(dest), _resolve(dest.parent)
+    if folder == root:
+        problem = "is"
+    elif root in folder.parents or root in (beside, *beside.parents):  # a link may lie within it and lead elsewhere
+        problem = "lies within"
+    elif folder in root.parents:
+        problem = "holds"
+    else:
+        return
+    led = f", a link to {folder}," if isinstance(dest, Path) and dest.is_symlink() else ""
+    raise InputError(
+        sanitize_line(f"DEST {dest}{led} {problem} the dataset of the parents, {parents}", 300)
+        + f": give a folder apart from it, such as {sanitize_line(str(root), 200)}-cousins"
+    )
+
+
+def _resolve(path: "StoragePath") -> "StoragePath":
+    """Resolve the links of a local path."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):  # a link that leads to itself
+        raise InputError(f"{sanitize_line(str(path), 300)}: a link that leads nowhere; give another folder") from None

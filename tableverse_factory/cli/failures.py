@@ -27,22 +27,24 @@ def failures(
         str | None,
         typer.Option(metavar="CODE", help="Only scenes lost for this reason or error kind, also dropped ones."),
     ] = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Put them back: the next build tries them again.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Put them back: the next run tries them again.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show why scenes were lost; `--retry` puts them back.
 
     Without --stage or --reason, the failed ones; with, also those dropped there or for this. What is shown is what
-    `--retry` puts back. The next `tableverse build` computes them again and nothing else, and writes their shards anew.
+    `--retry` puts back. The command that made the dataset then computes them again and nothing else, and writes their
+    shards anew.
 
     Example: `tableverse failures out --reason timeout --retry`
     """
+    from schemas.manifest import SceneKind
     from tableverse_factory.core.storage.files import parse_path
     from workers.plan.invalidate import reopen_scenes
     from workers.progress.build_state import LOST_COLUMNS, read_build_state
 
     place = parse_path(out)
-    state = read_build_state(place, LOST_COLUMNS, ["stage"])
+    state = read_build_state(place, (*LOST_COLUMNS, "kind"), ["stage"])
     lost = state.list_lost()
     if stage is None and reason is None:
         selected = [scene for scene in lost if scene.status == "failed"]
@@ -58,7 +60,8 @@ def failures(
     if retry and selected:
         shards = reopen_scenes(place, [scene.scene_id for scene in selected])
         where = f"{pluralize(len(selected), 'scene')} in {pluralize(shards, 'shard')}"
-        typer.echo(f"{where} put back: run the same `tableverse build` to try again", err=as_json)
+        made_by = "cousins" if SceneKind.COUSIN in state.scenes["kind"].unique().to_pylist() else "build"
+        typer.echo(f"{where} put back: run the same `tableverse {made_by}` to try again", err=as_json)
 
 
 def _find_help(why: str) -> str:

@@ -16,8 +16,17 @@ train = typer.Typer(
     name="train", help="Train networks on synthetic scenes, and policies on a dataset.", no_args_is_help=True
 )
 
+
+def _require_folder(path: Path) -> Path:
+    """Refuse a file, and what would lie within one."""
+    require_local_path(path)
+    if found := next((each for each in (path, *path.parents) if each.exists() and not each.is_dir()), None):
+        raise typer.BadParameter(f"{found} is a file: give a new folder, or one whose training goes on")
+    return path
+
+
 TrainFolder = Annotated[
-    Path, typer.Argument(metavar="DIR", callback=require_local_path, help="New folder, or one to continue.")
+    Path, typer.Argument(metavar="DIR", callback=_require_folder, help="New folder, or one to continue.")
 ]
 TrainSteps = Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps of the training.")]
 TrainBatch = Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")]

@@ -92,6 +92,9 @@ def home(tmp_path_factory) -> Path:
         ("export out out", 1, ["out is the dataset itself"]),
         ("export lerobto out new", 2, ["'lerobto'", "'lerobot'"]),
         ("estimate out", 2, ["--scenes is missing", "tableverse estimate out --scenes"]),
+        ("train policy note.txt --dataset out", 2, ["note.txt is a file", "give a new folder, or one whose training"]),
+        ("train picture note.txt", 2, ["DIR: note.txt is a file"]),
+        ("train segmenter note.txt/net --scenes 1", 2, ["note.txt is a file"]),
         ("textures make marbel-3 --out t.png", 1, ["'marbel-3'", "did you mean marble?"]),
         ("config --config note.txt", 1, ["note.txt", "sections with keys"]),
         ("bench lcr layouts", 2, ["'lcr'", "'lccr'"]),
@@ -149,6 +152,35 @@ def test_another_configuration_names_the_key_and_both_values(tableverse, home, t
     assert answer.code == 1
     for words in ("run.seed was 0 and is now 7", "another OUT"):
         assert words in answer.err
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("out out", "DEST out is the dataset of the parents, out: give a folder apart from it, such as "),
+        ("out ./more/../out", "DEST more/../out is the dataset"),
+        ("out out/cousins", "DEST out/cousins lies within the dataset of the parents, out: "),
+        ("out link", "DEST link, a link to "),
+        ("out link/cousins", "DEST link/cousins lies within the dataset"),
+        ("out inside", "/out/scenes, lies within the dataset"),
+        ("out out/away", "lies within the dataset of the parents"),
+        ("out .", "DEST . holds the dataset of the parents"),
+        ("link out", "DEST out is the dataset of the parents, link: "),
+        ("out round", "round: a link that leads nowhere; give another folder"),
+    ],
+)
+def test_cousins_go_nowhere_into_the_dataset_of_their_parents(tableverse, home, tmp_path, monkeypatch, line, says):
+    shutil.copytree(home / "out", tmp_path / "out")
+    for name, target in (("link", "out"), ("inside", "out/scenes"), ("out/away", "../else"), ("round", "round")):
+        (tmp_path / name).symlink_to(target)
+    for name in ("else", "more"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    answer = tableverse("cousins", *line.split(" "))
+    assert answer.code == 1
+    assert says in answer.err
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_robot_is_held_against_the_dataset(tableverse, home, tmp_path):

@@ -104,7 +104,7 @@ class ShardReader:
         timings: list[Mapping[str, Any]] = []
         for result in results:
             own = {name: getattr(result, name) for name in _RESULT_FIELDS}
-            scenes.append({**own, "shard": shard, **make_cost_columns(result.costs)})
+            scenes.append({**own, "kind": result.row.kind.value, "shard": shard, **make_cost_columns(result.costs)})
             timings += [{name: getattr(t, name, result.scene_id) for name in TIMINGS.names} for t in result.timings]
         rows = _make_table(scenes, SCENES, self._columns), _make_table(timings, TIMINGS, self._timing_columns)
         return ShardRows(*rows, self._nothing.stored)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.results import (
     EpisodeResult,
     ResultsHeader,
@@ -21,6 +22,8 @@ from tableverse_factory.evaluation.benchmark.results import (
 def open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, dict[str, EpisodeResult]]]:
     """Open the journal of the results `out`, with the rows that both hold; the run removes it when `out` is written.
 
+    If the run ends before, it stays with its rows; without any it is removed.
+
     Raises:
         BuildError: if another process has it open.
         InputError: `other_results` if either is of another benchmark or policy.
@@ -31,14 +34,25 @@ def open_journal(out: Path, header: ResultsHeader) -> Iterator[tuple[BinaryIO, d
         data = file.read()
         whole = data[: data.rfind(b"\n") + 1]  # a killed process may have torn its last line
         file.truncate(len(whole))
-        if whole:
-            found, rows = decode_results(whole, file.name)
+        found, rows = decode_results(whole, file.name) if whole else (header, {})
+        if rows:
             _check_header(Path(file.name), found, header)
             known |= rows
         else:
+            file.truncate(0)
             file.write(encode_line(header))
             file.flush()
-        yield file, known
+        try:
+            yield file, known
+        finally:
+            _drop_header(file)
+
+
+def _drop_header(file: BinaryIO) -> None:
+    """Empty a journal that holds a header and no whole row."""
+    file.seek(0)
+    if not (file.readline() and file.readline().endswith(b"\n")):
+        file.truncate(0)
 
 
 @contextmanager
@@ -54,7 +68,11 @@ def _lock_file(out: Path) -> Iterator[BinaryIO]:
                     f"{out}: another process writes these results; wait for it, or give another --out"
                 ) from None
             if _is_at(path, file):
-                yield file
+                try:
+                    yield file
+                finally:  # others that wait for the lock see then that the file is gone
+                    if _is_at(path, file) and not path.stat().st_size:
+                        path.unlink()
                 return
 
 
@@ -74,10 +92,22 @@ def _is_of_run(out: Path, header: ResultsHeader) -> bool:
 
 
 def _check_header(path: Path, found: ResultsHeader, header: ResultsHeader) -> None:
-    if found == header:
+    """Refuse results of another run; weights that were moved are the same ones."""
+    if found.model_copy(update={"weights": header.weights}) == header:
         return
-    names = [name for name in ResultsHeader.model_fields if getattr(found, name) != getattr(header, name)]
+    changes = [
+        f"{name} {_was_and_is(getattr(found, name), getattr(header, name))}"
+        for name in ResultsHeader.model_fields
+        if name != "policy_digest" and getattr(found, name) != getattr(header, name)
+    ]
+    if found.policy_digest != header.policy_digest and found.weights[:19] == header.weights[:19]:  # up to the path
+        changes.append(f"the policy's code {_was_and_is(found.policy_digest[:12], header.policy_digest[:12])} (digest)")
     raise InputError(
-        f"{path} holds results of another run ({', '.join(names)} differ): give another --out, or remove it",
+        f"{path} holds results of another run: {'; '.join(changes)}. Give the same, or another --out, or remove it",
         "other_results",
     )
+
+
+def _was_and_is(old: object, new: object) -> str:
+    shown = (sanitize_line(str(value), 200) if value not in ("", ()) else "none" for value in (old, new))
+    return "was {}, and is now {}".format(*shown)

@@ -46,8 +46,16 @@ class PolicyName:
 
         Of a process behind an address only the address is known.
         """
-        files = [_find_source(self.name), Path(self.weights or SHIPPED.get(self.name) or "")]
-        return content_hash(self.name.encode(), *map(_hash_path, files))
+        return self.identify()[0]
+
+    def identify(self) -> tuple[str, str]:
+        """Return the digest, and a line on the weights: the start of their own SHA-256, and their path as given."""
+        weights = Path(self.weights or SHIPPED.get(self.name) or "")
+        hashed = _hash_path(weights)
+        line = (
+            f"sha256 {(hashed.hex() if weights.is_file() else hashed.decode())[:12]}, {weights}" if weights.name else ""
+        )
+        return content_hash(self.name.encode(), _hash_path(_find_source(self.name)), hashed), sanitize_line(line, 300)
 
     @property
     def shown(self) -> str:

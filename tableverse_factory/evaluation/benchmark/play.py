@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
@@ -27,6 +26,7 @@ from tableverse_factory.evaluation.benchmark.policy import (
     is_privileged,
     sample_points,
 )
+from tableverse_factory.evaluation.benchmark.policy_failure import describe_failure
 from tableverse_factory.evaluation.benchmark.results import EpisodeResult
 from tableverse_factory.physics.mjcf.scene_objects import load_mesh
 
@@ -144,7 +144,4 @@ def _ask(question: Callable[[Told], Answer], told: Told) -> Answer:
             raise
         if isinstance(error, PolicyError) and re.fullmatch("[a-z_]{1,60}", str(error.reason)):
             raise
-        text = type(error).__name__
-        with suppress(Exception):  # even the text of an error may be one
-            text = f"{text}: {error}"
-        raise PolicyError("policy_error", sanitize_line(" ".join(text.split()), 300)) from error
+        raise PolicyError("policy_error", describe_failure(error, 300)) from error

@@ -13,9 +13,9 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.json_arrays import MAX_MESSAGE_BYTES, decode_array, decode_start
 from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
+from tableverse_factory.evaluation.benchmark.policy_failure import describe_failure
 
 MAX_SESSIONS = 256  # the session that was asked longest ago is forgotten
 _IDLE_S = 600.0
@@ -73,8 +73,7 @@ class _Handler(BaseHTTPRequestHandler):
             message = json.loads(self.rfile.read(length))
             status, answer = 200, self.server.answer(self.path, message)
         except Exception as error:  # noqa: BLE001 whatever the policy raises is told to the benchmark
-            text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            status, answer = 500, {"error": sanitize_line(text, 200)}
+            status, answer = 500, {"error": describe_failure(error, 200)}
             self.close_connection = True
         body = json.dumps(answer).encode()
         self.send_response(status)

@@ -35,12 +35,16 @@ Line = Annotated[str, Field(max_length=300), AfterValidator(_check_line)]
 
 
 class ResultsHeader(Record):
-    """What was run: the benchmark's digest, and the policy with the digest of its file and weights."""
+    """What was run: the benchmark's digest, and the policy with the digest of its file and weights.
+
+    `weights` says which they were: the start of their own SHA-256, and their path as given.
+    """
 
     format: Literal["tableverse-results-1"] = "tableverse-results-1"
     benchmark: Digest
     policy: Annotated[Line, Field(min_length=1)]
     policy_digest: Digest
+    weights: Line = ""
     privileged: bool
     pictures: Annotated[tuple[str, ...], Field(max_length=16)]
     picture_size: tuple[int, int]

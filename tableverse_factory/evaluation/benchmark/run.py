@@ -67,10 +67,12 @@ def run_benchmark(
 
 
 def _make_header(benchmark: Benchmark, policy: PolicyName, seen: PolicyDescription) -> ResultsHeader:
+    digest, weights = policy.identify()
     return ResultsHeader(
         benchmark=benchmark.digest,
         policy=policy.shown,
-        policy_digest=policy.digest,
+        policy_digest=digest,
+        weights=weights,
         privileged=seen.privileged,
         pictures=seen.pictures,
         picture_size=seen.picture_size,

@@ -8,6 +8,13 @@ from typing import Any, TypeVar
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
+from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.evaluation.training.differences import (
+    Inputs,
+    describe_inputs,
+    describe_settings,
+    hash_content,
+)
 from tableverse_factory.models.local.device import Tensor, import_torch
 
 torch = import_torch()
@@ -18,7 +25,13 @@ Position = TypeVar("Position")
 
 
 def save_checkpoint(
-    folder: Path, network: Any, average: Any, optimizer: Any, settings: Any, positions: Sequence[Any]
+    folder: Path,
+    network: Any,
+    average: Any,
+    optimizer: Any,
+    settings: Any,
+    inputs: Inputs,
+    positions: Sequence[Any],
 ) -> None:
     """Write everything that the training needs to go on.
 
@@ -29,7 +42,11 @@ def save_checkpoint(
     tensors |= {f"mean.{name}": tensor.contiguous().clone() for name, tensor in average.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in state.items()}
-    metadata = {"settings": json.dumps(asdict(settings)), "positions": json.dumps([asdict(each) for each in positions])}
+    metadata = {
+        "settings": json.dumps(asdict(settings)),
+        "inputs": json.dumps(inputs),
+        "positions": json.dumps([asdict(each) for each in positions]),
+    }
     partial = folder / f"{CHECKPOINT}.partial"
     safetensors.save_file(tensors, partial, metadata)
     partial.rename(folder / CHECKPOINT)
@@ -41,12 +58,13 @@ def load_checkpoint(
     average: Any,
     optimizer: Any,
     settings: Any,
+    inputs: Inputs,
     start: Position,
     device: str,
     rank: int = 0,
     ranks: int = 1,
 ) -> Position:
-    """Restore a training of the same settings, but for `steps`; `start` if there is no checkpoint.
+    """Restore a training of the same settings, but for `steps`, and inputs; `start` if there is no checkpoint.
 
     Returns the position of the process `rank` of `ranks`.
     """
@@ -59,11 +77,15 @@ def load_checkpoint(
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
         theirs = type(settings)(**json.loads(metadata["settings"]))
+        read = {name: (str(path), str(digest)) for name, (path, digest) in json.loads(metadata["inputs"]).items()}
         positions = [type(start)(**each) for each in json.loads(metadata["positions"])]
-    except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is not a checkpoint ({error}): remove it, or give another folder") from error
-    if replace(theirs, steps=settings.steps) != settings:
-        raise InputError(f"{path} is of another training, {theirs}: give the same, or another folder")
+    except (OSError, safetensors.SafetensorError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path} is not a checkpoint of this version ({error}): remove it, or give another folder"
+        ) from error
+    changes = describe_settings(asdict(replace(theirs, steps=settings.steps)), asdict(settings))
+    if changes := changes + describe_inputs(read, inputs):
+        raise InputError(f"{path} is of another training: {'; '.join(changes)}. Give the same, or another folder")
     if len(positions) != ranks:
         raise InputError(f"{path} lacks the positions of {ranks} processes: remove it")
     try:
@@ -111,4 +133,8 @@ def read_weights(path: Path, network: Any) -> None:
         if not all(each.isfinite().all() for each in network.parameters()):
             raise ValueError("numbers that are not finite")
     except (OSError, safetensors.SafetensorError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path} holds no weights of this network: train it first") from error
+        why = sanitize_line(" ".join(str(error).split()), 200)
+        raise InputError(
+            f"{path} (sha256 {hash_content(path)[:12]}) holds no weights of this network ({why}): give those that a "
+            "training of it wrote"
+        ) from error

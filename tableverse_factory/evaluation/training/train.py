@@ -14,6 +14,7 @@ from schemas.identity import content_hash
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.training.differences import describe_settings
 from tableverse_factory.evaluation.training.network import forward, list_layers, make_network
 from tableverse_factory.evaluation.training.samples import make_batch
 from tableverse_factory.evaluation.training.views import TrainingView
@@ -180,10 +181,11 @@ def _load_checkpoint(path: Path, network: Any, optimizer: Any, settings: TrainSe
         with safetensors.safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
-    except (OSError, safetensors.SafetensorError) as error:
+        theirs = {**json.loads(metadata["settings"])}
+    except (OSError, safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a checkpoint ({error}): remove it, or give another folder") from error
-    if metadata.get("settings") != json.dumps(asdict(settings)):
-        raise InputError(f"{path} is of another training, {metadata.get('settings')}: give the same, or another folder")
+    if changes := describe_settings(theirs, asdict(settings)):
+        raise InputError(f"{path} is of another training: {'; '.join(changes)}. Give the same, or another folder")
     if metadata.get("net") != _fingerprint_network():
         raise InputError(f"{path} is of another network than this version trains: remove it, or give another folder")
     network.load_state_dict({k.removeprefix("net."): v for k, v in tensors.items() if k.startswith("net.")})

@@ -83,7 +83,9 @@ def test_sessions_do_not_see_one_another(address):
 
 def test_an_error_of_the_policy_is_told_and_the_next_episode_goes_on(address):
     policy, bad = HttpPolicy(address), {**encode_start(start()), "seed": 13}
-    with pytest.raises(PolicyError, match="/reset: status 500: ValueError: thirteen") as caught:
+    with pytest.raises(
+        PolicyError, match=r"/reset: status 500: ValueError: thirteen \(tests/\S+/test_http_policy\.py:\d+\)"
+    ) as caught:
         policy.reset(decode_start(bad))
     assert caught.value.reason == "policy_error"
     policy.reset(start())

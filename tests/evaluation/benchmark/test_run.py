@@ -1,6 +1,7 @@
 """Runs: the same bytes from any number of processes and after a kill; a policy's failures are rows."""
 
 import fcntl
+import hashlib
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from tableverse_factory.evaluation.benchmark.episode_processes import EpisodePro
 from tableverse_factory.evaluation.benchmark.journal import open_journal
 from tableverse_factory.evaluation.benchmark.load_policy import PolicyName
 from tableverse_factory.evaluation.benchmark.policy_server import PolicyServer
-from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_results, read_results
+from tableverse_factory.evaluation.benchmark.results import ResultsHeader, encode_line, encode_results, read_results
 from tableverse_factory.evaluation.benchmark.run import RunSettings, run_benchmark
 from tests.helpers.learnable_dataset import write_learnable_dataset
 from tests.helpers.paths import ROOT
@@ -92,6 +93,12 @@ def policies(tmp_path_factory):
     return path
 
 
+@pytest.fixture
+def run_command(run):
+    """The command line of `tests/conftest.py`: `run` is a run of a policy here."""
+    return run
+
+
 def run(benchmark, dataset, policy, out, **settings):
     return run_benchmark(benchmark, dataset, policy, out, RunSettings(**settings))[1]
 
@@ -143,7 +150,8 @@ def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies
     rows = run(benchmark, dataset, PolicyName(f"{policies}:Unlucky"), tmp_path / "u.jsonl", jobs=2, episode_s=15.0)
     assert [row.episode_id for row in rows] == [episode.episode_id for episode in benchmark.episodes]
     found = {row.episode_id: (row.reason, row.detail) for row in rows}
-    assert found["test_0000"] == ("policy_error", "RuntimeError: five steps")
+    line = POLICIES.splitlines().index('            raise RuntimeError("five\\nsteps")') + 1
+    assert found["test_0000"] == ("policy_error", f"RuntimeError: five steps (policies.py:{line})")
     assert found["test_0001"][0] == "bad_action"
     assert "give 8 finite numbers" in found["test_0001"][1]
     assert found["test_0000_texture"][0] == "bad_action"
@@ -151,6 +159,43 @@ def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies
     assert found["test_0000_camera"] == ("policy_crash", "its process ended with 3")
     assert found["test_0000_light"] == ("policy_timeout", "took longer than 15 s")
     assert capfd.readouterr().out == ""
+
+
+def test_a_run_ends_with_its_reasons_and_where_the_policy_raised(benchmark, dataset, tmp_path, run_command):
+    """What a policy says of itself moves no cursor, and a thousand reasons are some lines."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (folder / "helper.py").write_text("import json\n\n\ndef parse():\n    return json.loads('\\x1b[2J')\n")
+    policy = tmp_path / "says.py"
+    policy.write_text(
+        "from mine.helper import parse\n"
+        "from tableverse_factory.evaluation.benchmark.policy import PolicyError\n"
+        "class Says:\n"
+        "    pictures, picture_size = (), (96, 128)\n"
+        "    def reset(self, start):\n"
+        "        if start.episode_id == 'test_0000': parse()\n"
+        "        if start.episode_id == 'test_0001': raise ValueError('[bold]' + '\\x1b[2J' * 500)\n"
+        "        raise PolicyError(start.episode_id.replace('0', 'o').replace('1', 'i'), 'no')\n"
+        "    def act(self, observation): pass\n"
+    )
+    file = tmp_path / "benchmark.json"
+    file.write_bytes(benchmark.encode())
+    arguments = ("--dataset", dataset.path, "--policy", f"{policy}:Says", "--out", tmp_path / "says.jsonl", "--jobs", 1)
+    code, text, errors = run_command("benchmark", "run", file, *arguments)
+    assert code == 0, errors
+    said = text.splitlines()
+    assert said[0].startswith("0 of 9 episodes succeed; ")
+    assert said[1].split() == ["reason", "episodes", "for", "example"]
+    assert "policy_error" in said[2]
+    assert text.replace("\n", "").isprintable()
+    assert len(said) <= 30
+    rows = read_results(tmp_path / "says.jsonl")[1]
+    assert rows["test_0000"].detail.endswith(" (mine/helper.py:5)")
+    assert rows["test_0000"].detail.startswith("JSONDecodeError: ")
+    assert rows["test_0001"].detail.startswith("ValueError: [bold]\\x1b[2J")
+    assert rows["test_0001"].detail.endswith("… (says.py:7)")
+    assert len(rows["test_0001"].detail) <= 300
 
 
 def test_a_policy_that_does_not_load_ends_the_run_with_one_line(benchmark, dataset, policies, tmp_path):
@@ -176,17 +221,61 @@ def test_other_scenes_are_refused_before_anything_is_played(benchmark, tmp_path)
 def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, dataset, policies, tmp_path):
     out = tmp_path / "r.jsonl"
     run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
-    with pytest.raises(InputError, match=r"another run \(policy, policy_digest differ\)"):
+    with pytest.raises(
+        InputError, match=r"another run: policy was policies\.py:Quick, and is now random; the policy's code was "
+    ):
         run(benchmark, dataset, PolicyName("random"), out, splits=("train",))
     header, rows = read_results(out)
     other = Benchmark.model_validate(benchmark.model_dump() | {"seed": 5})
     out.write_bytes(encode_results(header.model_copy(update={"benchmark": other.digest}), rows.values()))
-    with pytest.raises(InputError, match=r"another run \(benchmark differ\)"), open_journal(out, header):
+    with pytest.raises(InputError, match=rf"run: benchmark was {other.digest}, and is now "), open_journal(out, header):
         pass
+    assert [path.name for path in tmp_path.iterdir()] == ["r.jsonl"], "no journal without rows stays"
     with (tmp_path / "r.jsonl.journal").open("ab") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(BuildError, match="another process writes these results"), open_journal(out, header):
             pass
+
+
+def test_other_weights_are_named_with_their_digests_and_moved_ones_are_the_same(benchmark, dataset, tmp_path):
+    policy, out = tmp_path / "weighed.py", tmp_path / "r.jsonl"
+    policy.write_text(POLICIES + "\nclass Weighed(Quick):\n    def __init__(self, weights): pass\n")
+    first, moved, other = tmp_path / "first.pt", tmp_path / "moved.pt", tmp_path / "other.pt"
+    for path, content in ((first, b"1"), (moved, b"1"), (other, b"2")):
+        path.write_bytes(content)
+    run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(first)), out, splits=("train",))
+    run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(moved)), out, splits=("train",))
+    with pytest.raises(InputError, match="holds results of another run") as caught:
+        run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(other)), out, splits=("train",))
+    old, new = (hashlib.sha256(content).hexdigest()[:12] for content in (b"1", b"2"))
+    for words in (f"weights was sha256 {old}, ", f", and is now sha256 {new}, ", "moved.pt", "other.pt"):
+        assert words in str(caught.value)
+    assert "code" not in str(caught.value)
+
+
+def test_a_journal_without_rows_goes_with_its_run_and_one_with_rows_stays(benchmark, dataset, policies, tmp_path):
+    out, journal = tmp_path / "r.jsonl", tmp_path / "r.jsonl.journal"
+    (row,) = run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+    header, _ = read_results(out)
+    out.unlink()
+    for line in (b"", encode_line(row)):
+        with suppress(KeyboardInterrupt), open_journal(out, header) as (file, _):
+            assert journal.read_bytes() == encode_line(header)
+            file.write(line)
+            raise KeyboardInterrupt
+        assert journal.exists() == bool(line)
+    with suppress(KeyboardInterrupt), open_journal(out, header) as (_, known):
+        assert list(known) == [row.episode_id]
+        raise KeyboardInterrupt
+    assert journal.read_bytes() == encode_line(header) + encode_line(row)
+    journal.write_bytes(b"notes of mine\n")
+    with pytest.raises(InputError, match="is no results file"), open_journal(out, header):
+        pass
+    assert journal.read_bytes() == b"notes of mine\n"
+    journal.write_bytes(encode_line(header.model_copy(update={"policy": "killed before its first row"})))
+    with open_journal(out, header) as (file, known):
+        assert (known, journal.read_bytes()) == ({}, encode_line(header))
+    assert not journal.exists()
 
 
 def test_only_one_run_at_a_time_has_the_journal(tmp_path):

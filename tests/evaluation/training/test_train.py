@@ -146,7 +146,7 @@ def test_a_checkpoint_of_another_training_or_net_or_of_nothing_is_refused(
     views: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     train_network(views, tmp_path, replace(SHORT, steps=1), CPU)
-    with pytest.raises(InputError, match="another training"):
+    with pytest.raises(InputError, match="another training: seed was 0 and is now 1"):
         train_network(views, tmp_path, replace(SHORT, steps=1, seed=1), CPU)
     with monkeypatch.context() as older:
         older.setattr("tableverse_factory.evaluation.training.network.WIDTHS", (16, 32, 64, 128))

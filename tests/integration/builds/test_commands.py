@@ -45,7 +45,7 @@ def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
     assert json.loads(run("failures", out, "--json", "--stage", "look")[1])[0]["why"] == "nothing_there"
     assert json.loads(run("failures", out, "--json", "--stage", "pack")[1]) == []
 
-    assert "1 scene in 1 shard put back" in run("failures", out, "--retry")[1]
+    assert "1 scene in 1 shard put back: run the same `tableverse build`" in run("failures", out, "--retry")[1]
     assert json.loads(run("status", out, "--json")[1])["remaining"] == 1
     build_tiny(out.parent / "images.parquet", out)
     assert json.loads(run("status", out, "--json")[1])["failed"] == 1

@@ -212,6 +212,17 @@ def test_cousins_of_a_damaged_parent_fail_and_are_made_once_it_is_restored(made,
     assert {row["status"] for row in rows_of(dest)} == {"done"}
 
 
+def test_lost_cousins_are_put_back_for_the_command_that_made_them(made, tmp_path, run):
+    """Also those of an open shard, whose rows are in its journal."""
+    rows = [row.model_copy(update={"content_sha256": "0" * 64}) for row in plan(made / "out", 2)]
+    write_manifest(tmp_path / "cousins.parquet", rows)
+    for limit, shards in ((1, "1 shard"), (None, "2 shards")):
+        build(tmp_path, "dest", limit=limit)
+        code, text, errors = run("failures", tmp_path / "dest", "--reason", "content_changed", "--retry")
+        assert code == 0, errors
+        assert f"in {shards} put back: run the same `tableverse cousins` to try again" in text
+
+
 def test_unfinished_datasets_have_no_cousins(made, tmp_path):
     shutil.copytree(made / "out", tmp_path / "out")
     run = json.loads((tmp_path / "out" / "run.json").read_text())

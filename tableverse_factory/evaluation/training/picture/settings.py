@@ -19,7 +19,6 @@ class PictureSettings:
         flat: Flat pictures that show no table.
         rate: Peak of the learning rate.
         gpus: Processes, a GPU each, that average their gradients.
-        start: SHA-256 of the weights that the training starts from; empty if it starts from random ones.
     """
 
     steps: int
@@ -38,7 +37,6 @@ class PictureSettings:
     flat: int = 1_200
     rate: float = 1.2e-3
     gpus: int = 1
-    start: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -54,13 +52,9 @@ class PictureSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrainPosition:
-    """How far a process has come: steps, packs, views, and the numbers of views of the packs in its ring.
-
-    `pool` is the sha256 of the file of meshes.
-    """
+    """How far a process has come: steps, packs, views, and the numbers of views of the packs in its ring."""
 
     step: int = 0
     packs: int = 0
     made: int = 0
     past: tuple[int, ...] = ()
-    pool: str = ""

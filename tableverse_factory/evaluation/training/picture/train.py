@@ -1,11 +1,10 @@
 """Training of the network of pictures on views that are rendered beside it."""
 
 import copy
-import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from tableverse_factory.evaluation.training.checkpoint import (
     save_checkpoint,
     write_weights,
 )
+from tableverse_factory.evaluation.training.differences import hash_inputs
 from tableverse_factory.evaluation.training.picture.exposure import Renderer, Views
 from tableverse_factory.evaluation.training.picture.losses import compute_losses, find_targets
 from tableverse_factory.evaluation.training.picture.network import make_network
@@ -26,7 +26,6 @@ from tableverse_factory.evaluation.training.picture.start import measure_norms, 
 from tableverse_factory.evaluation.training.picture.validate import validate_network
 from tableverse_factory.evaluation.training.picture.world import World, make_world
 from tableverse_factory.models.local.device import Tensor, import_torch
-from tableverse_factory.models.local.weight_files import hash_file
 
 torch = import_torch()
 
@@ -100,19 +99,15 @@ class _Trainer:
         lacks_statistics = False
         if run.start is not None:
             lacks_statistics = read_start(run.start, network)
-            with run.start.open("rb") as file:
-                settings = replace(settings, start=hashlib.file_digest(file, "sha256").hexdigest())
+        self._inputs = hash_inputs({"meshes": run.pool, "--from": run.start})
         self._settings = settings
         self._network = network.to(run.device, memory_format=torch.channels_last).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
         restored = self._network, self._average, self._optimizer
         position = load_checkpoint(
-            run.folder, *restored, settings, TrainPosition(), run.device, ranks.rank, settings.gpus
+            run.folder, *restored, settings, self._inputs, TrainPosition(), run.device, ranks.rank, settings.gpus
         )
-        self._pool = hash_file(run.pool)
-        if position.step and position.pool != self._pool:
-            raise InputError(f"{run.pool} holds other meshes than those that the checkpoint was trained on")
         world = make_world(run.pool, settings, run.jobs)
         renderer = world.make_renderer(settings, run.device)
         self._say(f"{len(world.tables.roots)} meshes, {len(world.textures)} textures")
@@ -215,11 +210,12 @@ class _Trainer:
         ring, folder = self._ring, self._run.folder
         if not all(torch.isfinite(each).all() for each in self._average.parameters()):
             raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
-        position = TrainPosition(self._step, ring.packs_done, ring.made, tuple(ring.past), self._pool)
+        position = TrainPosition(self._step, ring.packs_done, ring.made, tuple(ring.past))
         positions = self._ranks.gather(position)
         if self._ranks.rank:
             return
-        save_checkpoint(folder, self._network, self._average, self._optimizer, self._settings, positions)
+        trained = self._network, self._average, self._optimizer
+        save_checkpoint(folder, *trained, self._settings, self._inputs, positions)
         write_weights(self._average, folder)
         for with_depth in (False, True) if self._held_out else ():
             figures = validate_network(self._average, self._held_out, self._run.device, with_depth)

@@ -31,7 +31,6 @@ class PolicySettings:
 
 @dataclass(frozen=True, slots=True)
 class PolicyPosition:
-    """How far a training has come; `demonstrations` is the sha256 of their file."""
+    """How far a training has come."""
 
     step: int = 0
-    demonstrations: str = ""

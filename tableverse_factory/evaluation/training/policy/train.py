@@ -1,7 +1,6 @@
 """Training of policies from packed demonstrations and pictures; it needs numpy, torch and safetensors alone."""
 
 import copy
-import hashlib
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +15,7 @@ from tableverse_factory.evaluation.training.checkpoint import (
     save_checkpoint,
     write_weights,
 )
+from tableverse_factory.evaluation.training.differences import Inputs, hash_inputs
 from tableverse_factory.evaluation.training.policy.demonstrations import Demonstrations
 from tableverse_factory.evaluation.training.policy.lessons import Lesson, StateLesson
 from tableverse_factory.evaluation.training.policy.network import make_network
@@ -69,7 +69,7 @@ def train_state_policy(settings: PolicySettings, run: TrainRun, log: Log) -> int
     A checkpoint in the folder is continued.
     """
     data = _load(settings, run)
-    return _train(data, StateLesson(data), settings, run, log, _hash_files(run.demonstrations))
+    return _train(data, StateLesson(data), settings, run, log, hash_inputs({"demonstrations": run.demonstrations}))
 
 
 def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path, state: Path, log: Log) -> int:
@@ -80,7 +80,8 @@ def train_picture_policy(settings: PolicySettings, run: TrainRun, pictures: Path
     teacher = load_teacher(settings, state)
     data, packed = _load(settings, run), PackedPictures.read(pictures)
     lesson = PictureLesson(data, PictureTensors(packed, run.device), teacher)
-    return _train(data, lesson, settings, run, log, _hash_files(run.demonstrations, pictures, state))
+    files = {"demonstrations": run.demonstrations, "pictures": pictures, "--pictures-from": state}
+    return _train(data, lesson, settings, run, log, hash_inputs(files))
 
 
 def load_teacher(settings: PolicySettings, state: Path) -> Any:
@@ -98,16 +99,12 @@ def _load(settings: PolicySettings, run: TrainRun) -> DemonstrationTensors:
 
 
 def _train(
-    data: DemonstrationTensors, lesson: Lesson, settings: PolicySettings, run: TrainRun, log: Log, digest: str
+    data: DemonstrationTensors, lesson: Lesson, settings: PolicySettings, run: TrainRun, log: Log, inputs: Inputs
 ) -> int:
     try:
-        return _Trainer(data, lesson, settings, run, log, digest).train()
+        return _Trainer(data, lesson, settings, run, log, inputs).train()
     except torch.OutOfMemoryError as error:
         raise InputError("the GPU's memory ran out: fewer goals or chunks per step need less") from error
-
-
-def _hash_files(*paths: Path) -> str:
-    return hashlib.sha256(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in paths)).hexdigest()
 
 
 class _Trainer:
@@ -120,19 +117,17 @@ class _Trainer:
         settings: PolicySettings,
         run: TrainRun,
         log: Log,
-        digest: str,
+        inputs: Inputs,
     ) -> None:
         self._started, self._settings, self._run, self._log = time.monotonic(), settings, run, log
-        self._data, self._lesson, self._digest = data, lesson, digest
+        self._data, self._lesson, self._inputs = data, lesson, inputs
         run.folder.mkdir(parents=True, exist_ok=True)
         self._network = lesson.make_network(settings.seed).to(run.device).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device, lesson.rate_factors)
         position = load_checkpoint(
-            run.folder, self._network, self._average, self._optimizer, settings, PolicyPosition(), run.device
+            run.folder, self._network, self._average, self._optimizer, settings, inputs, PolicyPosition(), run.device
         )
-        if position.step and position.demonstrations != digest:
-            raise InputError(f"{run.demonstrations} holds other demonstrations than the checkpoint was trained on")
         self._step = position.step
         self._replay: tuple[Any, dict[str, Tensor]] | None = None
         counts = [len(data.choices[held_out][0]) for held_out in (False, True)]
@@ -207,8 +202,8 @@ class _Trainer:
         """Save, and measure the held-out demonstrations; weights that are not finite are refused."""
         if not all(torch.isfinite(each).all() for each in self._average.parameters()):
             raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
-        position = PolicyPosition(self._step, self._digest)
-        save_checkpoint(self._run.folder, self._network, self._average, self._optimizer, self._settings, [position])
+        trained = self._network, self._average, self._optimizer
+        save_checkpoint(self._run.folder, *trained, self._settings, self._inputs, [PolicyPosition(self._step)])
         write_weights(self._average, self._run.folder)
         for held_out in (False, True):
             if len(self._data.choices[held_out][0]):

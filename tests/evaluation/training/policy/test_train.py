@@ -1,5 +1,7 @@
 """Training of the policy on states: the same weights again, also in parts; other files are refused."""
 
+import hashlib
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -58,13 +60,18 @@ def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(packed: 
         assert_same(tmp_path / "whole", tmp_path / "other")
 
 
+def _differing(name: str, old: Path, new: Path) -> str:
+    was, now = (f"{path} (sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:12]})" for path in (old, new))
+    return re.escape(f"is of another training: {name} was {was} and is now {now}. Give the same, or another folder")
+
+
 def test_a_checkpoint_is_continued_with_its_own_settings_and_demonstrations(packed: Path, tmp_path: Path) -> None:
     train(tmp_path, packed, minutes=0.0)
-    with pytest.raises(InputError, match=r"is of another training, .*: give the same, or another folder"):
+    with pytest.raises(InputError, match=r"is of another training: chunks was \d+ and is now 9\. Give the same, or"):
         train(tmp_path, packed, replace(SETTINGS, chunks=9))
     own, others = Demonstrations.read(packed), tmp_path / "others.npz"
     replace(own, poses=own.poses + np.float32(0.01)).write(others)
-    with pytest.raises(InputError, match=r"others\.npz holds other demonstrations than the checkpoint"):
+    with pytest.raises(InputError, match=_differing("demonstrations", packed, others)):
         train(tmp_path, others)
     replace(own, held_out=own.held_out + np.uint8(1)).write(others)
     with pytest.raises(InputError, match=r"others\.npz holds no demonstrations to train on"):
@@ -86,6 +93,9 @@ def test_weights_of_any_other_origin_are_refused(packed: Path, tmp_path: Path) -
         save_file(tensors, path)
         with pytest.raises(InputError, match="holds no weights of this network"):
             StatePolicy(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    with pytest.raises(InputError, match=rf"{path} \(sha256 {digest}\) holds no weights .* Missing key\(s\)"):
+        StatePolicy(path)
     torch.save(weights, path)  # a pickle
     with pytest.raises(InputError, match="holds no weights of this network"):
         StatePolicy(path)
