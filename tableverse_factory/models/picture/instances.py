@@ -22,6 +22,7 @@ ACROSS_PX = 3  # surfaces are compared at this distance from the border of two p
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
 AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
+EVEN = -0.5  # near even odds: in training, pairs of pixels of two objects weigh three times, hence -1.1 for even ones
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
@@ -66,7 +67,8 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         touches = border.length >= MIN_CONTACT * np.sqrt(min(sizes[a], sizes[b]))
         limit = CREASED if agreement >= LIKELY else SMOOTH if agreement >= AGREED else 0.0
         continues = border.boundary < EDGE and border.bend < limit and border.affinity > -SURE
-        if touches and (continues or border.affinity > SURE):
+        is_smooth = border.affinity > EVEN and border.bend < SMOOTH
+        if touches and (continues or is_smooth or border.affinity > SURE):
             wanted.append(border)
     group = _merge_pieces(wanted, borders, len(middle_of))
     touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}

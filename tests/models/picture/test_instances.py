@@ -12,6 +12,7 @@ from tableverse_factory.models.picture.predict import OBJECT, TABLE, PicturePred
 ROWS, COLUMNS = 96, 128
 LEFT, RIGHT = (slice(30, 60), slice(30, 60)), (slice(30, 60), slice(60, 90))  # they touch
 LARGE = (slice(10, 50), slice(5, 55))
+UNLIKELY = -1.0  # logit that two pixels are of one object: neither votes nor boundaries are overruled
 
 
 def make_prediction(*things: tuple[slice, slice]) -> PicturePrediction:
@@ -27,7 +28,7 @@ def make_prediction(*things: tuple[slice, slice]) -> PicturePrediction:
         label,
         votes,
         np.zeros((ROWS, COLUMNS), np.float32),
-        np.zeros((6, ROWS, COLUMNS), np.float32),
+        np.full((6, ROWS, COLUMNS), UNLIKELY, np.float32),
         np.array([0.0, 0.0, -1.0]),
         1.0,
         0.9,
@@ -107,6 +108,15 @@ def test_pixels_that_belong_together_join_what_print_cut_and_others_keep_apart_w
     found = replace(votes, votes=(votes.votes + rng.normal(0.0, 4.0, votes.votes.shape)).astype(np.float32))
     assert segment(found).max() == 1
     assert segment(replace(found, affinity=found.affinity - np.float32(3.0))).max() == 2
+
+
+def test_even_odds_join_what_print_cut_where_the_surface_goes_on_and_nowhere_else() -> None:
+    halves = draw_boundary(vote_in_halves(30.0), 58, 59, 60, 61)
+    even = replace(halves, affinity=np.zeros_like(halves.affinity))
+    assert segment(even).max() == 1
+    depth = even.depth.copy()
+    depth[:, 60:] = 1.5
+    assert segment(replace(even, depth=depth)).max() == 2
 
 
 def test_ids_are_dense_from_one_the_largest_first() -> None:

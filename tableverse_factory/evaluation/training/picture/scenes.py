@@ -30,6 +30,8 @@ from tableverse_factory.geometry.math.transforms import rotation_matrix
 FOCAL_RANGE = (0.67, 1.5)  # in widths of the picture
 RIG_SHARE = 0.4  # of views as the cameras of robots and desks see: their focal lengths, heights and distances
 RIG_FOCAL, RIG_ELEVATION, RIG_DISTANCE_M = (0.78, 1.02), (24, 62), (0.45, 1.35)
+STEEP_SHARE, STEEP_ELEVATION = 0.08, (62, 90)  # of views, rigs' among them, that look down
+ROLL, MUCH_ROLL, MUCH_ROLL_SHARE = 0.05, 0.15, 0.4  # deviations of the camera's roll [rad]: a net that saw little of it says 0
 COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16)
 COUNT_SHARES = (0.08, 0.1, 0.11, 0.12, 0.12, 0.12, 0.12, 0.1, 0.08, 0.05)
 SETTLED_SHARE, EMPTY_SHARE = 0.4, 0.03
@@ -161,7 +163,7 @@ def _aim_at_things(
         rig = rng.random() < RIG_SHARE
         focal = size[0] * float(np.exp(rng.uniform(*np.log(RIG_FOCAL if rig else FOCAL_RANGE))))
         angles = RIG_ELEVATION if rig else (20, 72) if rng.random() < 0.75 else (10, 89)
-        elevation = np.radians(rng.uniform(*angles))
+        elevation = np.radians(rng.uniform(*(STEEP_ELEVATION if rng.random() < STEEP_SHARE else angles)))
         close = not rig and rng.random() < CLOSE_SHARE and builder.boxes
         box = builder.boxes[int(rng.integers(len(builder.boxes)))] if close else np.stack([low, high])
         middle, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
@@ -205,7 +207,7 @@ def _make_view(
     right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.9999 else [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
     down = np.cross(forward, right)
-    roll = rng.normal(0, 0.05)
+    roll = rng.normal(0, MUCH_ROLL if rng.random() < MUCH_ROLL_SHARE else ROLL)
     c, s = np.cos(roll), np.sin(roll)
     view = np.zeros(View.WIDTH, dtype=np.float32)
     view[View.EYE] = eye

@@ -29,12 +29,12 @@ class PictureSettings:
     height: int = 288
     capacity: int = 24_000
     first: int = 2_000
-    fresh: float = 12.0
+    fresh: float = 24.0
     small: float = 0.6
     samples: int = 12
-    packages: int = 320
-    patterns: int = 900
-    flat: int = 1_200
+    packages: int = 1_200
+    patterns: int = 2_500
+    flat: int = 2_400
     rate: float = 1.2e-3
     gpus: int = 1
 

@@ -73,7 +73,7 @@ class ThingMaker:
         self._handles = tables.find("handle")
         self._makers: tuple[tuple[float, Callable[[np.random.Generator], Thing]], ...] = (
             (0.2, self._make_box),
-            (0.16, self._make_large_box),
+            (0.22, self._make_large_box),
             (0.1, self._make_can),
             (0.12, self._make_odd),
             (0.12, self._make_handled),
