@@ -20,7 +20,7 @@ BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
 REACH_PX = 2  # a boundary this near is that of a border
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
 LEAST_PROBABILITY = 0.02
-FAVOUR = 0.4  # log-likelihood per pixel of border by which `picture` must be better: the depth is measured
+FAVOUR = 0.8  # log-likelihood per pixel of border by which `picture` must be better: the depth is measured
 
 Probabilities = Float32[np.ndarray, "h w"]
 
