@@ -22,7 +22,7 @@ ACROSS_PX = 3  # surfaces are compared at this distance from the border of two p
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
 AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
-EVEN = -0.5  # near even odds: in training, pairs of pixels of two objects weigh three times, hence -1.1 for even ones
+EVEN = -0.8  # near even odds, which are at -1.1: in training, pairs of pixels of two objects weigh three times
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
@@ -67,9 +67,10 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         touches = border.length >= MIN_CONTACT * np.sqrt(min(sizes[a], sizes[b]))
         limit = CREASED if agreement >= LIKELY else SMOOTH if agreement >= AGREED else 0.0
         continues = border.boundary < EDGE and border.bend < limit and border.affinity > -SURE
-        is_smooth = border.affinity > EVEN and border.bend < SMOOTH
-        if touches and (continues or is_smooth or border.affinity > SURE):
-            wanted.append(border)
+        if touches and (continues or border.affinity > SURE):
+            wanted.append((border, -SURE))
+        elif touches and border.affinity > EVEN and border.bend < SMOOTH:
+            wanted.append((border, EVEN))
     group = _merge_pieces(wanted, borders, len(middle_of))
     touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}
     ids = _join_fragments(found, group[pieces], touching)
@@ -78,21 +79,21 @@ def _find_objects(found: PicturePrediction) -> IdImage:
     return _renumber(np.where(sure[ids], ids, 0))
 
 
-def _merge_pieces(wanted: Sequence[_Border], borders: Sequence[_Border], count: int) -> IdImage:
+def _merge_pieces(wanted: Sequence[tuple[_Border, float]], borders: Sequence[_Border], count: int) -> IdImage:
     """Merge across the wanted borders, the surest first, and number the group of each of `count` pieces.
 
-    Two groups stay apart where most of their common border says so: else a chain of scraps in a shadow joins a cup to
-    its saucer.
+    Each comes with the least mean logit of the groups' whole common border: else a chain of scraps in a shadow joins a
+    cup to its saucer.
     """
     pairs = np.array([border.pieces for border in borders], dtype=np.int32).reshape(-1, 2)
     length = np.array([border.length for border in borders])
     says = length * np.array([border.affinity for border in borders])
     group = np.arange(count, dtype=np.int32)
-    for border in sorted(wanted, key=lambda border: (-border.affinity, border.pieces)):
+    for border, least in sorted(wanted, key=lambda each: (-each[0].affinity, each[0].pieces)):
         one, two = group[list(border.pieces)]
         sides = group[pairs]
         common = (sides == (one, two)).all(axis=1) | (sides == (two, one)).all(axis=1)
-        if says[common].sum() > -SURE * length[common].sum():
+        if says[common].sum() > least * length[common].sum():
             group[group == two] = one
     return group
 
