@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -36,10 +37,14 @@ class DeferredFunction:
 
     address: str
 
+    @property
+    def module(self) -> str:
+        """Name of its module."""
+        return self.address.partition(":")[0]
+
     def load(self) -> StageFunction:
         """Import the function."""
-        module, _, name = self.address.partition(":")
-        return cast(StageFunction, getattr(import_module(module), name))
+        return cast(StageFunction, getattr(import_module(self.module), self.address.partition(":")[2]))
 
     def __call__(self, item: Any, config: Config, rng: np.random.Generator, services: Services) -> Outcome[Any]:
         """Run the function."""
@@ -53,7 +58,7 @@ class Stage:
     Attributes:
         name: Also the name of its random stream.
         run: `run(item, config, rng, services) -> Outcome`. Pure: no clock, no global state, no other randomness. A
-            `DeferredFunction` is imported by processes that run stages, before their first scene.
+            `DeferredFunction` is imported by the first process that runs it; sandboxes do so before their first scene.
         reads: The sections or `section.key`s that it reads, its own first. Other changes leave its output valid.
         recorded: What it reads besides (prompts, weights, robot files), by part of run.json: a change of these makes
             another build.
@@ -101,6 +106,15 @@ def import_stages(pipelines: Iterable[Sequence[Stage]]) -> None:
         for stage in stages:
             if isinstance(stage.run, DeferredFunction):
                 stage.run.load()
+
+
+def find_stages(pipelines: Iterable[Sequence[Stage]]) -> None:
+    """Raise ModuleNotFoundError if the module of a stage is not there; a build that has begun finds it too late."""
+    for stages in pipelines:
+        for stage in stages:
+            module = stage.run.module if isinstance(stage.run, DeferredFunction) else ""
+            if module and find_spec(module) is None:
+                raise ModuleNotFoundError(f"no module named {module!r}, of stage {stage.name}")
 
 
 def post_export_stages(pipelines: Pipelines) -> list[str]:

@@ -12,7 +12,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.models.services import Services
-from tableverse_factory.pipeline import PIPELINES
+from tableverse_factory.pipeline import PIPELINES, WITH_TRAJECTORIES
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tests.helpers.captures_on_disk import write_layout
@@ -63,6 +63,10 @@ def test_stages_read_what_they_declare(entries, tmp_path, kind):
 def test_whoever_only_plans_a_build_imports_no_native_code_of_stages(module):
     line = f"import sys, {module}; print(*({{'open3d', 'mujoco', 'scipy', 'trimesh', 'coal'}} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", line], check=True, capture_output=True, text=True).stdout.split() == []
+
+
+def test_the_functions_of_all_stages_are_there():
+    assert all(callable(stage.run.load()) for line in WITH_TRAJECTORIES.values() for stage in line)
 
 
 def test_what_a_stage_declares_is_there():

@@ -165,7 +165,7 @@ def _print_reasons(rows: Sequence["EpisodeResult"]) -> None:
         detail = Counter(row.detail for row in rows if row.reason == reason).most_common(1)[0][0]
         example = next(row for row in rows if (row.reason, row.detail) == (reason, detail))
         table.add_row(reason, str(count), sanitize_line(f"{example.episode_id}{detail and ': '}{detail}", 400))
-    Console(markup=False, highlight=False).print(table)
+    Console(markup=False, emoji=False, highlight=False).print(table)
     if more := counts[MAX_REASONS:]:
         print(f"and {pluralize(sum(count for _, count in more), 'episode')} for {pluralize(len(more), 'other reason')}")
 

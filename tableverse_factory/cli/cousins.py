@@ -101,10 +101,10 @@ def _check_apart(parents: "StoragePath", dest: "StoragePath") -> None:
     root, folder, beside = _resolve(parents), _resolve(dest), _resolve(dest.parent)
     if folder == root:
         problem = "is"
-    elif root in folder.parents or root in (beside, *beside.parents):  # a link may lie within it and lead elsewhere
-        problem = "lies within"
     elif folder in root.parents:
         problem = "holds"
+    elif root in folder.parents or root in (beside, *beside.parents):  # a link may lie within it and lead elsewhere
+        problem = "lies within"
     else:
         return
     led = f", a link to {folder}," if isinstance(dest, Path) and dest.is_symlink() else ""

@@ -60,7 +60,7 @@ def failures(
     if retry and selected:
         shards = reopen_scenes(place, [scene.scene_id for scene in selected])
         where = f"{pluralize(len(selected), 'scene')} in {pluralize(shards, 'shard')}"
-        made_by = "cousins" if SceneKind.COUSIN in state.scenes["kind"].unique().to_pylist() else "build"
+        made_by = "cousins" if state.scenes["kind"].unique().to_pylist() == [SceneKind.COUSIN] else "build"
         typer.echo(f"{where} put back: run the same `tableverse {made_by}` to try again", err=as_json)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tableverse_factory.cli.options import require_local_path
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.training.train import TrainProgress
@@ -21,7 +22,8 @@ def _require_folder(path: Path) -> Path:
     """Refuse a file, and what would lie within one."""
     require_local_path(path)
     if found := next((each for each in (path, *path.parents) if each.exists() and not each.is_dir()), None):
-        raise typer.BadParameter(f"{found} is a file: give a new folder, or one whose training goes on")
+        shown = sanitize_line(str(found), 300)
+        raise typer.BadParameter(f"{shown} is a file: give a new folder, or one whose training goes on")
     return path
 
 

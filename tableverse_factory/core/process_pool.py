@@ -49,7 +49,7 @@ def parallel_map(
         return
     # Forked children would share the threads' locks of libraries that are already at work.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(items)), context, prepare_child) as pool, _translate_death(doing):
+    with ProcessPoolExecutor(min(jobs, len(items)), context, _prepare_worker) as pool, _translate_death(doing):
         with _defer_interrupt():
             results = pool.map(work, items, chunksize=chunk)
         yield from results
@@ -67,7 +67,7 @@ def parallel_stream(
             yield from map(work, items)
         return
     rest, context = iter(items), multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, prepare_child)
+    pool = ProcessPoolExecutor(jobs, context, _prepare_worker)
     try:
         with _translate_death(doing):
             with _defer_interrupt():
@@ -91,16 +91,18 @@ def _translate_death(doing: str) -> Iterator[None]:
 
 
 def prepare_child() -> None:
-    """Limit a child to one thread, and end it with its parent: it would wait for work forever.
-
-    Children work for this package alone, so that plots need not be imported there.
-    """
+    """Limit a child to one thread, and end it with its parent: it would wait for work forever."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
     if parent is None or os.getppid() != parent.pid:
         os._exit(1)  # it was killed just before
-    stub_plotly()
     threadpool_limits(1)
+
+
+def _prepare_worker() -> None:
+    """Prepare a child of a pool, which works for this package alone: plots need not be imported there."""
+    prepare_child()
+    stub_plotly()
 
 
 @contextmanager

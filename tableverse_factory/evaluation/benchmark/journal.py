@@ -98,10 +98,14 @@ def _check_header(path: Path, found: ResultsHeader, header: ResultsHeader) -> No
     changes = [
         f"{name} {_was_and_is(getattr(found, name), getattr(header, name))}"
         for name in ResultsHeader.model_fields
-        if name != "policy_digest" and getattr(found, name) != getattr(header, name)
+        if name not in ("policy_digest", "weights") and getattr(found, name) != getattr(header, name)
     ]
-    if found.policy_digest != header.policy_digest and found.weights[:19] == header.weights[:19]:  # up to the path
-        changes.append(f"the policy's code {_was_and_is(found.policy_digest[:12], header.policy_digest[:12])} (digest)")
+    (old, _, _), (new, _, _) = (each.weights.partition(", ") for each in (found, header))  # digests, without names
+    if old and old != new:
+        changes.append(f"weights {_was_and_is(found.weights, header.weights)}")
+    elif found.policy_digest != header.policy_digest:
+        what = "the policy's code" if old == new else "the policy's code or weights"
+        changes.append(f"{what} {_was_and_is(found.policy_digest[:12], header.policy_digest[:12])} (digest)")
     raise InputError(
         f"{path} holds results of another run: {'; '.join(changes)}. Give the same, or another --out, or remove it",
         "other_results",

@@ -3,6 +3,7 @@
 import hashlib
 import importlib
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -49,12 +50,10 @@ class PolicyName:
         return self.identify()[0]
 
     def identify(self) -> tuple[str, str]:
-        """Return the digest, and a line on the weights: the start of their own SHA-256, and their path as given."""
+        """Return the digest, and a line on the weights: the start of their own SHA-256, if they are here, and name."""
         weights = Path(self.weights or SHIPPED.get(self.name) or "")
         hashed = _hash_path(weights)
-        line = (
-            f"sha256 {(hashed.hex() if weights.is_file() else hashed.decode())[:12]}, {weights}" if weights.name else ""
-        )
+        line = f"sha256 {hashed.hex()[:12]}, {weights.name}" if weights.name and weights.exists() else weights.name
         return content_hash(self.name.encode(), _hash_path(_find_source(self.name)), hashed), sanitize_line(line, 300)
 
     @property
@@ -77,12 +76,15 @@ def _find_source(name: str) -> Path:
 
 
 def _hash_path(path: Path) -> bytes:
-    """Hash a file, all files of a folder with their names, or else the path."""
+    """Hash a file, all files of a folder with their names within it, or else the path."""
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").digest()
-    inside = sorted(each for each in path.rglob("*") if each.is_file()) if path.name and path.is_dir() else []
-    return content_hash(str(path).encode(), *(_hash_path(each) for each in inside)).encode()
+    if not (path.name and path.is_dir()):
+        return bytes.fromhex(content_hash(os.fsencode(path)))
+    inside = sorted(each for each in path.rglob("*") if each.is_file())
+    named = (part for each in inside for part in (os.fsencode(each.relative_to(path)), _hash_path(each)))
+    return bytes.fromhex(content_hash(*named))
 
 
 def load_policy(name: PolicyName) -> Policy:

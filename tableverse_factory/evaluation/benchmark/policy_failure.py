@@ -24,11 +24,17 @@ def describe_failure(error: Exception, limit: int) -> str:
 
 
 def _find_place(error: Exception) -> str:
-    """Find the innermost line of the policy's own code, or else of a package that it called; empty without any."""
+    """Find the innermost line of the policy's own code; empty without any."""
     frames = [each for each in traceback.walk_tb(error.__traceback__) if not _lies_in(each[0], _OURS)]
     frames = [each for each in frames if not each[0].f_code.co_filename.startswith("<")]  # of no file
     own = [each for each in frames if not any(_lies_in(each[0], folder) for folder in _INSTALLED)]
-    return _name_place(*(own or frames)[-1]) if frames else ""
+    if frames and not own:  # it is installed: the first package that ours calls
+        own = [each for each in frames if _find_package(each[0]) == _find_package(frames[0][0])]
+    return _name_place(*own[-1]) if own else ""
+
+
+def _find_package(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0]
 
 
 def _lies_in(frame: FrameType, folder: Path) -> bool:
@@ -37,5 +43,6 @@ def _lies_in(frame: FrameType, folder: Path) -> bool:
 
 def _name_place(frame: FrameType, line: int) -> str:
     """Name file and line; as much of the path as the module's name has parts is the same on every machine."""
-    path, parts = Path(frame.f_code.co_filename), str(frame.f_globals.get("__name__", "")).count(".") + 1
+    path = Path(frame.f_code.co_filename)
+    parts = str(frame.f_globals.get("__name__", "")).count(".") + (2 if path.name == "__init__.py" else 1)
     return sanitize_line("/".join(path.parts[-parts:]), MAX_PLACE_CHARS - 12) + f":{line}"

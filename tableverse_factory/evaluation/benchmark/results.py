@@ -37,7 +37,7 @@ Line = Annotated[str, Field(max_length=300), AfterValidator(_check_line)]
 class ResultsHeader(Record):
     """What was run: the benchmark's digest, and the policy with the digest of its file and weights.
 
-    `weights` says which they were: the start of their own SHA-256, and their path as given.
+    `weights` says which they were: the start of their own SHA-256, if they were there, and their name.
     """
 
     format: Literal["tableverse-results-1"] = "tableverse-results-1"

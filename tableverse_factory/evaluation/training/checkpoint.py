@@ -126,7 +126,9 @@ def read_weights(path: Path, network: Any) -> None:
     safetensors = import_extra("safetensors", "training", "models")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file: give the weights that a training wrote")
+    digest = "unreadable"
     try:
+        digest = hash_content(path)[:12]
         with safetensors.safe_open(path, "pt") as file:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
         network.load_state_dict({k: each.float() if each.is_floating_point() else each for k, each in weights.items()})
@@ -135,6 +137,5 @@ def read_weights(path: Path, network: Any) -> None:
     except (OSError, safetensors.SafetensorError, RuntimeError, ValueError) as error:
         why = sanitize_line(" ".join(str(error).split()), 200)
         raise InputError(
-            f"{path} (sha256 {hash_content(path)[:12]}) holds no weights of this network ({why}): give those that a "
-            "training of it wrote"
+            f"{path} (sha256 {digest}) holds no weights of this network ({why}): give those that a training of it wrote"
         ) from error

@@ -178,7 +178,7 @@ def _measure_borders(found: PicturePrediction, pieces: IdImage) -> Iterator[_Bor
     keys, index = np.unique(pairs, axis=0, return_inverse=True)
     affinities = _average_affinities(found, pieces)
     for k, (a, b) in enumerate(keys.tolist()):
-        on, affinity = index.ravel() == k, affinities.get((a, b), 0.0)
+        on, affinity = index.ravel() == k, affinities.get((a, b), EVEN)
         yield _Border((a, b), int(on.sum()), float(np.median(bends[on])), float(np.median(edges[on])), affinity)
 
 

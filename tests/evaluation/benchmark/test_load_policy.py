@@ -1,5 +1,7 @@
 """Policies by name: what is wrong with a name or a class is said in one line."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -95,6 +97,10 @@ def test_other_code_or_weights_are_another_policy(file, tmp_path):
         (tmp_path / "folder/part/weights.pt").write_bytes(content)
         digests.append(PolicyName(f"{file}:Good", str(tmp_path / "folder")).digest)
     assert len(set(digests)) == 5
+    shutil.copytree(tmp_path / "folder", tmp_path / "moved")
+    assert PolicyName(f"{file}:Good", str(tmp_path / "moved")).digest == digests[-1]
+    (tmp_path / "moved/part/weights.pt").rename(tmp_path / "moved/part/others.pt")
+    assert PolicyName(f"{file}:Good", str(tmp_path / "moved")).digest != digests[-1]
     assert PolicyName(f"{file}:Good").shown == "classes.py:Good"
     assert PolicyName(f"{file}:Good", title="good\x1b[2J").shown == "good\\x1b[2J"
 

@@ -21,6 +21,7 @@ from tableverse_factory.dataset.parts import read_part_files, read_part_rows
 from tableverse_factory.dataset.tar_members import read_scene_files
 from tests.helpers.builds import wait_until
 from tests.helpers.paths import ROOT
+from workers.sandbox.child import load_pipelines
 from workers.sandbox.parent import Sandbox
 
 pytestmark = pytest.mark.heavy
@@ -155,6 +156,11 @@ def test_what_a_stage_defers_is_imported_before_its_clock_starts(tmp_path):
 def test_a_pipeline_that_does_not_import_stops_the_build(tmp_path, pipeline):
     with pytest.raises(BuildError, match="no_such_module"):
         _run_one(Sandbox(_setup(tmp_path, pipeline=pipeline)), 0, "fine")
+
+
+def test_a_stage_whose_module_is_absent_is_found_before_a_build_begins():
+    with pytest.raises(BuildError, match=r"no module named 'tests\.helpers\.no_such_module', of stage"):
+        load_pipelines("tests.helpers.deferred_pipeline:MISSING")
 
 
 def test_close_leaves_no_process(sandbox):

@@ -13,7 +13,7 @@ from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, build_capture, create_centered_camera
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
 
-SURPRISE = 1.15  # of photographs: 68 % of 28 scales lie within so many deviations of the net, which knows renders alone
+SIGMA_FACTOR = 1.15  # 68 % of 28 photographs lie within so many deviations of the net, which knows renders alone
 FOCAL_SIGMA = 0.2  # of the logarithm of an assumed focal length, with which the scale grows
 
 
@@ -31,7 +31,7 @@ def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
         photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=photo.intrinsics_source), bounds
     )
     spread = FOCAL_SIGMA if photo.exif_px is None and bounds.focal_px is None else 0.0
-    return replace(capture, camera=camera, scale_sigma=math.hypot(SURPRISE * found.scale_sigma, spread))
+    return replace(capture, camera=camera, scale_sigma=math.hypot(SIGMA_FACTOR * found.scale_sigma, spread))
 
 
 def check_table(found: PicturePrediction, bounds: ObserveConfig) -> None:

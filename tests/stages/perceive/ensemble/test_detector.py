@@ -21,10 +21,10 @@ from tests.helpers.tabletop_views import look
 SHAPE = (80, 120)
 ONE = np.zeros(SHAPE, dtype=np.int32)
 ONE[20:60, 20:100] = 1
-FOUR = ONE.copy()
-for part in range(1, 4):
-    FOUR[20:60, 20 + 20 * part : 100] = part + 1
-SEAMS = tuple(np.s_[20:60, column - 2 : column + 2] for column in (40, 60, 80))
+EIGHT = ONE.copy()
+for part in range(1, 8):
+    EIGHT[20:60, 20 + 10 * part : 100] = part + 1
+SEAMS = tuple(np.s_[20:60, column - 2 : column + 2] for column in range(30, 100, 10))
 
 
 def draw_boundary(*lines: tuple[slice, slice]) -> np.ndarray:
@@ -43,11 +43,11 @@ EVERYWHERE = np.ones(SHAPE, dtype=bool)
 @pytest.mark.parametrize(
     ("first", "second", "boundary", "second_wins"),
     [
-        (ONE, FOUR, draw_boundary(*SEAMS), True),
-        (FOUR, ONE, draw_boundary(), True),
-        (FOUR, ONE, draw_boundary(*SEAMS), False),
-        (ONE, FOUR, draw_boundary(), False),
-        (FOUR, FOUR, draw_boundary(), False),
+        (ONE, EIGHT, draw_boundary(*SEAMS), True),
+        (EIGHT, ONE, draw_boundary(), True),
+        (EIGHT, ONE, draw_boundary(*SEAMS), False),
+        (ONE, EIGHT, draw_boundary(), False),
+        (EIGHT, EIGHT, draw_boundary(), False),
         (ONE, np.zeros_like(ONE), draw_boundary(), False),
     ],
     ids=["seams are seen", "no seam is seen", "seams stay", "nothing to part", "both alike", "one sees nothing"],
