@@ -12,6 +12,7 @@ from tableverse_factory.core.config import fingerprint_config, fingerprint_tree,
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.source_hash import compute_source_hash
 from tableverse_factory.core.storage.files import StoragePath, make_missing_build_error, read_whole, write_atomic
+from tableverse_factory.core.text import describe_change
 from tableverse_factory.stage import RecordFunction, Stage
 
 FORMAT = "tableverse-dataset-1"
@@ -177,7 +178,7 @@ def _describe_change(key: str, values: tuple[Any, Any]) -> str:
     old, new = values
     if key.endswith("sha256") and None not in values:
         return f"the content of {key.removesuffix('sha256').rstrip('._')} differs"
-    return f"{key} was {old!r} and is now {new!r}"
+    return describe_change(key, old, new)
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

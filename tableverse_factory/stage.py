@@ -102,19 +102,20 @@ Pipelines = Mapping[SceneKind, Sequence[Stage]]  # the stages that a manifest ro
 
 def import_stages(pipelines: Iterable[Sequence[Stage]]) -> None:
     """Import what the stages run, so that it counts in no stage's time."""
-    for stages in pipelines:
-        for stage in stages:
-            if isinstance(stage.run, DeferredFunction):
-                stage.run.load()
+    for _, run in _list_deferred(pipelines):
+        run.load()
 
 
-def find_stages(pipelines: Iterable[Sequence[Stage]]) -> None:
-    """Raise ModuleNotFoundError if the module of a stage is not there; a build that has begun finds it too late."""
-    for stages in pipelines:
-        for stage in stages:
-            module = stage.run.module if isinstance(stage.run, DeferredFunction) else ""
-            if module and find_spec(module) is None:
-                raise ModuleNotFoundError(f"no module named {module!r}, of stage {stage.name}")
+def check_stages(pipelines: Iterable[Sequence[Stage]]) -> None:
+    """Raise ModuleNotFoundError if the module of a stage is not there, without importing it."""
+    for name, run in _list_deferred(pipelines):
+        if find_spec(run.module) is None:
+            raise ModuleNotFoundError(f"no module named {run.module!r}, of stage {name}")
+
+
+def _list_deferred(pipelines: Iterable[Sequence[Stage]]) -> list[tuple[str, DeferredFunction]]:
+    stages = (stage for line in pipelines for stage in line)
+    return [(stage.name, stage.run) for stage in stages if isinstance(stage.run, DeferredFunction)]
 
 
 def post_export_stages(pipelines: Pipelines) -> list[str]:

@@ -1,17 +1,12 @@
 """`tableverse cousins`: new scenes from those of a finished dataset."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from tableverse_factory.cli import options
 from tableverse_factory.cli.build import make_display, report_summary
 from tableverse_factory.core.errors import InputError, TableverseError
-from tableverse_factory.core.text import sanitize_line
-
-if TYPE_CHECKING:
-    from tableverse_factory.core.storage.files import StoragePath
 
 
 def cousins(
@@ -48,6 +43,7 @@ def cousins(
     Example: `tableverse cousins out out-cousins --per-scene 10`
     """
     from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.storage.apart import require_apart
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.cousin_rows import list_cousins
     from tableverse_factory.dataset.dataset import open_dataset
@@ -60,7 +56,7 @@ def cousins(
     from workers.plan.read_manifest import read_manifest
 
     source, place = parse_path(out), parse_path(dest)
-    _check_apart(source, place)
+    require_apart(place, source)
     manifest = place.parent / f"{place.name}.parquet"
     overrides = [*(overrides or []), f"run.seed={seed}"]
     load_config(config, overrides)  # what is refused leaves no manifest behind
@@ -94,29 +90,3 @@ def cousins(
             manifest.unlink()  # a build that was refused leaves no manifest behind
         raise
     report_summary(summary, dest)
-
-
-def _check_apart(parents: "StoragePath", dest: "StoragePath") -> None:
-    """Refuse a destination that is, holds or lies within the dataset of the parents, also through a link."""
-    root, folder, beside = _resolve(parents), _resolve(dest), _resolve(dest.parent)
-    if folder == root:
-        problem = "is"
-    elif folder in root.parents:
-        problem = "holds"
-    elif root in folder.parents or root in (beside, *beside.parents):  # a link may lie within it and lead elsewhere
-        problem = "lies within"
-    else:
-        return
-    led = f", a link to {folder}," if isinstance(dest, Path) and dest.is_symlink() else ""
-    raise InputError(
-        sanitize_line(f"DEST {dest}{led} {problem} the dataset of the parents, {parents}", 300)
-        + f": give a folder apart from it, such as {sanitize_line(str(root), 200)}-cousins"
-    )
-
-
-def _resolve(path: "StoragePath") -> "StoragePath":
-    """Resolve the links of a local path."""
-    try:
-        return path.resolve()
-    except (OSError, RuntimeError):  # a link that leads to itself
-        raise InputError(f"{sanitize_line(str(path), 300)}: a link that leads nowhere; give another folder") from None

@@ -21,6 +21,11 @@ def redact_secrets(text: str) -> str:
     return sanitize_line(plain, 300)
 
 
+def describe_change(name: str, before: object, now: object) -> str:
+    """Describe a change of a value in one line."""
+    return sanitize_line(f"{name} was {before!r} and is now {now!r}", 400)
+
+
 def pluralize(number: int, noun: str) -> str:
     """Format a number with a noun that takes an s: `1 row`, `2 rows`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

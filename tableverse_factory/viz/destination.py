@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.apart import require_apart, resolve_links
 from tableverse_factory.core.storage.files import PARTIAL, remove, resolve_filesystem, write_atomic
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.core.version import __version__
@@ -38,19 +39,12 @@ def resolve_destination(dest: Path, dataset: Path | None) -> Path:
     """Resolve the links of a destination, which is apart from the dataset.
 
     Raises:
-        InputError: if it lies within the dataset, or holds it.
+        InputError: as `require_apart`.
     """
-    try:
-        folder = dest.resolve()
-    except RuntimeError:  # a link that leads to itself
-        raise InputError(f"{dest}: a link that leads nowhere; {_ELSE}") from None
+    resolve_links(dest)
     if dataset is not None:
-        root = dataset.resolve()
-        if root == folder or root in folder.parents:
-            raise InputError(f"{dest}: lies within the dataset, whose bytes stay as built; give another folder")
-        if folder in root.parents:
-            raise InputError(f"{dest}: the dataset lies within it; give a folder that the gallery has for itself")
-    return folder
+        require_apart(dest, dataset)
+    return dest.resolve()
 
 
 @contextmanager

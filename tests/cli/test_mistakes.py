@@ -157,15 +157,15 @@ def test_another_configuration_names_the_key_and_both_values(tableverse, home, t
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("out out", "DEST out is the dataset of the parents, out: give a folder apart from it, such as "),
+        ("out out", "DEST out is the dataset, out: give a folder apart from it"),
         ("out ./more/../out", "DEST more/../out is the dataset"),
-        ("out out/cousins", "DEST out/cousins lies within the dataset of the parents, out: "),
+        ("out out/cousins", "DEST out/cousins lies within the dataset, out: "),
         ("out link", "DEST link, a link to "),
         ("out link/cousins", "DEST link/cousins lies within the dataset"),
         ("out inside", "/out/scenes, lies within the dataset"),
-        ("out out/away", "lies within the dataset of the parents"),
-        ("out .", "DEST . holds the dataset of the parents"),
-        ("link out", "DEST out is the dataset of the parents, link: "),
+        ("out out/away", "lies within the dataset"),
+        ("out .", "DEST . holds the dataset"),
+        ("link out", "DEST out is the dataset, link: "),
         ("out round", "round: a link that leads nowhere; give another folder"),
     ],
 )

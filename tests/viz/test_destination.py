@@ -49,7 +49,7 @@ def test_a_dataset_within_the_gallery_is_not_deleted_with_it(out, tmp_path, form
     before = digest(site)
     result = CliRunner().invoke(app, ["report", form.format(inside), "--dest", str(site)])
     assert result.exit_code != 0
-    assert "the dataset lies within it" in str(result.exception)
+    assert "holds the dataset" in str(result.exception)
     assert digest(site) == before
 
 

@@ -30,7 +30,7 @@ from tableverse_factory.dataset.parts import PartWriter
 from tableverse_factory.dataset.shards import check_exported
 from tableverse_factory.models.remote.cost_meter import Meter
 from tableverse_factory.models.services import Services
-from tableverse_factory.stage import Pipelines, Stage, find_stages, import_stages
+from tableverse_factory.stage import Pipelines, Stage, check_stages, import_stages
 from workers.sandbox.channel import Channel, ChannelClosedError
 from workers.sandbox.error_text import bound_drop, bound_failure, make_failure
 from workers.sandbox.messages import InputMissing, StageDone, encode_message
@@ -130,7 +130,7 @@ def load_pipelines(reference: str) -> Pipelines:
     module, _, attribute = reference.partition(":")
     try:
         pipelines: Pipelines = getattr(importlib.import_module(module), attribute)
-        find_stages(pipelines.values())
+        check_stages(pipelines.values())
     except (ImportError, AttributeError) as error:
         raise BuildError(f"the pipeline {reference!r} cannot be loaded: {error}") from error
     return pipelines

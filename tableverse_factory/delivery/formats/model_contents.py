@@ -24,7 +24,7 @@ from tableverse_factory.delivery.formats.model_views import (
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, pose_from_rotation, rotation_matrix
 from tableverse_factory.geometry.mesh.hulls import make_hull_mesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
-from tableverse_factory.physics.mjcf.geom_meshes import body_name, make_geom_mesh
+from tableverse_factory.physics.mjcf.geom_meshes import make_geom_mesh, name_body
 from tableverse_factory.physics.mjcf.scenery import Rgb, make_geom_box, make_geom_plane, read_geom_color, read_geom_mesh
 from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 
@@ -78,7 +78,7 @@ def read_model_contents(model: mujoco.MjModel, colliders: bool = True) -> ModelC
     mujoco.mj_camlight(model, data)
     roots = [int(root) for root in np.unique(model.body_rootid[model.geom_bodyid])]
     moving = {int(root) for root in np.unique(model.body_rootid[model.jnt_bodyid])}
-    chosen = moving or {root for root in roots if root > 0 and not is_table(body_name(model, root))}
+    chosen = moving or {root for root in roots if root > 0 and not is_table(name_body(model, root))}
     return ModelContents(
         tuple(_read_object(model, data, root, colliders) for root in roots if root in chosen),
         tuple(_read_object(model, data, root, colliders) for root in roots if root not in chosen),
@@ -107,7 +107,7 @@ def _read_object(model: mujoco.MjModel, data: mujoco.MjData, root: int, collider
     friction, spin, roll = model.geom_friction[solid].max(axis=0).tolist() if solid else (1.0, 0.0, 0.0)
     properties = _compute_mass_properties(model, data, root, pose)
     shapes = tuple(looks), tuple(unseen), tuple(hull for hull, _ in found)
-    return ModelObject(body_name(model, root), pose, *shapes, contacts, *properties, friction, (spin, roll))
+    return ModelObject(name_body(model, root), pose, *shapes, contacts, *properties, friction, (spin, roll))
 
 
 def _list_visual_geoms(model: mujoco.MjModel, geoms: Sequence[int]) -> list[int]:

@@ -4,7 +4,6 @@ Builds run as the command `tableverse build`, in processes of their own, which a
 outside.
 """
 
-import hashlib
 import os
 import shutil
 import signal
@@ -21,6 +20,7 @@ import psutil
 
 from tableverse_factory.core.cache_dir import CACHE_VARIABLE
 from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.core.text import pluralize
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.evaluation.bench.build_family import DRIVER, choose_victim, list_family
@@ -128,8 +128,7 @@ def hash_dataset(out: Path) -> dict[str, str]:
     for path in sorted(out.rglob("*")):
         parts = path.relative_to(out).parts
         if path.is_file() and parts[0] != "timings" and not parts[0].startswith("."):
-            with path.open("rb") as file:
-                digests["/".join(parts)] = hashlib.file_digest(file, "sha256").hexdigest()
+            digests["/".join(parts)] = hash_file(path)
     return digests
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tableverse_factory.core.errors import BuildError, InputError
-from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.text import describe_change
 from tableverse_factory.evaluation.benchmark.results import (
     EpisodeResult,
     ResultsHeader,
@@ -96,22 +96,17 @@ def _check_header(path: Path, found: ResultsHeader, header: ResultsHeader) -> No
     if found.model_copy(update={"weights": header.weights}) == header:
         return
     changes = [
-        f"{name} {_was_and_is(getattr(found, name), getattr(header, name))}"
+        describe_change(name, getattr(found, name), getattr(header, name))
         for name in ResultsHeader.model_fields
         if name not in ("policy_digest", "weights") and getattr(found, name) != getattr(header, name)
     ]
     (old, _, _), (new, _, _) = (each.weights.partition(", ") for each in (found, header))  # digests, without names
     if old and old != new:
-        changes.append(f"weights {_was_and_is(found.weights, header.weights)}")
+        changes.append(describe_change("weights", found.weights, header.weights))
     elif found.policy_digest != header.policy_digest:
         what = "the policy's code" if old == new else "the policy's code or weights"
-        changes.append(f"{what} {_was_and_is(found.policy_digest[:12], header.policy_digest[:12])} (digest)")
+        changes.append(describe_change(f"the digest of {what}", found.policy_digest[:12], header.policy_digest[:12]))
     raise InputError(
         f"{path} holds results of another run: {'; '.join(changes)}. Give the same, or another --out, or remove it",
         "other_results",
     )
-
-
-def _was_and_is(old: object, new: object) -> str:
-    shown = (sanitize_line(str(value), 200) if value not in ("", ()) else "none" for value in (old, new))
-    return "was {}, and is now {}".format(*shown)

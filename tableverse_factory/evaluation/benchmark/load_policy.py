@@ -1,6 +1,5 @@
 """Policies by name: ours, classes of modules and files, and processes behind an HTTP address."""
 
-import hashlib
 import importlib
 import importlib.util
 import os
@@ -14,6 +13,7 @@ from typing import Any
 
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import ConfigError, InputError, WeightsError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.benchmark.http_policy import HttpPolicy
 from tableverse_factory.evaluation.benchmark.policy import Policy, check_policy
@@ -41,20 +41,17 @@ class PolicyName:
     weights: str | None = None
     title: str | None = None
 
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the name, the class's own file and the weights, a file or folder: others are another run.
-
-        Of a process behind an address only the address is known.
-        """
-        return self.identify()[0]
-
     def identify(self) -> tuple[str, str]:
-        """Return the digest, and a line on the weights: the start of their own SHA-256, if they are here, and name."""
+        """Return a digest, and a line on the weights: the start of their own SHA-256, if they are here, and their name.
+
+        The digest is of the name, the class's own file and the weights, a file or folder: others are another run. Of a
+        process behind an address only the address is known.
+        """
         weights = Path(self.weights or SHIPPED.get(self.name) or "")
         hashed = _hash_path(weights)
-        line = f"sha256 {hashed.hex()[:12]}, {weights.name}" if weights.name and weights.exists() else weights.name
-        return content_hash(self.name.encode(), _hash_path(_find_source(self.name)), hashed), sanitize_line(line, 300)
+        line = f"sha256 {hashed[:12]}, {weights.name}" if weights.name and weights.exists() else weights.name
+        parts = self.name, _hash_path(_find_source(self.name)), hashed
+        return content_hash(*(part.encode() for part in parts)), sanitize_line(line, 300)
 
     @property
     def shown(self) -> str:
@@ -75,16 +72,15 @@ def _find_source(name: str) -> Path:
     return Path(source)
 
 
-def _hash_path(path: Path) -> bytes:
+def _hash_path(path: Path) -> str:
     """Hash a file, all files of a folder with their names within it, or else the path."""
     if path.is_file():
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").digest()
+        return hash_file(path)
     if not (path.name and path.is_dir()):
-        return bytes.fromhex(content_hash(os.fsencode(path)))
+        return content_hash(os.fsencode(path))
     inside = sorted(each for each in path.rglob("*") if each.is_file())
-    named = (part for each in inside for part in (os.fsencode(each.relative_to(path)), _hash_path(each)))
-    return bytes.fromhex(content_hash(*named))
+    named = (part for each in inside for part in (os.fsencode(each.relative_to(path)), hash_file(each).encode()))
+    return content_hash(*named)
 
 
 def load_policy(name: PolicyName) -> Policy:

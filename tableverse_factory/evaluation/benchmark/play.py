@@ -139,9 +139,9 @@ def _ask(question: Callable[[Told], Answer], told: Told) -> Answer:
     """Ask a policy; whatever it raises is its failure."""
     try:
         return question(told)
+    except PolicyGoneError:
+        raise
     except Exception as error:  # of foreign code, whose failure is a result
-        if isinstance(error, PolicyGoneError):
-            raise
         if isinstance(error, PolicyError) and re.fullmatch("[a-z_]{1,60}", str(error.reason)):
             raise
         raise PolicyError("policy_error", describe_failure(error, 300)) from error

@@ -2,18 +2,18 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.evaluation.training.differences import (
     Inputs,
     describe_inputs,
     describe_settings,
-    hash_content,
 )
 from tableverse_factory.models.local.device import Tensor, import_torch
 
@@ -24,23 +24,24 @@ WEIGHTS = "weights.safetensors"
 Position = TypeVar("Position")
 
 
-def save_checkpoint(
-    folder: Path,
-    network: Any,
-    average: Any,
-    optimizer: Any,
-    settings: Any,
-    inputs: Inputs,
-    positions: Sequence[Any],
-) -> None:
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """What a training changes: the network, its averaged weights, and the optimizer."""
+
+    network: Any
+    average: Any
+    optimizer: Any
+
+
+def save_checkpoint(folder: Path, trained: Trained, settings: Any, inputs: Inputs, positions: Sequence[Any]) -> None:
     """Write everything that the training needs to go on.
 
     Settings and positions, of which each of its processes has one, are dataclasses of plain values.
     """
     safetensors = import_extra("safetensors.torch", "training", "models")
-    tensors = {f"net.{name}": tensor.contiguous().clone() for name, tensor in network.state_dict().items()}
-    tensors |= {f"mean.{name}": tensor.contiguous().clone() for name, tensor in average.state_dict().items()}
-    for index, state in optimizer.state_dict()["state"].items():
+    tensors = {f"net.{name}": tensor.contiguous().clone() for name, tensor in trained.network.state_dict().items()}
+    tensors |= {f"mean.{name}": tensor.contiguous().clone() for name, tensor in trained.average.state_dict().items()}
+    for index, state in trained.optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in state.items()}
     metadata = {
         "settings": json.dumps(asdict(settings)),
@@ -54,9 +55,7 @@ def save_checkpoint(
 
 def load_checkpoint(
     folder: Path,
-    network: Any,
-    average: Any,
-    optimizer: Any,
+    trained: Trained,
     settings: Any,
     inputs: Inputs,
     start: Position,
@@ -89,11 +88,11 @@ def load_checkpoint(
     if len(positions) != ranks:
         raise InputError(f"{path} lacks the positions of {ranks} processes: remove it")
     try:
-        network.load_state_dict(_pick(tensors, "net."))
-        average.load_state_dict(_pick(tensors, "mean."))
+        trained.network.load_state_dict(_pick(tensors, "net."))
+        trained.average.load_state_dict(_pick(tensors, "mean."))
     except RuntimeError as error:
         raise InputError(f"{path} is of another network than this version trains: remove it") from error
-    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    parameters = [each for group in trained.optimizer.param_groups for each in group["params"]]
     state: dict[int, dict[str, Any]] = {}
     for name, tensor in _pick(tensors, "adam.").items():
         index, _, part = name.partition(".")
@@ -101,7 +100,7 @@ def load_checkpoint(
         if tensor.shape == like.shape:  # the fused optimizer wants the weights' order in memory
             tensor = torch.empty_like(like).copy_(tensor)
         state.setdefault(int(index), {})[part] = tensor
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+    trained.optimizer.load_state_dict({**trained.optimizer.state_dict(), "state": state})
     return positions[rank]
 
 
@@ -128,7 +127,7 @@ def read_weights(path: Path, network: Any) -> None:
         raise InputError(f"{path}: there is no such file: give the weights that a training wrote")
     digest = "unreadable"
     try:
-        digest = hash_content(path)[:12]
+        digest = hash_file(path)[:12]
         with safetensors.safe_open(path, "pt") as file:
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 it is no mapping
         network.load_state_dict({k: each.float() if each.is_floating_point() else each for k, each in weights.items()})

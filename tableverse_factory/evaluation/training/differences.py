@@ -1,29 +1,23 @@
 """Differences between a checkpoint's training and the one that would go on with it."""
 
-import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.file_hash import hash_file
+from tableverse_factory.core.text import describe_change, sanitize_line
 
 Inputs = Mapping[str, tuple[str, str]]  # path and SHA-256 of each file that a training reads, by what it is
 
 
 def hash_inputs(files: Mapping[str, Path | None]) -> Inputs:
     """Hash the files that a training reads, but for those that it does without."""
-    return {name: (str(path), hash_content(path)) for name, path in files.items() if path is not None}
-
-
-def hash_content(path: Path) -> str:
-    """Compute the SHA-256 of a file; `weight_files` does too, but imports more than a training needs."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return {name: (str(path), hash_file(path)) for name, path in files.items() if path is not None}
 
 
 def describe_settings(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
     """Describe the settings that differ, each with both values."""
     return [
-        sanitize_line(f"{name} was {before.get(name)!r} and is now {now.get(name)!r}", 200)
+        describe_change(name, before.get(name), now.get(name))
         for name in {**before, **now}
         if before.get(name) != now.get(name)
     ]

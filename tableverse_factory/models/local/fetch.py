@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tableverse_factory.core.errors import InputError, WeightsError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.storage.files import sync_folder
 from tableverse_factory.models.local.catalogue import ModelEntry, WeightFile
@@ -23,7 +24,6 @@ from tableverse_factory.models.local.hf_weights import (
 from tableverse_factory.models.local.weight_files import (
     SHA256,
     check_file,
-    hash_file,
     hash_git_blob,
     locate_file,
     locate_repository,

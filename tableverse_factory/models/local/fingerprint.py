@@ -8,8 +8,8 @@ from typing import Any
 from schemas.config import ModelsConfig
 from schemas.identity import content_hash
 from tableverse_factory.core.errors import WeightsError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.models.local.device import select_device
-from tableverse_factory.models.local.weight_files import hash_file
 
 PACKAGES = ("torch", "transformers")
 # Distributions that are installed from git, by depth model.

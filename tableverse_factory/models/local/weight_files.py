@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from schemas.config import Config
 from tableverse_factory.core.errors import WeightsError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.core.text import describe_error
@@ -128,12 +129,6 @@ def check_file(model: ModelEntry, commit: str, file: WeightFile, locked: WeightF
             return FileState(file.name, "damaged", f"not the blob {named} of git")
         return FileState(file.name, "present", "git's hash, its name in the cache")
     return FileState(file.name, "present", "no hash is known: fetch it once to record one")
-
-
-def hash_file(path: Path) -> str:
-    """Compute the sha256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def hash_git_blob(path: Path) -> str:

@@ -22,7 +22,7 @@ ACROSS_PX = 3  # surfaces are compared at this distance from the border of two p
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
 AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
-EVEN = -0.8  # near even odds, which are at -1.1: in training, pairs of pixels of two objects weigh three times
+PROBABLE = -0.8  # the same on a smooth surface; odds are even at -1.1: training weighs pairs of two objects threefold
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
@@ -69,8 +69,8 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         continues = border.boundary < EDGE and border.bend < limit and border.affinity > -SURE
         if touches and (continues or border.affinity > SURE):
             wanted.append((border, -SURE))
-        elif touches and border.affinity > EVEN and border.bend < SMOOTH:
-            wanted.append((border, EVEN))
+        elif touches and border.affinity > PROBABLE and border.bend < SMOOTH:
+            wanted.append((border, PROBABLE))
     group = _merge_pieces(wanted, borders, len(middle_of))
     touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}
     ids = _join_fragments(found, group[pieces], touching)
@@ -178,7 +178,7 @@ def _measure_borders(found: PicturePrediction, pieces: IdImage) -> Iterator[_Bor
     keys, index = np.unique(pairs, axis=0, return_inverse=True)
     affinities = _average_affinities(found, pieces)
     for k, (a, b) in enumerate(keys.tolist()):
-        on, affinity = index.ravel() == k, affinities.get((a, b), EVEN)
+        on, affinity = index.ravel() == k, affinities.get((a, b), PROBABLE)
         yield _Border((a, b), int(on.sum()), float(np.median(bends[on])), float(np.median(edges[on])), affinity)
 
 

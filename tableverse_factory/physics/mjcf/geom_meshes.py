@@ -12,8 +12,8 @@ _SEGMENTS = 48
 _PLANE_REACH_M = 50.0
 
 
-def body_name(model: mujoco.MjModel, body: int) -> str:
-    """Name of a body, or `#` and its id where it has none."""
+def name_body(model: mujoco.MjModel, body: int) -> str:
+    """Name a body, or give `#` and its id where it has none."""
     return model.body(body).name or f"#{body}"
 
 

@@ -12,7 +12,7 @@ from schemas.scene import Certificate
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh
 from tableverse_factory.geometry.relations.containers import make_hollow_vessel
-from tableverse_factory.physics.mjcf.geom_meshes import body_name
+from tableverse_factory.physics.mjcf.geom_meshes import name_body
 from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, measure_drift, read_body_poses, set_poses
 from tableverse_factory.physics.simulate.model_solids import ModelBody, find_deepest_overlaps, load_bodies
@@ -123,7 +123,7 @@ def find_deepest_contact(model: mujoco.MjModel, poses: Sequence[Pose]) -> Depth:
     if depths.max(initial=0.0) <= 0.0:
         return 0.0, ""
     worst = int(np.argmax(depths))
-    return float(depths[worst]), " & ".join(body_name(model, int(root)) for root in roots[worst])
+    return float(depths[worst]), " & ".join(name_body(model, int(root)) for root in roots[worst])
 
 
 def _find_deepest_overlap(moving: Sequence[ModelBody], poses: Sequence[Pose], still: ModelBody) -> Depth:

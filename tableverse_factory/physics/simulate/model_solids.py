@@ -25,7 +25,7 @@ from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volum
 from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, place_mesh
 from tableverse_factory.geometry.mesh.repair import MIN_FILL_SHARE, make_closed_solid, mesh_to_solid
 from tableverse_factory.geometry.mesh.shells import is_one_shell
-from tableverse_factory.physics.mjcf.geom_meshes import body_name, make_geom_mesh
+from tableverse_factory.physics.mjcf.geom_meshes import make_geom_mesh, name_body
 from tableverse_factory.physics.mjcf.inertia import is_closed
 from tableverse_factory.physics.mjcf.undrawn_geoms import find_undrawn_geoms
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies
@@ -101,7 +101,7 @@ def load_bodies(model: mujoco.MjModel) -> tuple[tuple[ModelBody, ...], ModelBody
     mujoco.mj_kinematics(model, data)
     free = find_free_bodies(model)
     roots = model.body_rootid[model.geom_bodyid]
-    own = ((body_name(model, root), root, np.flatnonzero(roots == root)) for root in free)
+    own = ((name_body(model, root), root, np.flatnonzero(roots == root)) for root in free)
     moving = tuple(_load_body(model, data, *body) for body in own)
     return moving, _load_body(model, data, "world", 0, np.flatnonzero(~np.isin(roots, free)))
 

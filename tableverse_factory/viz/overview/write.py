@@ -6,6 +6,7 @@ from typing import Any
 
 from tableverse_factory import pipeline
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.storage.apart import require_apart
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.viz.funnel import FunnelStep, compute_funnel
@@ -15,11 +16,9 @@ from tableverse_factory.viz.overview.figure import draw_overview
 
 def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
     """Write the statistics of the committed shards into a folder apart from the dataset; return the files' paths."""
-    root = Path(dataset.path).resolve()
     if dest.exists() and not dest.is_dir():
         raise InputError(f"{dest}: a file; give a folder")
-    if root == dest.resolve() or root in dest.resolve().parents:
-        raise InputError(f"{dest}: lies within the dataset, whose bytes stay as they were built; give another folder")
+    require_apart(dest, Path(dataset.path), may_hold=True)
     statistics, steps, content = _compute_all(dataset)
     files = {
         "statistics.json": (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),

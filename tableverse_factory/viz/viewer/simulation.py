@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.geometry import Frozen, Points, Pose, Vector3
 from schemas.trajectories import Numbers
-from tableverse_factory.physics.mjcf.geom_meshes import body_name
+from tableverse_factory.physics.mjcf.geom_meshes import name_body
 from tableverse_factory.physics.simulate.at_rest import UNSTABLE, find_free_bodies, make_quiet_data, read_body_poses
 
 MAX_CONTACTS = 1000  # most contacts shown, the strongest first
@@ -42,7 +42,7 @@ class Simulation:
     def __init__(self, model: mujoco.MjModel) -> None:
         self._model, self._data = model, make_quiet_data(model)
         bodies = find_free_bodies(model)
-        self._bodies = {body_name(model, body): body for body in bodies}
+        self._bodies = {name_body(model, body): body for body in bodies}
         mujoco.mj_forward(model, self._data)
 
     @property

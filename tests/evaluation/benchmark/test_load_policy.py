@@ -86,21 +86,21 @@ def test_a_file_that_fails_is_no_traceback(tmp_path):
 def test_other_code_or_weights_are_another_policy(file, tmp_path):
     weights = tmp_path / "weights.pt"
     weights.write_bytes(b"1")
-    digests = [PolicyName(f"{file}:Good", str(weights)).digest]
+    digests = [PolicyName(f"{file}:Good", str(weights)).identify()[0]]
     weights.write_bytes(b"2")
-    digests.append(PolicyName(f"{file}:Good", str(weights)).digest)
+    digests.append(PolicyName(f"{file}:Good", str(weights)).identify()[0])
     file.write_text(CLASSES + "\n")
-    digests.append(PolicyName(f"{file}:Good", str(weights)).digest)
+    digests.append(PolicyName(f"{file}:Good", str(weights)).identify()[0])
     assert len(set(digests)) == 3
     for content in (b"3", b"4"):
         (tmp_path / "folder/part").mkdir(parents=True, exist_ok=True)
         (tmp_path / "folder/part/weights.pt").write_bytes(content)
-        digests.append(PolicyName(f"{file}:Good", str(tmp_path / "folder")).digest)
+        digests.append(PolicyName(f"{file}:Good", str(tmp_path / "folder")).identify()[0])
     assert len(set(digests)) == 5
     shutil.copytree(tmp_path / "folder", tmp_path / "moved")
-    assert PolicyName(f"{file}:Good", str(tmp_path / "moved")).digest == digests[-1]
+    assert PolicyName(f"{file}:Good", str(tmp_path / "moved")).identify()[0] == digests[-1]
     (tmp_path / "moved/part/weights.pt").rename(tmp_path / "moved/part/others.pt")
-    assert PolicyName(f"{file}:Good", str(tmp_path / "moved")).digest != digests[-1]
+    assert PolicyName(f"{file}:Good", str(tmp_path / "moved")).identify()[0] != digests[-1]
     assert PolicyName(f"{file}:Good").shown == "classes.py:Good"
     assert PolicyName(f"{file}:Good", title="good\x1b[2J").shown == "good\\x1b[2J"
 
@@ -109,10 +109,10 @@ def test_other_code_of_a_module_is_another_policy(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     file = tmp_path / "policies_of_a_package.py"
     file.write_text(CLASSES)
-    before = PolicyName("policies_of_a_package:Good").digest
+    before = PolicyName("policies_of_a_package:Good").identify()[0]
     file.write_text(CLASSES + "\n")
-    assert PolicyName("policies_of_a_package:Good").digest != before
-    assert PolicyName("absent_module:Good").digest != PolicyName("http://127.0.0.1:1").digest
+    assert PolicyName("policies_of_a_package:Good").identify()[0] != before
+    assert PolicyName("absent_module:Good").identify()[0] != PolicyName("http://127.0.0.1:1").identify()[0]
 
 
 def test_actions_are_checked_and_clipped():

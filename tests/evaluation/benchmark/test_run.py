@@ -222,13 +222,17 @@ def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, datase
     out = tmp_path / "r.jsonl"
     run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
     with pytest.raises(
-        InputError, match=r"another run: policy was policies\.py:Quick, and is now random; the policy's code was "
+        InputError,
+        match=r"another run: policy was 'policies\.py:Quick' and is now 'random'; the digest of the policy's code was ",
     ):
         run(benchmark, dataset, PolicyName("random"), out, splits=("train",))
     header, rows = read_results(out)
     other = Benchmark.model_validate(benchmark.model_dump() | {"seed": 5})
     out.write_bytes(encode_results(header.model_copy(update={"benchmark": other.digest}), rows.values()))
-    with pytest.raises(InputError, match=rf"run: benchmark was {other.digest}, and is now "), open_journal(out, header):
+    with (
+        pytest.raises(InputError, match=rf"run: benchmark was '{other.digest}' and is now "),
+        open_journal(out, header),
+    ):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["r.jsonl"], "no journal without rows stays"
     with (tmp_path / "r.jsonl.journal").open("ab") as held:
@@ -248,7 +252,7 @@ def test_other_weights_are_named_with_their_digests_and_moved_ones_are_the_same(
     with pytest.raises(InputError, match="holds results of another run") as caught:
         run(benchmark, dataset, PolicyName(f"{policy}:Weighed", str(other)), out, splits=("train",))
     old, new = (hashlib.sha256(content).hexdigest()[:12] for content in (b"1", b"2"))
-    for words in (f"weights was sha256 {old}, ", f", and is now sha256 {new}, ", "moved.pt", "other.pt"):
+    for words in (f"weights was 'sha256 {old}, ", f" and is now 'sha256 {new}, ", "moved.pt", "other.pt"):
         assert words in str(caught.value)
     assert "code" not in str(caught.value)
 

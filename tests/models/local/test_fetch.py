@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 
 from tableverse_factory.core.errors import InputError, ModelAccessError
+from tableverse_factory.core.file_hash import hash_file
 from tableverse_factory.models.local import fetch as fetching
 from tableverse_factory.models.local.catalogue import BY_REPOSITORY, CATALOGUE, DEFAULT_WEIGHTS, ModelEntry, WeightFile
 from tableverse_factory.models.local.device import Device
@@ -20,7 +21,6 @@ from tableverse_factory.models.local.weight_files import (
     LOCK_NAME,
     SHA256,
     check_model,
-    hash_file,
     locate_repository,
     read_lock,
 )

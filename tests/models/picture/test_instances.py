@@ -110,7 +110,7 @@ def test_pixels_that_belong_together_join_what_print_cut_and_others_keep_apart_w
     assert segment(replace(found, affinity=found.affinity - np.float32(3.0))).max() == 2
 
 
-def test_even_odds_join_what_print_cut_where_the_surface_goes_on_and_nowhere_else() -> None:
+def test_what_is_probably_one_object_is_joined_where_the_surface_goes_on_and_nowhere_else() -> None:
     halves = draw_boundary(vote_in_halves(30.0), 58, 59, 60, 61)
     even = replace(halves, affinity=np.zeros_like(halves.affinity))
     assert segment(even).max() == 1

@@ -10,6 +10,7 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelError
 from tableverse_factory.evaluation.training.checkpoint import (
+    Trained,
     load_checkpoint,
     save_checkpoint,
     write_weights,
@@ -104,9 +105,9 @@ class _Trainer:
         self._network = network.to(run.device, memory_format=torch.channels_last).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device)
-        restored = self._network, self._average, self._optimizer
+        self._trained = Trained(self._network, self._average, self._optimizer)
         position = load_checkpoint(
-            run.folder, *restored, settings, self._inputs, TrainPosition(), run.device, ranks.rank, settings.gpus
+            run.folder, self._trained, settings, self._inputs, TrainPosition(), run.device, ranks.rank, settings.gpus
         )
         world = make_world(run.pool, settings, run.jobs)
         renderer = world.make_renderer(settings, run.device)
@@ -214,8 +215,7 @@ class _Trainer:
         positions = self._ranks.gather(position)
         if self._ranks.rank:
             return
-        trained = self._network, self._average, self._optimizer
-        save_checkpoint(folder, *trained, self._settings, self._inputs, positions)
+        save_checkpoint(folder, self._trained, self._settings, self._inputs, positions)
         write_weights(self._average, folder)
         for with_depth in (False, True) if self._held_out else ():
             figures = validate_network(self._average, self._held_out, self._run.device, with_depth)

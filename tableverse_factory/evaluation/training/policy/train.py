@@ -10,6 +10,7 @@ from typing import Any
 
 from tableverse_factory.core.errors import InputError, ModelError
 from tableverse_factory.evaluation.training.checkpoint import (
+    Trained,
     load_checkpoint,
     read_weights,
     save_checkpoint,
@@ -125,9 +126,8 @@ class _Trainer:
         self._network = lesson.make_network(settings.seed).to(run.device).train()
         self._average = copy.deepcopy(self._network).eval()
         self._optimizer = _make_optimizer(self._network, settings, run.device, lesson.rate_factors)
-        position = load_checkpoint(
-            run.folder, self._network, self._average, self._optimizer, settings, inputs, PolicyPosition(), run.device
-        )
+        self._trained = Trained(self._network, self._average, self._optimizer)
+        position = load_checkpoint(run.folder, self._trained, settings, inputs, PolicyPosition(), run.device)
         self._step = position.step
         self._replay: tuple[Any, dict[str, Tensor]] | None = None
         counts = [len(data.choices[held_out][0]) for held_out in (False, True)]
@@ -202,8 +202,7 @@ class _Trainer:
         """Save, and measure the held-out demonstrations; weights that are not finite are refused."""
         if not all(torch.isfinite(each).all() for each in self._average.parameters()):
             raise ModelError(f"the weights of step {self._step} are not finite; the last checkpoint is kept")
-        trained = self._network, self._average, self._optimizer
-        save_checkpoint(self._run.folder, *trained, self._settings, self._inputs, [PolicyPosition(self._step)])
+        save_checkpoint(self._run.folder, self._trained, self._settings, self._inputs, [PolicyPosition(self._step)])
         write_weights(self._average, self._run.folder)
         for held_out in (False, True):
             if len(self._data.choices[held_out][0]):
