@@ -43,13 +43,13 @@ def place(
     complete = MESH_MODELS[config.place.mesh_model]
     answers = complete(item, [view for _, view in seen], config.place, rng, services)
     placed: list[PlacedObject] = []
-    kept: list[PerceivedObject] = []
+    kept: list[tuple[PerceivedObject, ObjectView]] = []
     for (perceived, view), answer in zip(seen, answers, strict=True):
         try:
             if isinstance(answer, GeometryError):
                 raise answer
             placed.append(_register_object(perceived, view, answer))
-            kept.append(perceived)
+            kept.append((perceived, view))
         except GeometryError as error:
             left_out.append((perceived.object_id, str(error)))
     if not placed:
@@ -127,17 +127,25 @@ def _register_object(perceived: PerceivedObject, view: ObjectView, completion: C
     )
 
 
-def _encode_evidence(scene: PerceivedObjects, objects: Sequence[PerceivedObject], jpeg_quality: int) -> Evidence:
-    """Encode the picture, its instance ids and the camera for the dataset; `object_pixels` follows `objects`."""
+def _encode_evidence(
+    scene: PerceivedObjects, objects: Sequence[tuple[PerceivedObject, ObjectView]], jpeg_quality: int
+) -> Evidence:
+    """Encode the picture, its instance ids and the camera for the dataset; `object_pixels` follows `objects`.
+
+    Of the objects the ids show what their views hold: colour of the table that smeared depth gave to one is not its.
+    """
     color = io.BytesIO()
     Image.fromarray(np.asarray(scene.observation.color)).save(color, "JPEG", quality=jpeg_quality)
     ids = np.maximum(scene.instance_ids, 0)
+    for perceived, view in objects:
+        part = ids[view.window]
+        part[(part == perceived.instance_id) & ~view.own] = 0
     if int(ids.max(initial=0)) > MAX_MASK_VALUE:
         raise GeometryError(f"instance id {int(ids.max())}: masks hold at most {MAX_MASK_VALUE}")
     return Evidence(
         color_jpg=color.getvalue(),
         masks_png=encode_png(ids.astype(np.uint16), compress_level=6),
-        object_pixels=tuple(o.instance_id for o in objects),
+        object_pixels=tuple(perceived.instance_id for perceived, _ in objects),
         camera=scene.observation.camera,
         camera_to_table=scene.camera_to_table,
         scale_source=scene.observation.scale_source,

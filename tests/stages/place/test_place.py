@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy import ndimage
 
 from schemas.codec import decode, encode
 from schemas.config import Config, PlaceConfig
@@ -16,6 +17,7 @@ from schemas.objects import Explanation, PerceivedObject, PerceivedObjects, Plac
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.bench.completion import render_noisy_view
+from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh, to_trimesh
 from tableverse_factory.geometry.mesh.surface_samples import measure_distance_to_surface
@@ -200,6 +202,28 @@ def test_the_evidence_holds_the_picture_and_the_masks_of_the_objects() -> None:
     picture = Image.open(io.BytesIO(result.evidence.color_jpg))
     assert (picture.format, picture.size) == ("JPEG", (640, 480))
     assert result.evidence.camera == scene.observation.camera
+
+
+def test_the_masks_of_the_evidence_leave_out_the_table_that_smeared_depth_gave_to_an_object() -> None:
+    scene = seen(box(0.1, 0.1, 0.1))
+    own = scene.instance_ids == 1
+    color = np.where(own[..., None], np.uint8([200, 40, 40]), np.uint8([150, 120, 80])).astype(np.uint8)
+    smear = ndimage.binary_dilation(own, iterations=4) & ~own
+    away, nearest = ndimage.distance_transform_edt(~own, return_indices=True)
+    assert away[smear].max() < 6
+    depth = np.where(smear, scene.observation.depth[tuple(nearest)], scene.observation.depth)
+    grown = np.where(smear, 1, scene.instance_ids).astype(np.int32)
+    item = replace(
+        scene.objects[0],
+        points_camera=backproject(depth, scene.observation.camera)[grown == 1],
+        colors=color[grown == 1],
+    )
+    observation = replace(scene.observation, color=color, depth=depth.astype(np.float32))
+    result = placed(replace(scene, observation=observation, instance_ids=grown, objects=(item,)))
+    assert result.evidence is not None
+    masks = np.array(Image.open(io.BytesIO(result.evidence.masks_png)))
+    assert (masks[smear] == 1).mean() < 0.1
+    assert (masks[own] == 1).mean() > 0.98
 
 
 def test_hopeless_objects_are_left_out_with_their_reason_and_the_rest_goes_on() -> None:

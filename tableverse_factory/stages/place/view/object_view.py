@@ -43,7 +43,8 @@ class ObjectView(Frozen):
         points: Denoised points, table frame [m]. Shape (n, 3).
         normals: Unit normals of `points`, towards the camera, table frame. Shape (n, 3).
         camera: Intrinsics of the window: pixel (0, 0) is the window's corner.
-        own: Pixels of the object.
+        window: Rows and columns of the picture that the window shows.
+        own: Pixels of the object, without those whose reading was smeared over its outline.
         depth: Smoothed depth [m]; 0 where unknown.
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
@@ -57,6 +58,7 @@ class ObjectView(Frozen):
     colors: Colors
     camera: Camera
     camera_to_table: Pose
+    window: tuple[slice, slice]
     own: Mask
     depth: DepthImage
     facing: DepthImage
@@ -110,6 +112,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
         colors=np.ascontiguousarray(color[seen][source]),
         camera=window,
         camera_to_table=pose,
+        window=(rows, columns),
         own=own,
         depth=np.where(own, own_depth, np.where(past, end, raw)),
         facing=np.where(seen, np.abs(cosine), 1.0),
