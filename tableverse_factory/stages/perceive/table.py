@@ -96,7 +96,10 @@ def find_table(
         why = "; ".join(refused) or f"no plane holds {MIN_PLANE_SHARE:.0%} of the {len(sample)} sampled readings"
         return Dropped("no_table_plane", why)
     chosen = _choose_plane(candidates, BENT_PARALLEL_COS if observation.bend else PARALLEL_COS)
-    return _build_view(observation, points, valid, chosen.plane, [c.plane for c in candidates if c is not chosen])
+    others = [candidate.plane for candidate in candidates if candidate is not chosen]
+    return _build_view(
+        observation, points, valid, valid if table_top is None else valid & table_top, chosen.plane, others
+    )
 
 
 def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
@@ -219,13 +222,18 @@ def _is_table_over(table: _PlaneCandidate, floor: _PlaneCandidate, parallel: flo
 
 
 def _build_view(
-    observation: Observation, points: Float64[np.ndarray, "h w 3"], valid: Mask, found: Plane, others: list[Plane]
+    observation: Observation,
+    points: Float64[np.ndarray, "h w 3"],
+    valid: Mask,
+    top: Mask,
+    found: Plane,
+    others: list[Plane],
 ) -> TableView | Dropped:
     noise, bend = compute_depth_noise(points[..., 2]), observation.bend
     tolerance = np.maximum(np.maximum(0.005, 2.5 * noise), BENDS * bend * points[..., 2])
-    plane = refine_plane(found, points[valid], tolerance[valid]).facing(np.zeros(3))
+    plane = refine_plane(found, points[top], tolerance[top]).facing(np.zeros(3))
     if bend:
-        plane = _level_plane(plane, others, points[valid], tolerance[valid])
+        plane = _level_plane(plane, others, points[top], tolerance[top])
     axes = compute_table_axes(plane)
     heights = np.where(valid, plane.heights(points), 0.0)
     xy = points @ axes[:2].T
