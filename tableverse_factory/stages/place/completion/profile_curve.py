@@ -15,7 +15,7 @@ from tableverse_factory.stages.place.view.object_view import ObjectView, measure
 AZIMUTHS = 32
 CELLS = 4500
 CELL_RANGE_M = (0.0007, 0.0025)
-WALL_RANGE_M = (0.0012, 0.012)
+WALL_RANGE_M = (0.001, 0.012)
 USUAL_WALL_M = 0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls
 WALL_POINTS, LEAST_POINTS = 300, 30
 LIP_M = 0.004  # height next to rim and floor over which a wall is not measured: both are rounded
@@ -35,6 +35,8 @@ BORED_SHARE = 0.6  # widest hole in a solid as a share of the body's width; a wi
 LID_WIDTH = 0.6  # middle of a mouth, as a share of its radius
 LID_DEPTH = 0.25  # of a lid below the rim, as a share of the cavity's: a wall that slants up from the floor is no lid
 LID_POINTS = 20
+FLOOR_POINTS = 20
+RESTING_M = 0.001  # most height of a wall's lowest part at which it rests on the support itself, without a foot [m]
 FOOT_RING_M = 0.0025  # least width of the ring on which a floor above the support stands [m]
 HOLLOW_FOOT_M = (0.0008, 0.008)  # hollow gaps below a floor: narrower ones are filled, taller ones are no foot ring
 
@@ -75,16 +77,19 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
                 body, hole = _build_solid(votes), _build_cavity(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
             if cavity is not None:
-                return _build_thin_wall(swollen, cavity, profile, outward, swelling * votes.band)
+                return _build_thin_wall(swollen, cavity, profile, outward, swelling * votes.band, _is_upright(axis))
     section = _build_solid(votes)
     return None if section.is_empty() else (section, CrossSection())
+
+
+def _is_upright(axis: Pose) -> bool:
+    return bool(axis.quaternion_wxyz[0] > 1.0 - 1e-9)
 
 
 def _collect_votes(view: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
     """Average the observed free space of each ring over all azimuths."""
     low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
-    upright = axis.quaternion_wxyz[0] > 1.0 - 1e-9
-    bottom = min(view.support_z - axis.position[2], top - 0.003) if upright else low
+    bottom = min(view.support_z - axis.position[2], top - 0.003) if _is_upright(axis) else low
     reach = float(np.quantile(profile[:, 0], 0.998))
     if not 0.002 < reach < 1.0 or top - bottom < 0.002:
         return None
@@ -153,8 +158,16 @@ def _measure_wall_across(hole: CrossSection, outer: Profile, low: float, high: f
     return float(np.clip(np.median(distance.min(axis=1)[beside]), *WALL_RANGE_M))
 
 
+def _measure_inside_height(votes: _Votes, inner: Profile, mouth: float) -> float:
+    """Measure the least height of the seen inside over the support [m]: what rests there is no thicker."""
+    slices = np.floor(inner[:, 0] / SLICE_M).astype(int)
+    rows = [slices == k for k in range(int(mouth / SLICE_M))]
+    heights = [float(np.median(inner[row, 1])) for row in rows if row.sum() >= FLOOR_POINTS]
+    return min(heights, default=np.inf) - votes.bottom
+
+
 def _build_thin_wall(
-    votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], swelling: float
+    votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], swelling: float, upright: bool
 ) -> tuple[CrossSection, CrossSection]:
     """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
     outer = _find_outer_profile(profile, outward)
@@ -163,6 +176,9 @@ def _build_thin_wall(
     completed, floor_z = _complete_cavity(votes, cavity, outer, USUAL_WALL_M, flat)
     seen = _build_cavity(votes, completed, swelling)
     wall = _measure_wall_across(seen, profile[outward > 0.3], floor_z + LIP_M, rim - LIP_M)
+    mouth = votes.cell * float(cavity.sum(axis=0).max())
+    lowest = _measure_inside_height(votes, profile[outward < 0.3], mouth) if upright else np.inf
+    wall = max(min(wall, lowest), WALL_RANGE_M[0])
     completed, floor_z = _complete_cavity(votes, cavity, outer, wall, flat)
     hole = _build_cavity(votes, completed, swelling)
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
@@ -173,9 +189,10 @@ def _build_thin_wall(
     foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
     if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
         foot = min(foot, float(outer[0, 0]))
-    solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
     gap = floor_z - wall - votes.bottom
-    if HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
+    if lowest - wall > RESTING_M:
+        solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
+    if lowest - wall > RESTING_M and HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
         within = foot - max(wall, FOOT_RING_M)
         solid = solid - _build_rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.

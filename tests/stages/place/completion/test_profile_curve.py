@@ -54,3 +54,14 @@ def test_a_floor_seen_is_as_high_as_it_is(floor):
     for x in (-0.015, 0.0, 0.015):
         solid = contains_points(whole, np.stack([np.full(len(z), x), np.zeros(len(z)), z], axis=1))
         assert abs(z[solid][-1] - floor) < 0.001
+
+
+def test_what_rests_on_its_sheet_is_no_thicker_than_its_inside_is_high():
+    thickness = 0.0012
+    under = np.array([(0.0, 0.0), (0.07, 0.0), (0.085, 0.01), (0.12, 0.022)])
+    outline = np.vstack([under, under[::-1] + np.array([0.0, thickness])])
+    plate = complete(from_trimesh(trimesh.creation.revolve(outline, sections=96)), elevation=0.9)
+    for radius in (0.02, 0.05, 0.1):
+        starts = [np.array([radius * np.cos(a), radius * np.sin(a), -0.001]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+        found = np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.05) for start in starts])
+        assert abs(found - thickness) < 0.0005, radius
