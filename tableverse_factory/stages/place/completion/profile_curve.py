@@ -189,12 +189,12 @@ def _build_thin_wall(
     foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
     if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
         foot = min(foot, float(outer[0, 0]))
-    gap = floor_z - wall - votes.bottom
     if lowest - wall > RESTING_M:
         solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
-    if lowest - wall > RESTING_M and HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
-        within = foot - max(wall, FOOT_RING_M)
-        solid = solid - _build_rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
+        gap = floor_z - wall - votes.bottom
+        if HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
+            within = foot - max(wall, FOOT_RING_M)
+            solid = solid - _build_rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
     carved = _build_solid(votes)
     thin = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24)
