@@ -126,8 +126,9 @@ class PerceiveConfig(RemoteModelSection):
         "auto", "geometric", "picture", "ensemble", "learned", "replay", "grounding_dino", "openai", "gemini"
     ] = "auto"
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `geometric`
-    where a sensor measured depth, and `picture`, our own net, where a model estimated it. `ensemble` chooses between
-    these two for each pile where a sensor measured depth; else it is `picture`. `learned` is a net of `tableverse train
+    where a sensor measured depth, and `picture`, our own net, where a model estimated it. `ensemble` lets a
+    sensor's depth and the net decide together, pile by pile, where that explains the picture much better than depth
+    alone; without a sensor it is `picture`. `learned` is a net of `tableverse train
     segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of OpenAI's chat
     completions, `gemini` Google's own protocol.
     """

@@ -176,14 +176,17 @@ def _measure_borders(found: PicturePrediction, pieces: IdImage) -> Iterator[_Bor
     pairs, bends, edges = (np.concatenate(part) for part in zip(*parts, strict=True))
     bends *= found.camera.fx
     keys, index = np.unique(pairs, axis=0, return_inverse=True)
-    affinities = _average_affinities(found, pieces)
+    affinities = {pair: logits / count for pair, logits, count in zip(*sum_affinities(found, pieces), strict=True)}
     for k, (a, b) in enumerate(keys.tolist()):
         on, affinity = index.ravel() == k, affinities.get((a, b), PROBABLE)
         yield _Border((a, b), int(on.sum()), float(np.median(bends[on])), float(np.median(edges[on])), affinity)
 
 
-def _average_affinities(found: PicturePrediction, pieces: IdImage) -> dict[tuple[int, int], float]:
-    """Average the logits of all pairs of pixels that lie on two pieces, the one of the lesser number first."""
+def sum_affinities(found: PicturePrediction, pieces: IdImage) -> tuple[list[tuple[int, int]], list[float], list[float]]:
+    """Sum the logits of all pairs of pixels that lie on two pieces.
+
+    Returns the pairs of pieces, the one of the lesser number first, the sums, and the numbers of pairs of pixels.
+    """
     pairs, logits = [], []
     for (reach, axis), map_ in zip(product(REACHES, (1, 0)), found.affinity, strict=True):
         own, values = (np.moveaxis(each, axis, 0)[:-reach] for each in (pieces, map_))
@@ -193,7 +196,7 @@ def _average_affinities(found: PicturePrediction, pieces: IdImage) -> dict[tuple
         logits.append(values[on])
     keys, index, counts = np.unique(np.concatenate(pairs), axis=0, return_inverse=True, return_counts=True)
     sums = np.bincount(index.ravel(), np.concatenate(logits), len(keys))
-    return {(int(a), int(b)): float(v) for (a, b), v in zip(keys, sums / counts, strict=True)}
+    return [(a, b) for a, b in keys.tolist()], sums.tolist(), counts.astype(np.float64).tolist()
 
 
 def _compare_across(

@@ -121,7 +121,7 @@ def _ask(
 ) -> _Outputs:
     """Ask the net about the picture at a size, rows and columns."""
     rays = compute_rays(rescale_camera(camera, size[1], size[0]))
-    inputs = {"image": _resize_color(color, *size), "rays": rays, "depth": _thin_depth(sensed, *size)[None]}
+    inputs = {"image": _resize_color(color, *size), "rays": rays, "depth": take_nearest(sensed, *size)[None]}
     return load_picture_net(weights)(inputs)
 
 
@@ -159,7 +159,7 @@ def _resize_color(color: Picture, rows: int, columns: int) -> Float32[np.ndarray
     return np.ascontiguousarray(np.moveaxis(small, -1, 0)) / np.float32(255.0)
 
 
-def _thin_depth(depth: Float32[np.ndarray, "h w"], rows: int, columns: int) -> Float32[np.ndarray, "h2 w2"]:
-    """Take the reading nearest to the centre of each pixel of another size: means would lie between surfaces."""
-    at = ((np.arange(n) + 0.5) * (full / n) for n, full in zip((rows, columns), depth.shape, strict=True))
-    return depth[np.ix_(*(places.astype(np.intp) for places in at))]
+def take_nearest(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Take what is nearest to the centre of each pixel of another size: means of depths would lie between surfaces."""
+    at = ((np.arange(n) + 0.5) * (full / n) for n, full in zip((rows, columns), image.shape, strict=True))
+    return image[np.ix_(*(places.astype(np.intp) for places in at))]

@@ -80,22 +80,22 @@ def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[Me
     return found
 
 
-def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView) -> IdImage:
+def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView, with_vessels: bool = True) -> IdImage:
     """Merge regions that are parts of one object and renumber them from 1.
 
     Each region may join one other: a part seen behind an occluder the larger part, the inside of a vessel its wall.
-    Then the floors of vessels join the walls around them.
+    Then the floors of vessels join the walls around them. `with_vessels` off leaves vessels as they are.
     """
     regions = describe_regions(ids, surface, view)
     nearer = measure_occlusion(ids, surface)
     pairs: list[tuple[int, int]] = []
     for b in range(len(regions)):
         a = _find_other_part(regions, b, surface, nearer)
-        if a is None:
+        if a is None and with_vessels:
             a = _find_vessel(regions, b, nearer)
         if a is not None:
             pairs.append((a + 1, b + 1))
-    ids = _add_floors(ids, regions, pairs, view)
+    ids = _add_floors(ids, regions, pairs, view) if with_vessels else ids
     links = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     count = len(regions) + 1
     graph = coo_array((np.ones(len(pairs)), (links[0], links[1])), shape=(count, count))

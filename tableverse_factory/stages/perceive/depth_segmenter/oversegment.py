@@ -1,7 +1,8 @@
 """Over-segmentation along borders, then merging across the weakest ones into objects."""
 
 import heapq
-from collections.abc import Iterator
+import operator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
@@ -20,16 +21,17 @@ MAX_JUMP_M = 0.02
 SHORT_BORDER = 2.0
 MAX_GAP_PX = 4
 
-Links = dict[int, dict[int, tuple[float, int]]]  # neighbours of each patch: sum of the border's strength, length [px]
+Link = tuple[float, ...]  # sums over a border: of its strength, its length [px], and what else adds up
+Links = dict[int, dict[int, Link]]  # of each patch with its neighbours
 
 
-def oversegment(surface: Surface, mask: Mask, pitch_m: float) -> IdImage:
+def oversegment(borders: Float64[np.ndarray, "h w"], mask: Mask, pitch_m: float) -> IdImage:
     """Split the mask into small patches that respect borders by a compact watershed from a grid of seeds."""
     spacing = int(np.clip(round(SEED_SPACING_M / pitch_m), 6, 16))
     seeds = np.zeros(mask.shape, dtype=np.int32)
     grid = seeds[spacing // 2 :: spacing, spacing // 2 :: spacing]
     grid[...] = np.arange(1, grid.size + 1).reshape(grid.shape)
-    found = watershed(surface.borders, seeds * mask, mask=mask, compactness=COMPACTNESS)
+    found = watershed(borders, seeds * mask, mask=mask, compactness=COMPACTNESS)
     values, numbered = np.unique(found, return_inverse=True)
     return numbered.reshape(mask.shape).astype(np.int32) + (0 if values[0] == 0 else 1)
 
@@ -40,16 +42,23 @@ def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
     The strength of a border is its mean over all pixels along which the two regions touch, so that a short gap in a
     crease does not join two objects that have grown on either side of it.
     """
-    links = _build_links(ids, surface)
+    return merge_linked(ids, build_links(ids, surface), _compute_strength, MERGED_BELOW)
+
+
+def merge_linked(ids: IdImage, links: Links, measure: Callable[[Link, int, int], float], most: float) -> IdImage:
+    """Merge linked patches, the weakest border first, while it is no stronger than `most`; uses up `links`.
+
+    `measure` tells a border's strength from its link and the numbers of pixels on either side.
+    """
     sizes = np.bincount(ids.ravel()).tolist()
     into = list(range(len(sizes)))
     version = [0] * len(into)
     pairs = ((a, b, link) for a in links for b, link in links[a].items() if a < b)
-    heap = [(_compute_strength(link, sizes[a], sizes[b]), a, b, 0, 0) for a, b, link in pairs]
+    heap = [(measure(link, sizes[a], sizes[b]), a, b, 0, 0) for a, b, link in pairs]
     heapq.heapify(heap)
     while heap:
         strength, a, b, version_a, version_b = heapq.heappop(heap)
-        if strength > MERGED_BELOW:
+        if strength > most:
             break
         if version[a] != version_a or version[b] != version_b:
             continue
@@ -60,19 +69,20 @@ def merge_patches(ids: IdImage, surface: Surface) -> IdImage:
         _merge_links(links, a, b)
         for c, link in links[a].items():
             low, high = min(a, c), max(a, c)
-            heapq.heappush(heap, (_compute_strength(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
+            heapq.heappush(heap, (measure(link, sizes[a], sizes[c]), low, high, version[low], version[high]))
     for k, target in enumerate(into):  # a patch only ever goes into a lower one, whose own root is known by then
         into[k] = into[target]
     return np.array(into)[ids].astype(np.int32)
 
 
-def _compute_strength(link: tuple[float, int], size_a: int, size_b: int) -> float:
+def _compute_strength(link: Link, size_a: int, size_b: int) -> float:
     """Compute the mean strength of a border, raised where it is short for the size of the smaller region."""
     total, length = link
     return float(total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length))
 
 
-def _build_links(ids: IdImage, surface: Surface) -> Links:
+def build_links(ids: IdImage, surface: Surface) -> Links:
+    """Link every two patches that touch by the sum of their border's strength and its length [px]."""
     count = int(ids.max(initial=0)) + 1
     found = (borders for direction in DIRECTIONS for borders in _find_borders(ids, surface, direction))
     lows, highs, strengths = map(np.concatenate, zip(*found, strict=True))
@@ -111,10 +121,10 @@ def _find_borders(
 def _merge_links(links: Links, a: int, b: int) -> None:
     """Hand the neighbours of `b` to `a`."""
     del links[a][b], links[b][a]
-    for c, (total, length) in links.pop(b).items():
+    for c, link in links.pop(b).items():
         del links[c][b]
-        known_total, known_length = links[a].get(c, (0.0, 0))
-        links[a][c] = links[c][a] = (known_total + total, known_length + length)
+        known = links[a].get(c)
+        links[a][c] = links[c][a] = tuple(map(operator.add, known, link)) if known else link
 
 
 def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:

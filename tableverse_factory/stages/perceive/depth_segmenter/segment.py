@@ -70,6 +70,11 @@ def assign_regions_to_boxes(regions: IdImage, found: DetectionResult) -> IdImage
     return ids
 
 
+def compute_least_pixels(pitch_m: float) -> int:
+    """Compute the pixels of the smallest region that is kept, where a pixel is `pitch_m` wide."""
+    return max(MIN_PIXELS, round(MIN_CORE_M2 / pitch_m**2))
+
+
 def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
     """Segment the objects on the table, ids from 1, the largest first; and find the container of each that has one."""
     if not view.raised.any():
@@ -79,8 +84,8 @@ def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
     typical = float(np.median(part.depth[part.raised]))
     pitch = typical / part.observation.camera.fx
     surface = compute_surface(part.depth, part.observation.camera, typical)
-    least = max(MIN_PIXELS, round(MIN_CORE_M2 / pitch**2))
-    patches = merge_patches(oversegment(surface, part.raised, pitch), surface)
+    least = compute_least_pixels(pitch)
+    patches = merge_patches(oversegment(surface.borders, part.raised, pitch), surface)
     regions = attach_border_pixels(patches, surface, part.raised, least)
     regions = keep_regions_over_table(regions, part)
     regions = merge_occluded_parts(regions, surface, part)

@@ -1,4 +1,4 @@
-"""The detector `ensemble`: each pile from `geometric` or from `picture`, as the boundaries that our net sees decide."""
+"""The detector `ensemble`: each pile by depth alone or by both, as the boundaries that our net sees decide."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,31 +14,32 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
-from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, predict_observation
+from tableverse_factory.stages.perceive.ensemble.fused import detect_fused
+from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_observation
 
 BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
 REACH_PX = 2  # a boundary this near is that of a border
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
 LEAST_PROBABILITY = 0.02
-FAVOUR = 0.8  # log-likelihood per pixel of border by which `picture` must be better: the depth is measured
+FAVOUR = 0.4  # log-likelihood per pixel of border by which the answer of both must be better: depth is measured
 
 Probabilities = Float32[np.ndarray, "h w"]
 
 
 def detect_with_both(view: TableView, config: Config, services: Services) -> DetectionResult:
-    """Detect objects by depth and by the net, and choose one answer for each pile."""
-    answers = detect_from_depth(view, config, services), detect_in_picture(view, config, services)
+    """Detect objects by depth, and by depth and the net together, and choose one answer for each pile."""
+    answers = detect_from_depth(view, config, services), detect_fused(view, config)
     ids = [_get_ids(answer) for answer in answers]
-    seen = predict_observation(view.observation, config.perceive.detector_weights).boundary
+    seen = predict_observation(view.observation, config.perceive.detector_weights)
     height, width = view.valid.shape
-    boundary = np.asarray(Image.fromarray(seen).resize((width, height), Image.Resampling.BILINEAR))
+    boundary = np.asarray(Image.fromarray(seen.boundary).resize((width, height), Image.Resampling.BILINEAR))
     near = ndimage.binary_dilation((ids[0] > 0) | (ids[1] > 0), iterations=BESIDE_PX)
     piles, count = ndimage.label(near)
     by_net = np.zeros(count + 1, dtype=bool)
     for pile, window in enumerate(ndimage.find_objects(piles), start=1):
         inside = piles[window] == pile
         by_net[pile] = prefer_second([part[window] * inside for part in ids], boundary[window], inside)
-    return _merge_answers(answers, ids, piles, by_net)
+    return replace(_merge_answers(answers, ids, piles, by_net), shown=find_standing(view, seen))
 
 
 def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:

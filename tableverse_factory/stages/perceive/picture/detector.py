@@ -8,7 +8,7 @@ from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
-from tableverse_factory.models.picture.predict import OBJECT, TABLE, PicturePrediction, predict_picture
+from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction, predict_picture
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, DetectionResult
 from tableverse_factory.stages.perceive.base.object_filter import (
@@ -25,6 +25,8 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import (
 )
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
 
+SURELY_OTHER = 0.9  # probability of neither object nor table from which what rises over the table is no object
+
 
 def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
@@ -33,9 +35,19 @@ def detect_in_picture(view: TableView, config: Config, _services: Services) -> D
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
     detections = to_detections(regions, find_containers(regions, find_rims(regions, view), view))
-    if not view.observation.bend:  # a sensor's depth tells by itself what stands on the table
-        return detections
-    return replace(detections, shown=_find_label(found, OBJECT, view.valid.shape))
+    return replace(detections, shown=find_standing(view, found))
+
+
+def find_standing(view: TableView, found: PicturePrediction) -> Mask:
+    """Find where objects are seen, found or not.
+
+    A sensor tells what rises over the table, and the net what of that is none: people's arms, and what stands behind.
+    """
+    shape = view.valid.shape
+    if view.observation.bend:
+        return _find_label(found, OBJECT, shape)
+    other = upsample_ids((found.label[OTHER] > SURELY_OTHER).astype(np.int32), shape) > 0
+    return view.raised & (view.observation.depth > 0) & ~other
 
 
 def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Config) -> IdImage:

@@ -14,11 +14,12 @@ from schemas.objects import PerceivedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import ConfigError, ModelAccessError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.models.picture.predict import PicturePrediction
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
-from tableverse_factory.stages.perceive.picture.detector import detect_in_picture
+from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, find_standing
 from tableverse_factory.stages.perceive.recorded import record_segmenter
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import CAMERA, Box, best_overlaps, camera_above, look
@@ -115,7 +116,23 @@ def test_the_net_reads_the_depth_of_a_sensor_too(view: tuple[Path, IdImage]) -> 
     assert min(best_overlaps(ids, outcome.value.instance_ids)) > 0.7
     alone = find_table(sensed.value, np.random.default_rng(0), None)
     assert not isinstance(alone, Dropped)
-    assert detect_in_picture(alone, config, Services(Path())).shown is None, "the sensor tells what has to be explained"
+    shown = detect_in_picture(alone, config, Services(Path())).shown
+    assert shown is not None
+    assert not (shown & ~alone.raised).any(), "only what the sensor sees stand has to be explained"
+    assert (shown & (ids > 1)).sum() > 0.9 * (alone.raised & (ids > 1)).sum()
+
+
+@pytest.mark.parametrize(("other", "stands"), [(0.05, True), (0.8, True), (0.95, False)])
+def test_what_the_net_surely_takes_for_no_object_needs_no_explanation(other: float, stands: bool) -> None:
+    """An arm over the table: the sensor sees it stand there, and no object explains it."""
+    view = find_table(look(THINGS, POSE, floor_z=-0.7, wall_y=1.5)[0], np.random.default_rng(0))
+    assert not isinstance(view, Dropped)
+    size = view.valid.shape
+    label = np.stack([np.full(size, p, np.float32) for p in (other, (1.0 - other) / 2, (1.0 - other) / 2)])
+    zero = np.zeros(size, np.float32)
+    votes, affinity = np.zeros((2, *size), np.float32), np.zeros((6, *size), np.float32)
+    said = PicturePrediction(CAMERA, zero, label, votes, zero, affinity, np.array([0.0, 0.0, 1.0]), 1.0, 1.0, 0.1)
+    assert bool(find_standing(view, said).any()) is stands
 
 
 @pytest.mark.heavy

@@ -1,0 +1,113 @@
+"""Objects of a sensor's depth and our net together: small patches, merged across borders that neither sees."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float32
+from PIL import Image
+
+from schemas.config import Config
+from schemas.geometry import IdImage, Mask
+from tableverse_factory.models.picture.instances import sum_affinities
+from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction, take_nearest
+from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
+from tableverse_factory.stages.perceive.base.object_filter import (
+    keep_objects,
+    keep_regions_over_table,
+    renumber_regions,
+)
+from tableverse_factory.stages.perceive.base.table_view import (
+    ImageWindow,
+    TableView,
+    crop_view,
+    find_working_window,
+    uncrop_ids,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.merge_regions import merge_occluded_parts
+from tableverse_factory.stages.perceive.depth_segmenter.oversegment import (
+    Link,
+    attach_border_pixels,
+    build_links,
+    merge_linked,
+    oversegment,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
+from tableverse_factory.stages.perceive.depth_segmenter.segment import (
+    MARGIN_PX,
+    WORKING_PIXELS,
+    compute_least_pixels,
+    fill_holes,
+    to_detections,
+)
+from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface, compute_surface
+from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
+from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_observation
+
+SURE = 0.6  # probability of an object from which a pixel is one that the sensor does not see rise
+MERGED_BELOW = 1.3  # strength of a border up to which two regions are one; the best of eight on rendered tables
+AFFINITY_WEIGHT = 0.35  # strength in depth that a logit of the net outweighs: logistic regression on 32 such tables
+
+
+def detect_fused(view: TableView, config: Config) -> DetectionResult:
+    """Detect objects as unnamed candidates, the largest first, by a sensor's depth and by the net together."""
+    seen = predict_observation(view.observation, config.perceive.detector_weights)
+    shape = view.valid.shape
+    mask = find_standing(view, seen) | (_upsample(seen.label[OBJECT], shape) > SURE)
+    if not (mask & view.valid).any():
+        return to_detections(np.zeros(shape, dtype=np.int32), {})
+    window = find_working_window(mask, WORKING_PIXELS, MARGIN_PX)
+    part, own = replace(crop_view(view, window), raised=mask[window.slices]), mask[window.slices]
+    typical = float(np.median(part.depth[own & part.valid]))
+    surface = compute_surface(part.depth, part.observation.camera, typical)
+    boundary = _upsample(seen.boundary, shape)[window.slices]
+    patches = oversegment(np.maximum(surface.borders, boundary), own, typical / part.observation.camera.fx)
+    whole = _merge_patches(patches, surface, seen, window, shape)
+    least = compute_least_pixels(typical / part.observation.camera.fx)
+    attached = attach_border_pixels(whole, surface, own, least)
+    regions = keep_regions_over_table(np.where(part.valid, attached, 0), part)
+    regions = merge_occluded_parts(regions, surface, part, with_vessels=False)
+    regions = keep_objects(regions, part, range(1, int(regions.max(initial=0)) + 1))
+    regions = _add_unmeasured(regions, attached, part.valid)
+    sizes = np.bincount(regions.ravel())[1:]
+    regions = renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
+    full = fill_holes(uncrop_ids(regions, window, shape))
+    regions = np.where(part.valid, regions, 0)
+    holders = find_containers(regions, find_rims(regions, part), part)
+    return to_detections(full, holders)
+
+
+def _merge_patches(
+    patches: IdImage, surface: Surface, seen: PicturePrediction, window: ImageWindow, shape: tuple[int, ...]
+) -> IdImage:
+    """Merge patches across the weakest borders by the mean strength in depth, less the net's mean logit of one object.
+
+    Where depth is unknown the net decides alone.
+    """
+    known = surface.normals[..., 2] < 0
+    links = build_links(patches, replace(surface, borders=np.where(known, surface.borders, MERGED_BELOW)))
+    small = take_nearest(uncrop_ids(patches, window, shape), *seen.boundary.shape)
+    for others in links.values():
+        others.update({b: (*link, 0.0, 0.0) for b, link in others.items()})
+    for (a, b), logits, count in zip(*sum_affinities(seen, small), strict=True):
+        total, length = links.get(a, {}).get(b, (0.0, 0.0))[:2]  # two that do not touch yet may do so once they grow
+        links.setdefault(a, {})[b] = links.setdefault(b, {})[a] = (total, length, logits, count)
+    return merge_linked(patches, links, _measure_strength, MERGED_BELOW)
+
+
+def _measure_strength(link: Link, _size_a: int, _size_b: int) -> float:
+    total, length, logits, count = link
+    return total / length - AFFINITY_WEIGHT * logits / max(count, 1.0) if length else math.inf
+
+
+def _add_unmeasured(regions: IdImage, before: IdImage, measured: Mask) -> IdImage:
+    """Give each pixel without a reading what most measured pixels of its region have become."""
+    counts = np.zeros((int(before.max(initial=0)) + 1, int(regions.max(initial=0)) + 1), dtype=np.int64)
+    np.add.at(counts, (before[measured], regions[measured]), 1)
+    became = np.where(np.arange(len(counts)) > 0, counts.argmax(axis=1), 0).astype(np.int32)
+    return np.where(measured | (regions > 0), regions, became[before])
+
+
+def _upsample(map_: Float32[np.ndarray, "h w"], shape: tuple[int, ...]) -> Float32[np.ndarray, "h2 w2"]:
+    height, width = shape
+    return np.asarray(Image.fromarray(map_).resize((width, height), Image.Resampling.BILINEAR))
