@@ -105,7 +105,7 @@ class ObserveConfig(StageSection):
     """
     focal_px: Annotated[float, Field(gt=0.0, le=1e6, allow_inf_nan=False)] | None = None
     """Focal length of bare pictures that neither the model nor EXIF gives [px]; null: 58 degrees on the longer side."""
-    min_table_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.7
+    min_table_probability: Annotated[float, Field(ge=0.0, le=1.0)] = 0.92
     """`picture`: least probability that a table-top is shown; else the picture is dropped as `no_table`."""
     table_distance_m: Interval = (0.1, 4.0)
     """`picture`: least and greatest distance of the camera from the table's plane [m]."""

@@ -57,7 +57,7 @@ def predict(color: np.ndarray) -> PicturePrediction:
 def read_probability(outcome: Outcome[Observation]) -> float:
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "no_table"
-    told = re.search(r"probability of ([01]\.\d\d), under observe\.min_table_probability = 0\.7$", outcome.detail)
+    told = re.search(r"probability of ([01]\.\d\d), under observe\.min_table_probability = 0\.92$", outcome.detail)
     assert told, outcome.detail
     return float(told[1])
 
