@@ -271,7 +271,8 @@ def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
     assert not (tmp_path / "mine.parquet").exists()
     code, _, errors = run("cousins", made / "out", made / "out", "--executor", "local")
     assert code == 1
-    assert "is the dataset" in errors and "give a folder apart from it" in errors
+    assert "is the dataset" in errors
+    assert "give a folder apart from it" in errors
 
 
 def test_the_gallery_shows_a_family_side_by_side(made, tmp_path):
