@@ -176,6 +176,7 @@ def test_one_writer_at_a_time(mixed, tmp_path):
     build(manifest, tmp_path / "out")
 
 
+@pytest.mark.slow  # test_asking_build.py kills a local build, test_ray_build.py one on Ray, test_commit.py each step
 def test_kill_minus_nine_at_random_moments_gives_the_same_bytes(tmp_path):
     names = [*MIXED, *["slow_0.3"] * 12]
     manifest = write_manifest(tmp_path / "m.parquet", names)

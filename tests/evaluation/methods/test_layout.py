@@ -44,14 +44,14 @@ def solid(kind: str) -> TriangleMesh:
 @pytest.mark.parametrize(
     ("kind", "degrees", "error"),
     [
-        ("wedge", 0, 0),
+        pytest.param("wedge", 0, 0, marks=pytest.mark.slow),
         ("wedge", 7, 7),
-        ("wedge", -120, 120),
+        pytest.param("wedge", -120, 120, marks=pytest.mark.slow),
         ("wedge", 180, 180),
-        ("box", 4, 4),
+        pytest.param("box", 4, 4, marks=pytest.mark.slow),
         ("box", 176, 4),
         ("box", 90, 90),
-        ("square", 87, 3),
+        pytest.param("square", 87, 3, marks=pytest.mark.slow),
         ("square", 45, 45),
         ("can", 30, None),
     ],

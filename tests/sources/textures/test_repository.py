@@ -18,6 +18,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.textures.conventions import MAPS, find_source, parse_category, parse_map_name
 from tableverse_factory.sources.textures.library import open_library, write_index
 from tableverse_factory.sources.textures.repository import index_textures
+from tests.helpers.captures_on_disk import huge_png
 
 AMBIENT = ("Color", "NormalGL", "NormalDX", "Roughness", "AmbientOcclusion", "Displacement", "Metalness")
 
@@ -156,10 +157,8 @@ def test_a_licence_is_what_something_states_and_nothing_else(tmp_path):
     ],
 )
 def test_a_bad_set_is_a_row_with_its_reason(tmp_path, files, reason):
-    bomb = io.BytesIO()
-    Image.new("1", (20_000, 20_000)).save(bomb, "PNG")
     for name, data in files.items():
-        put(tmp_path, name, bomb.getvalue() if data == b"BOMB" else data)
+        put(tmp_path, name, huge_png(20_000, 20_000) if data == b"BOMB" else data)
     row = rows(tmp_path)["A1"]
     assert row["rejected"] == reason
     assert row["rejected_detail"].isprintable()

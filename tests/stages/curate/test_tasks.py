@@ -66,7 +66,7 @@ def judge_and_referee(scene: SettledScene, tmp_path) -> tuple[int, int, list[str
     return len(assessment.tasks), len({t.relation for t in assessment.tasks}), found
 
 
-@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 8), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 8), marks=pytest.mark.slow)])
 def test_tasks_of_random_tables_hold_every_constraint(tmp_path, seeds):
     total = 0
     for seed in seeds:
@@ -74,7 +74,7 @@ def test_tasks_of_random_tables_hold_every_constraint(tmp_path, seeds):
         assert not found
         assert relations >= min(3, tasks)
         total += tasks
-    assert total > 40
+    assert total > 10 * len(seeds)
 
 
 def synthetic_scene(number: int) -> SettledScene:

@@ -112,8 +112,14 @@ def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
         _commit(ledger, out, result)
 
 
-@pytest.mark.parametrize("folder", [folder for folder in FOLDERS if folder != "scenes"])
-@pytest.mark.parametrize("merged", [True, False])
+@pytest.mark.parametrize(
+    ("folder", "merged"),
+    [
+        *((folder, True) for folder in FOLDERS if folder != "scenes"),
+        ("mjcf", False),
+        *(pytest.param(folder, False, marks=pytest.mark.slow) for folder in ("objects", "tasks", "timings")),
+    ],
+)
 def test_a_file_that_a_committed_shard_has_lost_is_named_and_the_advice_mends_it(finished, folder, merged):
     manifest, out = finished
     before = digests(out)

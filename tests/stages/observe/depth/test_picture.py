@@ -94,12 +94,11 @@ def test_a_photograph_without_a_table_is_dropped(name: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "black",
         "noise",
         "sky and ground",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("white", "grey", "red", "smooth noise", "down", "right")
+            for name in ("black", "white", "grey", "red", "smooth noise", "down", "right")
         ),
     ],
 )

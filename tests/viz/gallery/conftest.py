@@ -1,0 +1,16 @@
+"""Pictures of one sample per pixel: what a test reads of them is coarse, and four samples take longer."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from tableverse_factory.physics.render.views import FAST
+from tableverse_factory.viz.gallery import pictures
+
+
+@pytest.fixture(scope="package", autouse=True)
+def quick_pictures() -> Iterator[None]:
+    """Render without antialiasing; tests/integration/browser looks at those of full quality."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pictures, "QUALITY", FAST)
+        yield
