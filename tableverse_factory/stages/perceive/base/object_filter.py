@@ -35,10 +35,11 @@ def find_over_table(view: TableView) -> Mask:
     return view.valid & (is_inside_outline(view.outline_xy, xy, -EDGE_M) | _find_feet_below_image(view))
 
 
-def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) -> IdImage:
+def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = (), *, by_depth: bool = True) -> IdImage:
     """Keep the regions that are large enough and supported, renumbered from 1.
 
-    `contents`, which stand in the opening of a vessel, may be smaller: no table is there for noise to raise.
+    `contents`, which stand in the opening of a vessel, may be smaller: no table is there for noise to raise. Far
+    regions found `by_depth` must be larger, as the noise of a sensor grows; those that a net sees need not.
     """
     inner = is_inside_outline(view.outline_xy, view.xy(view.points_camera), -RAGGED_EDGE_M)
     kept = []
@@ -46,7 +47,7 @@ def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = ()) 
         mask = (ids == k) & view.valid
         least = MIN_CONTENT_AREA_M2 if k in contents else MIN_AREA_M2
         if (
-            _is_large_enough(mask, view, least)
+            _is_large_enough(mask, view, least, by_depth=by_depth)
             and _is_carried(mask, ids, view)
             and not _is_ragged_edge(mask, inner, view)
         ):
@@ -67,11 +68,11 @@ def _measure_area(mask: Mask, view: TableView) -> float:
     return float(np.sum(view.depth[mask] ** 2)) / (camera.fx * camera.fy)
 
 
-def _is_large_enough(mask: Mask, view: TableView, least_m2: float) -> bool:
-    """Whether the region is larger than what noise alone raises at its distance."""
+def _is_large_enough(mask: Mask, view: TableView, least_m2: float, *, by_depth: bool) -> bool:
+    """Whether the region is larger than what noise alone raises, if found `by_depth` at its distance."""
     if not mask.any():
         return False
-    noise = float(compute_depth_noise(np.median(view.depth[mask])))
+    noise = float(compute_depth_noise(np.median(view.depth[mask]))) if by_depth else NOISE_AT_HALF_A_METRE_M
     return _measure_area(mask, view) >= least_m2 * (noise / NOISE_AT_HALF_A_METRE_M) ** 2
 
 

@@ -67,7 +67,7 @@ def detect_fused(view: TableView, config: Config) -> DetectionResult:
     attached = attach_border_pixels(whole, surface, own, least)
     regions = keep_regions_over_table(np.where(part.valid, attached, 0), part)
     regions = merge_occluded_parts(regions, surface, part, with_vessels=False)
-    regions = keep_objects(regions, part, range(1, int(regions.max(initial=0)) + 1))
+    regions = keep_objects(regions, part, by_depth=False)
     regions = _add_unmeasured(regions, attached, part.valid)
     sizes = np.bincount(regions.ravel())[1:]
     regions = renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])

@@ -13,7 +13,6 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, DetectionResult
 from tableverse_factory.stages.perceive.base.object_filter import (
     keep_objects,
-    keep_regions_over_table,
     renumber_regions,
 )
 from tableverse_factory.stages.perceive.base.table_view import TableView
@@ -31,7 +30,7 @@ SURELY_OTHER = 0.9  # probability of neither object nor table from which what ri
 def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
     found = predict_observation(view.observation, config.perceive.detector_weights)
-    regions = keep_objects(keep_regions_over_table(segment_prediction(found, view.valid.shape), view), view)
+    regions = keep_objects(segment_prediction(found, view.valid.shape), view, by_depth=False)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
     detections = to_detections(regions, find_containers(regions, find_rims(regions, view), view))
