@@ -12,8 +12,8 @@ from tableverse_factory.stages.perceive.learned.onnx import check_net
 def check_perception_models(config: Config, kinds: Collection[SceneKind], here: bool) -> None:
     """Check the models of the detector and the segmenter; WeightsError if one cannot be loaded."""
     own = config.perceive
-    sees_bare = own.detector == "auto" and SceneKind.IMAGE in kinds
-    if sees_bare or own.detector in ("picture", "ensemble") or own.segmenter == "picture":
+    by_net = own.detector == "auto" and not {SceneKind.IMAGE, SceneKind.CAPTURE}.isdisjoint(kinds)
+    if by_net or own.detector in ("picture", "ensemble") or own.segmenter == "picture":
         check_picture_net(own.detector_weights, "perceive.detector_weights")
     if own.detector == "learned":
         check_net(own.detector_weights)

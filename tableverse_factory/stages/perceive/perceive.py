@@ -83,9 +83,7 @@ def choose_detector(item: Observation, config: PerceiveConfig) -> str:
         return config.detector
     if config.detector == "auto" and item.recorded_detections is not None:
         return "replay"
-    if item.bend:
-        return "picture"
-    return "geometric" if config.detector == "auto" else "ensemble"
+    return "picture" if item.bend else "ensemble"
 
 
 def segment_boxes(view: TableView, found: DetectionResult, config: Config) -> IdImage:

@@ -21,7 +21,7 @@ BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
 REACH_PX = 2  # a boundary this near is that of a border
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
 LEAST_PROBABILITY = 0.02
-FAVOUR = 0.4  # log-likelihood per pixel of border by which the answer of both must be better: depth is measured
+FAVOUR = 0.6  # log-likelihood per pixel of border by which the answer of both must be better: depth is measured
 
 Probabilities = Float32[np.ndarray, "h w"]
 
