@@ -23,8 +23,8 @@ def bench_perception(
         typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
     ],
     detector: Annotated[
-        str, typer.Option(help="Detector to measure: geometric, picture, ensemble, learned or replay.")
-    ] = "geometric",
+        str, typer.Option(help="Detector to measure: ensemble, geometric, picture, learned or replay.")
+    ] = "ensemble",
     weights: Annotated[
         str, typer.Option(metavar="FILE", help="The .onnx file of `learned`, or another one of `picture`.")
     ] = "",

@@ -41,15 +41,17 @@ def measure_explanation(
     """Measure what stands above the table by the sensor's own readings, and the part of each object.
 
     It is what is raised over the outline of the table, with the parts of the table that a pile cuts off, but not what
-    mostly stands beside it, such as a wall, or hangs there. Where a model's depth, which is bent, rises tells little:
-    `shown` are then the pixels that the detector takes for objects, found or not.
+    mostly stands beside it, such as a wall, or hangs there. A detector that uses our net says which pixels count,
+    `shown`: of a sensor's depth those that are raised and surely no arm or background, of a model's, which is bent,
+    those that the net takes for objects, found or not.
     """
     height, width = ids.shape
     stride = int(np.ceil(np.sqrt(ids.size / MAX_PIXELS)))
     window = ImageWindow(0, 0, height // stride, width // stride, stride)
     part, own = crop_view(view, window), ids[window.slices]
     areas = _measure_pixel_areas(part)
-    standing = _find_standing(part, areas, part.raised if shown is None else shown[window.slices])
+    by_depth = view.observation.bend == 0.0
+    standing = _find_standing(part, areas, part.raised if shown is None else shown[window.slices], by_depth=by_depth)
     shares = [standing & (own == item.instance_id) for item in objects]
     return Explanation(
         points=int(standing.sum()) * stride**2,
@@ -67,10 +69,11 @@ def _measure_pixel_areas(view: TableView) -> Float64[np.ndarray, "h w"]:
     return np.asarray(view.observation.depth, dtype=np.float64) ** 2 / (camera.fx * camera.fy)
 
 
-def _find_standing(view: TableView, areas: Float64[np.ndarray, "h w"], raised: Mask) -> Mask:
+def _find_standing(view: TableView, areas: Float64[np.ndarray, "h w"], raised: Mask, *, by_depth: bool) -> Mask:
     """Find what is raised and over the table, less the pieces that are no objects by the segmenter's own filters."""
     whole = replace(view, outline_xy=_extend_outline(view, areas))
-    pieces = keep_objects(keep_regions_over_table(_label_pieces(raised & (areas > 0.0), view), whole), whole)
+    labelled = keep_regions_over_table(_label_pieces(raised & (areas > 0.0), view), whole)
+    pieces = keep_objects(labelled, whole, by_depth=by_depth)
     return (pieces > 0) & find_over_table(whole)
 
 

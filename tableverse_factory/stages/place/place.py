@@ -132,7 +132,7 @@ def _encode_evidence(
 ) -> Evidence:
     """Encode the picture, its instance ids and the camera for the dataset; `object_pixels` follows `objects`.
 
-    Of the objects the ids show what their views hold: colour of the table that smeared depth gave to one is not its.
+    The ids of an object are what its view holds: colour of the table that smeared depth gave to it is not its own.
     """
     color = io.BytesIO()
     Image.fromarray(np.asarray(scene.observation.color)).save(color, "JPEG", quality=jpeg_quality)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.helpers.builds import digests, finish, scenes, start, write_manifest
+from tests.helpers.builds import digests, finish, kill, scenes, start, write_manifest
 
 SCENES = 20
 POISON = {3: ("segfault", "crash"), 9: ("hang", "timeout"), 14: ("hog", "out_of_memory")}
@@ -16,9 +16,14 @@ def built(tmp_path_factory):
     names = [POISON[i][0] if i in POISON else "fine" for i in range(SCENES)]
     manifest = write_manifest(folder / "images.parquet", names)
     builds = [start(manifest, folder / executor, executor, 2, **RUN) for executor in ("local", "ray")]
-    for process in builds:  # side by side: most of their time they wait for the scenes that hang
-        code, errors = finish(process, 300.0)
-        assert code == 0, errors
+    try:
+        for process in builds:  # side by side: most of their time they wait for the scenes that hang
+            code, errors = finish(process, 300.0)
+            assert code == 0, errors
+    finally:
+        for process in builds:
+            if process.poll() is None:
+                kill(process)
     return folder
 
 

@@ -17,6 +17,7 @@ from tableverse_factory.stages.perceive.table import _remove_strips, find_table,
 from tests.helpers.tabletop_views import Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
+GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 
@@ -31,7 +32,7 @@ def turn_camera(camera, degrees):
 
 
 def seen(observation, tmp_path):
-    outcome = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path))
+    outcome = perceive(observation, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     return outcome.value
 
@@ -155,12 +156,12 @@ def test_a_wall_alone_is_no_table():
 
 def test_no_plane_and_no_objects_are_dropped_with_what_was_measured(tmp_path):
     observation, _ = look([])
-    empty = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path))
+    empty = perceive(observation, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(empty, Dropped)
     assert empty.reason == "no_objects"
     assert "geometric" in empty.detail
     noise = np.random.default_rng(0).uniform(0.4, 4.0, observation.depth.shape).astype(np.float32)
-    nothing = perceive(replace(observation, depth=noise), Config(), np.random.default_rng(0), Services(tmp_path))
+    nothing = perceive(replace(observation, depth=noise), GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(nothing, Dropped)
     assert nothing.reason == "no_table_plane"
 
@@ -169,7 +170,7 @@ def test_a_single_reading_is_no_table(tmp_path):
     observation, _ = look(THINGS)
     depth = np.zeros_like(observation.depth)
     depth[100, 100] = 1.0
-    outcome = perceive(replace(observation, depth=depth), Config(), np.random.default_rng(0), Services(tmp_path))
+    outcome = perceive(replace(observation, depth=depth), GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Dropped)
     assert outcome.reason == "no_table_plane"
 

@@ -8,7 +8,7 @@ from tableverse_factory.physics.render.views import FAST
 from tableverse_factory.viz.gallery import pictures
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def quick_pictures() -> Iterator[None]:
     """Render without antialiasing; tests/integration/browser looks at those of full quality."""
     with pytest.MonkeyPatch.context() as patched:

@@ -14,6 +14,7 @@ MIN_OVER_TABLE = 0.3
 MIN_AREA_M2, MIN_CONTENT_AREA_M2 = 0.00045, 0.0002
 NOISE_AT_HALF_A_METRE_M = 0.0012
 HANGING_M = 0.04
+BENDS = 2.0  # height below the table at which a model's depth, which is bent, may show what stands on it, in bends
 BELOW_PX = 4
 CONTACT_M = 0.025
 MIN_CARRIED = 0.1
@@ -69,7 +70,7 @@ def _measure_area(mask: Mask, view: TableView) -> float:
 
 
 def _is_large_enough(mask: Mask, view: TableView, least_m2: float, *, by_depth: bool) -> bool:
-    """Whether the region is larger than what noise alone raises, if found `by_depth` at its distance."""
+    """Whether the region is larger than what noise alone raises: at its distance if found `by_depth`, else nearby."""
     if not mask.any():
         return False
     noise = float(compute_depth_noise(np.median(view.depth[mask]))) if by_depth else NOISE_AT_HALF_A_METRE_M
@@ -84,12 +85,15 @@ def _find_feet_below_image(view: TableView) -> Mask:
 
 
 def _is_carried(mask: Mask, ids: IdImage, view: TableView) -> bool:
-    """Whether the region is near the table or has a visible or hidden support.
+    """Whether the region is near the table or has a visible or hidden support, and does not stand below, on a floor.
 
     Below its lower contour are the table, a surface that it touches, or something nearer that may hide its support.
     What rises there beyond the table, in no region of `ids`, is a wall or furniture: a rail on it is no object.
     """
-    if float(np.percentile(view.heights[mask], 2)) < HANGING_M:
+    low, middle = np.percentile(view.heights[mask], (2, 50))
+    if middle < -max(HANGING_M, BENDS * view.observation.bend * float(np.median(view.depth[mask]))):
+        return False
+    if low < HANGING_M:
         return True
     columns = np.flatnonzero(mask.any(axis=0))
     lowest = mask.shape[0] - 1 - np.argmax(mask[::-1, columns], axis=0)

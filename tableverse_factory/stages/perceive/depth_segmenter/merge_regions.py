@@ -80,7 +80,7 @@ def describe_regions(ids: IdImage, surface: Surface, view: TableView) -> list[Me
     return found
 
 
-def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView, with_vessels: bool = True) -> IdImage:
+def merge_occluded_parts(ids: IdImage, surface: Surface, view: TableView, *, with_vessels: bool = True) -> IdImage:
     """Merge regions that are parts of one object and renumber them from 1.
 
     Each region may join one other: a part seen behind an occluder the larger part, the inside of a vessel its wall.

@@ -102,9 +102,10 @@ def _find_borders(
 ) -> Iterator[tuple[Int32[np.ndarray, " n"], Int32[np.ndarray, " n"], Float64[np.ndarray, " n"]]]:
     """Find pairs of pixels with the lower and the higher id, and the strength of the border between them.
 
-    They are neighbours, or a few pixels without a reading apart, as sensors leave where the surface steps back.
+    They are neighbours, or a few pixels apart without a reading and of no patch, as sensors leave where the surface
+    steps back.
     """
-    nothing, open_gap = surface.points[..., 2] == 0, np.ones(ids.shape, dtype=bool)
+    nothing, open_gap = (surface.points[..., 2] == 0) & (ids == 0), np.ones(ids.shape, dtype=bool)
     for distance in range(1, MAX_GAP_PX + 1):
         rows, columns = distance * direction[0], distance * direction[1]
         other = shift_image(ids, rows, columns)

@@ -81,6 +81,8 @@ def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
         return np.zeros(view.valid.shape, dtype=np.int32), {}
     window = find_working_window(view.raised, WORKING_PIXELS, MARGIN_PX)
     part = crop_view(view, window)
+    if not part.raised.any():  # what is raised lies between the pixels of a large picture that are looked at
+        return np.zeros(view.valid.shape, dtype=np.int32), {}
     typical = float(np.median(part.depth[part.raised]))
     pitch = typical / part.observation.camera.fx
     surface = compute_surface(part.depth, part.observation.camera, typical)

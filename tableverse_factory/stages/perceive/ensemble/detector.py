@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32
-from PIL import Image
 from scipy import ndimage
 
 from schemas.config import Config
@@ -14,7 +13,7 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
-from tableverse_factory.stages.perceive.ensemble.fused import detect_fused
+from tableverse_factory.stages.perceive.ensemble.fused import detect_fused, upsample_map
 from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_observation
 
 BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
@@ -31,15 +30,14 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
     answers = detect_from_depth(view, config, services), detect_fused(view, config)
     ids = [_get_ids(answer) for answer in answers]
     seen = predict_observation(view.observation, config.perceive.detector_weights)
-    height, width = view.valid.shape
-    boundary = np.asarray(Image.fromarray(seen.boundary).resize((width, height), Image.Resampling.BILINEAR))
+    boundary = upsample_map(seen.boundary, view.valid.shape)
     near = ndimage.binary_dilation((ids[0] > 0) | (ids[1] > 0), iterations=BESIDE_PX)
     piles, count = ndimage.label(near)
-    by_net = np.zeros(count + 1, dtype=bool)
+    takes_second = np.zeros(count + 1, dtype=bool)
     for pile, window in enumerate(ndimage.find_objects(piles), start=1):
         inside = piles[window] == pile
-        by_net[pile] = prefer_second([part[window] * inside for part in ids], boundary[window], inside)
-    return replace(_merge_answers(answers, ids, piles, by_net), shown=find_standing(view, seen))
+        takes_second[pile] = prefer_second([part[window] * inside for part in ids], boundary[window], inside)
+    return replace(_merge_answers(answers, ids, piles, takes_second), shown=find_standing(view, seen))
 
 
 def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
@@ -72,10 +70,10 @@ def _find_borders(ids: IdImage) -> Mask:
 
 
 def _merge_answers(
-    answers: Sequence[DetectionResult], ids: Sequence[IdImage], piles: IdImage, by_net: np.ndarray
+    answers: Sequence[DetectionResult], ids: Sequence[IdImage], piles: IdImage, takes_second: np.ndarray
 ) -> DetectionResult:
-    """Take from each answer what lies in its piles; `by_net` says for each pile whether that is the second one."""
-    chosen = by_net[piles]
+    """Take from each answer what lies in its piles; `takes_second` says which from the second."""
+    chosen = takes_second[piles]
     shares = [np.where(chosen == source, own, 0) for source, own in enumerate(ids)]
     kept = [
         (source, index)

@@ -44,8 +44,10 @@ from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface, 
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
 from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_observation
 
-SURE = 0.6  # probability of an object from which a pixel is one that the sensor does not see rise
-MERGED_BELOW = 1.3  # strength of a border up to which two regions are one; the best of eight on rendered tables
+SURELY_OBJECT = 0.6  # probability of an object from which a pixel is one that the sensor does not see rise
+# Strength of a border up to which two regions are one; the best of eight on rendered tables, and a sum of fractions of
+# two, so that the mean over a border of which nothing is known is no more.
+FUSED_BELOW = 1.3125
 AFFINITY_WEIGHT = 0.35  # strength in depth that a logit of the net outweighs: logistic regression on 32 such tables
 
 
@@ -53,23 +55,26 @@ def detect_fused(view: TableView, config: Config) -> DetectionResult:
     """Detect objects as unnamed candidates, the largest first, by a sensor's depth and by the net together."""
     seen = predict_observation(view.observation, config.perceive.detector_weights)
     shape = view.valid.shape
-    mask = find_standing(view, seen) | (_upsample(seen.label[OBJECT], shape) > SURE)
-    if not (mask & view.valid).any():
+    mask = find_standing(view, seen) | (upsample_map(seen.label[OBJECT], shape) > SURELY_OBJECT)
+    if not mask.any():
         return to_detections(np.zeros(shape, dtype=np.int32), {})
     window = find_working_window(mask, WORKING_PIXELS, MARGIN_PX)
     part, own = replace(crop_view(view, window), raised=mask[window.slices]), mask[window.slices]
+    if not (own & part.valid).any():  # what is there lies between the pixels of a large picture that are looked at
+        return to_detections(np.zeros(shape, dtype=np.int32), {})
     typical = float(np.median(part.depth[own & part.valid]))
+    pitch = typical / part.observation.camera.fx
     surface = compute_surface(part.depth, part.observation.camera, typical)
-    boundary = _upsample(seen.boundary, shape)[window.slices]
-    patches = oversegment(np.maximum(surface.borders, boundary), own, typical / part.observation.camera.fx)
+    boundary = upsample_map(seen.boundary, shape)[window.slices]
+    patches = oversegment(np.maximum(surface.borders, boundary), own, pitch)
     whole = _merge_patches(patches, surface, seen, window, shape)
-    least = compute_least_pixels(typical / part.observation.camera.fx)
-    attached = attach_border_pixels(whole, surface, own, least)
+    attached = attach_border_pixels(whole, surface, own, compute_least_pixels(pitch))
     regions = keep_regions_over_table(np.where(part.valid, attached, 0), part)
     regions = merge_occluded_parts(regions, surface, part, with_vessels=False)
     regions = keep_objects(regions, part, by_depth=False)
+    # Holders come before their contents: by the pixels with a reading, as those of containers are compared.
+    sizes = np.bincount(regions[part.valid], minlength=int(regions.max(initial=0)) + 1)[1:]
     regions = _add_unmeasured(regions, attached, part.valid)
-    sizes = np.bincount(regions.ravel())[1:]
     regions = renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])
     full = fill_holes(uncrop_ids(regions, window, shape))
     regions = np.where(part.valid, regions, 0)
@@ -85,17 +90,18 @@ def _merge_patches(
     Where depth is unknown the net decides alone.
     """
     known = surface.normals[..., 2] < 0
-    links = build_links(patches, replace(surface, borders=np.where(known, surface.borders, MERGED_BELOW)))
+    links = build_links(patches, replace(surface, borders=np.where(known, surface.borders, FUSED_BELOW)))
     small = take_nearest(uncrop_ids(patches, window, shape), *seen.boundary.shape)
     for others in links.values():
         others.update({b: (*link, 0.0, 0.0) for b, link in others.items()})
     for (a, b), logits, count in zip(*sum_affinities(seen, small), strict=True):
         total, length = links.get(a, {}).get(b, (0.0, 0.0))[:2]  # two that do not touch yet may do so once they grow
         links.setdefault(a, {})[b] = links.setdefault(b, {})[a] = (total, length, logits, count)
-    return merge_linked(patches, links, _measure_strength, MERGED_BELOW)
+    return merge_linked(patches, links, _measure_strength, FUSED_BELOW)
 
 
 def _measure_strength(link: Link, _size_a: int, _size_b: int) -> float:
+    """Measure a border's mean strength in depth, less what the net says; infinite where the two do not touch."""
     total, length, logits, count = link
     return total / length - AFFINITY_WEIGHT * logits / max(count, 1.0) if length else math.inf
 
@@ -108,6 +114,7 @@ def _add_unmeasured(regions: IdImage, before: IdImage, measured: Mask) -> IdImag
     return np.where(measured | (regions > 0), regions, became[before])
 
 
-def _upsample(map_: Float32[np.ndarray, "h w"], shape: tuple[int, ...]) -> Float32[np.ndarray, "h2 w2"]:
+def upsample_map(map_: Float32[np.ndarray, "h w"], shape: tuple[int, ...]) -> Float32[np.ndarray, "h2 w2"]:
+    """Resize a map of the net to the size of the picture."""
     height, width = shape
     return np.asarray(Image.fromarray(map_).resize((width, height), Image.Resampling.BILINEAR))

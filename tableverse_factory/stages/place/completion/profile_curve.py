@@ -83,6 +83,7 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
 
 
 def _is_upright(axis: Pose) -> bool:
+    """Whether an axis is vertical, so that the lowest end of what turns about it rests on the support."""
     return bool(axis.quaternion_wxyz[0] > 1.0 - 1e-9)
 
 

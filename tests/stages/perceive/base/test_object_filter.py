@@ -1,4 +1,6 @@
-"""Filters of regions: noise of a sensor raises scraps of a far table, and nothing that a net sees."""
+"""Filters of regions: noise raises scraps of a far table, and what stands on the floor stands on no table."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,3 +18,21 @@ def test_a_small_thing_far_away_is_an_object_unless_noise_may_have_raised_it(hei
     assert not isinstance(view, Dropped), view
     regions = np.where(ids == 2, 1, 0).astype(np.int32)
     assert keep_objects(regions, view, by_depth=by_depth).max() == kept
+
+
+@pytest.mark.parametrize(("bend", "beyond"), [(0.0, 0), (0.02, 0), (0.2, 1)])
+def test_what_stands_on_the_floor_is_no_object_of_the_table(bend, beyond):
+    """Unless a model's depth is so bent that it may stand on the table."""
+    seen, ids = look(
+        [Box(0.0, -0.1, (0.1, 0.1, 0.1))], camera_above(0.8, 0.9, 40.0), table_half=(0.35, 0.3), floor_z=-0.3
+    )
+    view = find_table(seen, np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    floor = np.zeros(ids.shape, np.int32)
+    below = view.valid & (view.heights < -0.2) & (ids == 0)
+    rows, columns = np.nonzero(below)
+    near = np.abs(columns - np.median(columns)) < 60
+    floor[rows[near], columns[near]] = 1
+    assert (floor == 1).sum() > 500
+    view = replace(view, observation=replace(view.observation, bend=bend))
+    assert keep_objects(np.where(ids == 2, 2, floor), view, by_depth=False).max() == 1 + beyond

@@ -95,7 +95,7 @@ def test_boxes_without_masks_get_the_regions_inside_them(breakfast, tmp_path):
 def test_auto_replays_what_has_recorded_detections(breakfast):
     assert choose_detector(recorded(breakfast), Config().perceive) == "replay"
     assert choose_detector(recorded(breakfast, with_ids=False), Config().perceive) == "replay"
-    assert choose_detector(breakfast[0], Config().perceive) == "geometric"
+    assert choose_detector(breakfast[0], Config().perceive) == "ensemble"
     assert choose_detector(recorded(breakfast), GEOMETRIC.perceive) == "geometric"
 
 

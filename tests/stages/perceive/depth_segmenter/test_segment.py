@@ -15,11 +15,12 @@ from tableverse_factory.stages.perceive.perceive import perceive
 from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
+GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 
 
 def found_in(things, tmp_path, noise_m=0.0, **scene):
     observation, truth = look(things, noise_m=noise_m, **scene)
-    outcome = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path))
+    outcome = perceive(observation, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(outcome, Done), outcome
     return outcome.value, truth
 
@@ -122,7 +123,7 @@ def test_points_lie_on_the_objects_true_surface(tmp_path):
     rows, columns = np.nonzero(truth == 2)
     stray = rng.choice(len(rows), 60, replace=False)
     depth[rows[stray], columns[stray]] -= rng.uniform(0.05, 0.2, 60).astype(np.float32)
-    outcome = perceive(replace(observation, depth=depth), Config(), rng, Services(tmp_path))
+    outcome = perceive(replace(observation, depth=depth), GEOMETRIC, rng, Services(tmp_path))
     item = max(outcome.value.objects, key=lambda o: len(o.points_camera))
     z = item.points_camera[:, 2]
     surface = observation.depth[truth == 2]
@@ -149,7 +150,7 @@ def test_at_most_so_many_objects_as_configured(tmp_path):
 def test_real_table_tops_hold_as_many_objects_as_one_counts(shared_dir, tmp_path, name, count):
     row = ImageRow(scene_id=name, kind=SceneKind.CAPTURE, uri=str(shared_dir / "captures" / name))
     observation = observe(row, Config(), np.random.default_rng(0), Services(tmp_path)).value
-    outcome = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path))
+    outcome = perceive(observation, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert count[0] <= len(outcome.value.objects) <= count[1]
 
 

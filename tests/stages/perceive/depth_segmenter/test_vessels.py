@@ -12,6 +12,7 @@ from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
+GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 
 GREEN, YELLOW = (40, 160, 60), (230, 200, 40)
 LOW = camera_above(0.45, 0.6, 38.0)
@@ -53,7 +54,7 @@ def test_solid_things_have_no_rim():
 @pytest.mark.parametrize("noise_m", [0.0, 0.0012])
 def test_a_bowl_is_whole_although_its_contents_part_it(tmp_path, noise_m):
     observation, _, truth = seen([Bowl(0.0, 0.0, 0.09), PARTING], noise_m)
-    found = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path)).value
+    found = perceive(observation, GEOMETRIC, np.random.default_rng(0), Services(tmp_path)).value
     assert len(found.objects) == 2
     assert min(best_overlaps(truth, found.instance_ids)) > 0.85
     content = next(o for o in found.objects if o.contained_in is not None)
