@@ -9,6 +9,7 @@ from scipy import ndimage
 from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done, Dropped
+from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import rotation_angle, rotation_matrix, transform_points
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
@@ -262,3 +263,20 @@ def test_strips_wider_than_the_picture_cost_no_more_than_the_picture():
     flat[20] = False
     for wide in (10.0, 30.0, 60.0, 1e15):
         assert _remove_strips(flat, wide).any() == (wide < 16.0), "nineteen rows are left on each side"
+
+
+def test_what_lies_in_the_plane_beside_the_table_top_does_not_tilt_it():
+    pose = camera_above()
+    observation, ids = look([], pose, noise_m=0.001)
+    points = backproject(observation.depth, observation.camera)
+    beside = (ids == 1) & (points[..., 0] > 0.05)
+    depth = np.where(beside, observation.depth * 0.985, observation.depth).astype(np.float32)  # a mat of a centimetre
+    bent = replace(observation, depth=depth, bend=0.01)
+    top = (ids == 1) & ~beside
+    true = rotation_matrix(pose.quaternion_wxyz)[2]
+    angles = []
+    for table_top in (top, None):
+        view = find_table(bent, np.random.default_rng(0), table_top)
+        assert not isinstance(view, Dropped), view
+        angles.append(np.degrees(np.arccos(np.clip(view.plane.normal @ true, -1.0, 1.0))))
+    assert angles[0] < 0.3 < angles[1]

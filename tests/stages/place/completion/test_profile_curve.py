@@ -65,3 +65,24 @@ def test_what_rests_on_its_sheet_is_no_thicker_than_its_inside_is_high():
         starts = [np.array([radius * np.cos(a), radius * np.sin(a), -0.001]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
         found = np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.05) for start in starts])
         assert abs(found - thickness) < 0.0005, radius
+
+
+@pytest.mark.parametrize("foot", [0.0, 0.006])
+def test_a_plate_whose_sheet_rests_has_no_foot_and_a_raised_one_has(foot):
+    """A sheet of 2 mm that rises from the middle, alone or on a disc."""
+    under = np.array([(0.0, 0.0), (0.03, 0.0), (0.03, foot), (0.06, foot + 0.012), (0.1, foot + 0.03)])
+    over = np.array([(0.1, foot + 0.032), (0.06, foot + 0.014), (0.03, foot + 0.002), (0.0, foot + 0.002)])
+    plate = complete(from_trimesh(trimesh.creation.revolve(np.vstack([under, over]), sections=96)), elevation=0.9)
+    assert plate.vertices[:, 2].min() < 0.001
+    starts = [np.array([0.045 * np.cos(a), 0.045 * np.sin(a), -0.001]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+    assert np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.003 + foot) for start in starts]) < 0.0005
+
+
+def test_under_the_domed_floor_of_a_plate_that_rests_on_its_rim_nothing_is_filled():
+    under = np.array([(0.0, 0.0025), (0.03, 0.0015), (0.06, 0.0), (0.1, 0.02)])
+    plate = complete(
+        from_trimesh(trimesh.creation.revolve(np.vstack([under, under[::-1] + np.array([0.0, 0.0015])]), sections=96)),
+        elevation=0.9,
+    )
+    starts = [np.array([0.008 * np.cos(a), 0.008 * np.sin(a), -0.001]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+    assert np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.0025) for start in starts]) < 0.0007
