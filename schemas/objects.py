@@ -55,7 +55,7 @@ class PerceivedObject(Frozen):
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What stands above the table in a picture, by the sensor, and how much of it each object explains.
+    """What stands above the table in a picture, and how much of it each object explains.
 
     Attributes:
         points: Number of pixels.
@@ -165,7 +165,8 @@ class Evidence(Frozen):
 
     Attributes:
         color_jpg: The picture as a JPEG file.
-        masks_png: Instance ids as found in the picture, a 16-bit PNG file (0 background).
+        masks_png: Instance ids as found in the picture, less what smeared depth added to the objects that were placed:
+            a 16-bit PNG file (0 background).
         object_pixels: Value in `masks_png` of each object, in the order of the objects.
         camera_to_table: Pose of the camera in the table frame.
         scale_source: What metres come from, with `scale_sigma`, `scale_deviation` and `intrinsics_source` as in

@@ -34,7 +34,7 @@ class DetectionResult(Frozen):
     table_box: PixelBox | None = None
     record: DetectionRecord | None = None  # origin of the answer; None where no model was asked
     ids: IdImage | None = None  # the instance at each pixel; None for boxes only, for a BoxSegmenter
-    shown: Mask | None = None  # where objects are seen, found or not; None: wherever the depth rises over the table
+    shown: Mask | None = None  # what objects must explain; None: wherever the depth rises over the table
 
 
 class Detector(Protocol):
