@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from schemas.config import Config
 from schemas.geometry import Camera, Pose
 from schemas.observation import Observation
 from tableverse_factory.geometry.math.transforms import (
@@ -15,6 +16,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 
 CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
+GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 FAR = 100.0
 
 

@@ -15,10 +15,9 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import _remove_strips, find_table, refit_table_to_box
-from tests.helpers.tabletop_views import Box, best_overlaps, camera_above, look
+from tests.helpers.tabletop_views import GEOMETRIC, Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
-GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 

@@ -3,6 +3,7 @@
 import heapq
 import operator
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
@@ -21,7 +22,16 @@ MAX_JUMP_M = 0.02
 SHORT_BORDER = 2.0
 MAX_GAP_PX = 4
 
-Link = tuple[float, ...]  # sums over a border: of its strength, its length [px], and what else adds up
+
+class Link(NamedTuple):
+    """Sums over the border of two patches; the last two are of pairs of pixels on either side, where a net judges."""
+
+    strength: float
+    length: float  # [px]
+    logits: float = 0.0
+    pairs: float = 0.0
+
+
 Links = dict[int, dict[int, Link]]  # of each patch with its neighbours
 
 
@@ -77,8 +87,8 @@ def merge_linked(ids: IdImage, links: Links, measure: Callable[[Link, int, int],
 
 def _compute_strength(link: Link, size_a: int, size_b: int) -> float:
     """Compute the mean strength of a border, raised where it is short for the size of the smaller region."""
-    total, length = link
-    return float(total / length * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / length))
+    mean = link.strength / link.length
+    return float(mean * max(1.0, SHORT_BORDER * float(min(size_a, size_b)) ** 0.5 / link.length))
 
 
 def build_links(ids: IdImage, surface: Surface) -> Links:
@@ -92,8 +102,7 @@ def build_links(ids: IdImage, surface: Surface) -> Links:
     links: Links = {}
     for key, total, length in zip(pairs.tolist(), totals.tolist(), lengths.tolist(), strict=True):
         a, b = divmod(key, count)
-        links.setdefault(a, {})[b] = (total, length)
-        links.setdefault(b, {})[a] = (total, length)
+        links.setdefault(a, {})[b] = links.setdefault(b, {})[a] = Link(total, length)
     return links
 
 
@@ -125,7 +134,7 @@ def _merge_links(links: Links, a: int, b: int) -> None:
     for c, link in links.pop(b).items():
         del links[c][b]
         known = links[a].get(c)
-        links[a][c] = links[c][a] = tuple(map(operator.add, known, link)) if known else link
+        links[a][c] = links[c][a] = Link(*map(operator.add, known, link)) if known else link
 
 
 def attach_border_pixels(ids: IdImage, surface: Surface, mask: Mask, least_pixels: int) -> IdImage:

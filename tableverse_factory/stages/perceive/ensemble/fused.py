@@ -92,18 +92,18 @@ def _merge_patches(
     known = surface.normals[..., 2] < 0
     links = build_links(patches, replace(surface, borders=np.where(known, surface.borders, FUSED_BELOW)))
     small = take_nearest(uncrop_ids(patches, window, shape), *seen.boundary.shape)
-    for others in links.values():
-        others.update({b: (*link, 0.0, 0.0) for b, link in others.items()})
-    for (a, b), logits, count in zip(*sum_affinities(seen, small), strict=True):
-        total, length = links.get(a, {}).get(b, (0.0, 0.0))[:2]  # two that do not touch yet may do so once they grow
-        links.setdefault(a, {})[b] = links.setdefault(b, {})[a] = (total, length, logits, count)
+    apart = Link(0.0, 0.0)  # two that do not touch yet may do so once they grow
+    for (a, b), logits, pairs in zip(*sum_affinities(seen, small), strict=True):
+        link = links.get(a, {}).get(b, apart)._replace(logits=logits, pairs=pairs)
+        links.setdefault(a, {})[b] = links.setdefault(b, {})[a] = link
     return merge_linked(patches, links, _measure_strength, FUSED_BELOW)
 
 
 def _measure_strength(link: Link, _size_a: int, _size_b: int) -> float:
     """Measure a border's mean strength in depth, less what the net says; infinite where the two do not touch."""
-    total, length, logits, count = link
-    return total / length - AFFINITY_WEIGHT * logits / max(count, 1.0) if length else math.inf
+    if not link.length:
+        return math.inf
+    return link.strength / link.length - AFFINITY_WEIGHT * link.logits / max(link.pairs, 1.0)
 
 
 def _add_unmeasured(regions: IdImage, before: IdImage, measured: Mask) -> IdImage:

@@ -11,11 +11,10 @@ from schemas.detection import Detections
 from schemas.outcome import Done, Dropped
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.perceive import choose_detector, perceive
-from tests.helpers.tabletop_views import Bowl, Box, camera_above, look, overlap
+from tests.helpers.tabletop_views import GEOMETRIC, Bowl, Box, camera_above, look, overlap
 
 pytestmark = pytest.mark.heavy
 
-GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 REPLAY = Config.model_validate({"perceive": {"detector": "replay", "min_explained": 0.0}})  # of some of the things
 
 

@@ -12,10 +12,9 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_holes
 from tableverse_factory.stages.perceive.perceive import perceive
-from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
+from tests.helpers.tabletop_views import GEOMETRIC, Bowl, Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
-GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 
 
 def found_in(things, tmp_path, noise_m=0.0, **scene):

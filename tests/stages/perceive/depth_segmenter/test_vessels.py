@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 
-from schemas.config import Config
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, find_rims
 from tableverse_factory.stages.perceive.depth_segmenter.segment import segment_depth
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.table import find_table
-from tests.helpers.tabletop_views import Bowl, Box, best_overlaps, camera_above, look
+from tests.helpers.tabletop_views import GEOMETRIC, Bowl, Box, best_overlaps, camera_above, look
 
 pytestmark = pytest.mark.heavy
-GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 
 GREEN, YELLOW = (40, 160, 60), (230, 200, 40)
 LOW = camera_above(0.45, 0.6, 38.0)

@@ -8,6 +8,7 @@ import pytest
 from schemas.geometry import Camera
 from tableverse_factory.models.picture.predict import PicturePrediction
 from tableverse_factory.stages.perceive.base.table_view import ImageWindow
+from tableverse_factory.stages.perceive.depth_segmenter.oversegment import Link
 from tableverse_factory.stages.perceive.depth_segmenter.surface import compute_surface
 from tableverse_factory.stages.perceive.ensemble.fused import (
     AFFINITY_WEIGHT,
@@ -24,14 +25,14 @@ from tableverse_factory.stages.perceive.ensemble.fused import (
     ids=["neither sees a border", "a step", "a seam", "a crease of one thing", "no depth: the net decides"],
 )
 def test_the_stronger_evidence_decides(depth: float, logit: float, joined: bool) -> None:
-    assert (_measure_strength((10 * depth, 10, 4 * logit, 4), 100, 100) <= FUSED_BELOW) is joined
+    assert (_measure_strength(Link(10 * depth, 10, 4 * logit, 4), 100, 100) <= FUSED_BELOW) is joined
 
 
 def test_borders_add_up_and_what_does_not_touch_stays_apart() -> None:
-    one, two = (6.0, 4.0, -3.0, 2.0), (2.0, 6.0, 9.0, 6.0)
-    both = tuple(a + b for a, b in zip(one, two, strict=True))
+    one, two = Link(6.0, 4.0, -3.0, 2.0), Link(2.0, 6.0, 9.0, 6.0)
+    both = Link(*(a + b for a, b in zip(one, two, strict=True)))
     assert _measure_strength(both, 9, 9) == pytest.approx(0.8 - AFFINITY_WEIGHT * 0.75)
-    assert _measure_strength((0.0, 0.0, 50.0, 10.0), 9, 9) == math.inf
+    assert _measure_strength(Link(0.0, 0.0, 50.0, 10.0), 9, 9) == math.inf
 
 
 def test_pixels_without_a_reading_follow_what_their_region_became() -> None:
@@ -60,5 +61,5 @@ def test_where_depth_is_unknown_the_net_decides_alone(logit: float, count: int, 
 @pytest.mark.parametrize("count", range(1, 60))
 def test_a_border_of_which_nothing_is_known_parts_nothing(count: int) -> None:
     total = math.fsum([FUSED_BELOW] * count)
-    assert _measure_strength((total, float(count), 0.0, 0.0), 9, 9) <= FUSED_BELOW
-    assert _measure_strength((sum([FUSED_BELOW] * count), float(count), 0.0, 0.0), 9, 9) <= FUSED_BELOW
+    assert _measure_strength(Link(total, float(count)), 9, 9) <= FUSED_BELOW
+    assert _measure_strength(Link(sum([FUSED_BELOW] * count), float(count)), 9, 9) <= FUSED_BELOW
