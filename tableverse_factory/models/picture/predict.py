@@ -15,6 +15,8 @@ from tableverse_factory.geometry.math.camera import backproject, rescale_camera
 from tableverse_factory.models.picture.net import MULTIPLE, REACHES, load_picture_net
 
 LEAST_PIXELS, MOST_PIXELS = 76_800, 118_000  # of the net's input: it was trained at 320 x 240 and more
+MOST_SENSED_PIXELS = 200_000  # of its input with a sensor's depth: small objects need them, and one look is enough
+MOST_CANVAS_PIXELS = 800_000  # of a prediction around a window
 MIRRORED_SCALE, STRIDE = 7 / 6, 16  # of a bare picture seen once more; the net takes sides that are multiples of 16
 OTHER, TABLE, OBJECT = range(3)
 _Outputs = dict[str, Float32[np.ndarray, "..."]]
@@ -74,18 +76,54 @@ def predict_picture(
     return _LATEST[key]
 
 
-def choose_working_size(height: int, width: int) -> tuple[int, int]:
+def predict_window(
+    color: Picture, camera: Camera, depth: DepthImage, window: tuple[slice, slice], weights: str = ""
+) -> PicturePrediction:
+    """Predict what a sensor shows within a window of rows and columns; around it is neither object nor table.
+
+    The net's pixels all go to the window. Maps are those of the whole picture at the resolution of the window.
+
+    Raises:
+        WeightsError, ModelError: as `predict_picture`.
+    """
+    rows, columns = (part.indices(n) for part, n in zip(window, depth.shape, strict=True))
+    height, width = rows[1] - rows[0], columns[1] - columns[0]
+    own = replace(camera, cx=camera.cx - columns[0], cy=camera.cy - rows[0], width=width, height=height)
+    found = predict_picture(color[window], own, depth[window], weights)
+    zoom = np.array(found.depth.shape) / (height, width)
+    shape = tuple(np.maximum(np.rint(np.array(depth.shape) * zoom).astype(int), found.depth.shape))
+    corner = np.minimum(np.rint((rows[0], columns[0]) * zoom).astype(int), np.subtract(shape, found.depth.shape))
+    inner = tuple(slice(int(start), int(start) + n) for start, n in zip(corner, found.depth.shape, strict=True))
+
+    def surround(map_: np.ndarray, around: np.ndarray | float = 0.0) -> np.ndarray:
+        full = np.full((*map_.shape[:-2], *shape), around, map_.dtype)
+        full[..., inner[0], inner[1]] = map_
+        return full
+
+    return replace(
+        found,
+        camera=rescale_camera(camera, shape[1], shape[0]),
+        depth=surround(found.depth, float(np.median(found.depth))),
+        label=surround(found.label, np.eye(3)[OTHER][:, None, None]),
+        votes=surround(found.votes),
+        boundary=surround(found.boundary),
+        affinity=surround(found.affinity),
+    )
+
+
+def choose_working_size(height: int, width: int, most: int = MOST_PIXELS) -> tuple[int, int]:
     """Choose rows and columns of the net's input: multiples of `MULTIPLE` that change the aspect least.
 
-    Of sizes that change it alike, the largest; sizes have `LEAST_PIXELS` to `MOST_PIXELS` where the aspect permits.
+    Of sizes that change it alike, the largest; sizes have `LEAST_PIXELS` to `most` where the aspect permits.
     """
     wanted = np.log(height / width)
-    return min(_list_sizes(), key=lambda size: (round(abs(np.log(size[0] / size[1]) - wanted), 2), -size[0] * size[1]))
+    sizes = _list_sizes(most)
+    return min(sizes, key=lambda size: (round(abs(np.log(size[0] / size[1]) - wanted), 2), -size[0] * size[1]))
 
 
-def _list_sizes() -> Iterator[tuple[int, int]]:
-    steps = range(2 * MULTIPLE, MOST_PIXELS // MULTIPLE, MULTIPLE)
-    return ((rows, columns) for rows in steps for columns in steps if LEAST_PIXELS <= rows * columns <= MOST_PIXELS)
+def _list_sizes(most: int) -> Iterator[tuple[int, int]]:
+    steps = range(2 * MULTIPLE, most // MULTIPLE, MULTIPLE)
+    return ((rows, columns) for rows in steps for columns in steps if LEAST_PIXELS <= rows * columns <= most)
 
 
 def compute_rays(camera: Camera) -> Float32[np.ndarray, "3 h w"]:
@@ -95,7 +133,7 @@ def compute_rays(camera: Camera) -> Float32[np.ndarray, "3 h w"]:
 
 
 def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"], weights: str) -> PicturePrediction:
-    rows, columns = choose_working_size(*color.shape[:2])
+    rows, columns = choose_working_size(*color.shape[:2], MOST_SENSED_PIXELS if sensed.any() else MOST_PIXELS)
     out = _ask(color, camera, sensed, weights, (rows, columns))
     if not sensed.any():  # the errors of the mirrored, larger picture are others: the mean of both is nearer
         larger = round(MIRRORED_SCALE * rows / STRIDE) * STRIDE, round(MIRRORED_SCALE * columns / STRIDE) * STRIDE

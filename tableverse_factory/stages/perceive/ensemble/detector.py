@@ -14,7 +14,7 @@ from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
 from tableverse_factory.stages.perceive.ensemble.fused import detect_fused, upsample_map
-from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_observation
+from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_view
 
 BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
 REACH_PX = 2  # a boundary this near is that of a border
@@ -29,7 +29,7 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
     """Detect objects by depth, and by depth and the net together, and choose one answer for each pile."""
     answers = detect_from_depth(view, config, services), detect_fused(view, config)
     ids = [_get_ids(answer) for answer in answers]
-    seen = predict_observation(view.observation, config.perceive.detector_weights)
+    seen = predict_view(view, config.perceive.detector_weights)
     boundary = upsample_map(seen.boundary, view.valid.shape)
     near = ndimage.binary_dilation((ids[0] > 0) | (ids[1] > 0), iterations=BESIDE_PX)
     piles, count = ndimage.label(near)

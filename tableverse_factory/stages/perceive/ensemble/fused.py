@@ -42,7 +42,7 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import (
 )
 from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface, compute_surface
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
-from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_observation
+from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_view
 
 SURELY_OBJECT = 0.6  # probability of an object from which a pixel is one that the sensor does not see rise
 # Strength of a border up to which two regions are one; the best of eight on rendered tables, and a sum of fractions of
@@ -53,7 +53,7 @@ AFFINITY_WEIGHT = 0.35  # strength in depth that a logit of the net outweighs: l
 
 def detect_fused(view: TableView, config: Config) -> DetectionResult:
     """Detect objects as unnamed candidates, the largest first, by a sensor's depth and by the net together."""
-    seen = predict_observation(view.observation, config.perceive.detector_weights)
+    seen = predict_view(view, config.perceive.detector_weights)
     shape = view.valid.shape
     mask = find_standing(view, seen) | (upsample_map(seen.label[OBJECT], shape) > SURELY_OBJECT)
     if not mask.any():

@@ -8,14 +8,14 @@ from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
-from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction, predict_picture
+from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction, predict_picture, predict_window
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, DetectionResult
 from tableverse_factory.stages.perceive.base.object_filter import (
     keep_objects,
     renumber_regions,
 )
-from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
 from tableverse_factory.stages.perceive.depth_segmenter.segment import (
     assign_regions_to_boxes,
@@ -26,10 +26,12 @@ from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_cont
 
 SURELY_OTHER = 0.9  # probability of neither object nor table from which what rises over the table is no object
 
+SURROUNDED = 0.05  # of the picture's length, on each side of what rises
+
 
 def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
-    found = predict_observation(view.observation, config.perceive.detector_weights)
+    found = predict_view(view, config.perceive.detector_weights)
     regions = keep_objects(segment_prediction(found, view.valid.shape), view, by_depth=False)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
@@ -51,7 +53,7 @@ def find_standing(view: TableView, found: PicturePrediction) -> Mask:
 
 def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Config) -> IdImage:
     """Assign the objects and the table-top that the net sees to the boxes of a detector."""
-    seen = predict_observation(view.observation, config.perceive.segmenter_weights)
+    seen = predict_view(view, config.perceive.segmenter_weights)
     ids = assign_regions_to_boxes(segment_prediction(seen, view.valid.shape), found)
     return np.where((ids == 0) & _find_label(seen, TABLE, view.valid.shape), TABLE_ID, ids)
 
@@ -59,6 +61,15 @@ def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Co
 def find_table_top(item: Observation, weights: str) -> Mask:
     """Find the pixels of the table-top. Shape (h, w)."""
     return _find_label(predict_observation(item, weights), TABLE, item.depth.shape)
+
+
+def predict_view(view: TableView, weights: str) -> PicturePrediction:
+    """Ask the net; with a sensor, about what rises over the table alone, so that small things have more pixels."""
+    item = view.observation
+    if item.bend or not view.raised.any():
+        return predict_observation(item, weights)
+    margin = round(SURROUNDED * max(item.depth.shape))
+    return predict_window(item.color, item.camera, item.depth, expand_window(view.raised, margin), weights)
 
 
 def predict_observation(item: Observation, weights: str) -> PicturePrediction:
