@@ -13,9 +13,9 @@ MAX_SLOW_MESHES = 30  # objects of a scene that may each take the whole `place.m
 
 
 class Section(BaseModel):
-    """Base of the sections."""
+    """Base of the sections; `core.config` reads the docstrings of their keys, which costs every process 30 ms."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class StageSection(Section):

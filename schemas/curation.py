@@ -36,7 +36,7 @@ HINGE_CATEGORIES = ("Bottle", "Box", "Bucket", "Laptop", "Pliers", "Scissors", "
 class Answer(BaseModel):
     """Base of answers of models and of what is made of them: unknown keys are ignored."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True, defer_build=True)
 
 
 class Usability(Answer):

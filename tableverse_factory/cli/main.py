@@ -33,7 +33,6 @@ from tableverse_factory.cli.train import train
 from tableverse_factory.cli.trajectories import trajectories
 from tableverse_factory.cli.verify import verify
 from tableverse_factory.cli.view import view
-from tableverse_factory.core.open3d_import import stub_plotly
 from tableverse_factory.core.version import __version__
 
 FIRST_STEPS = f"""\
@@ -123,5 +122,4 @@ def _without_a_command(
 
 def main() -> None:
     """Run the command line; docs/command-line.md lists its exit codes."""
-    stub_plotly()
     raise SystemExit(run_command(lambda: app(standalone_mode=False)))

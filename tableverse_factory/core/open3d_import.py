@@ -1,21 +1,36 @@
-"""Import of Open3D without its plotting packages, which bring a web server."""
+"""Open3D without the web server of its plots, half of its import time, which comes when the first plot is drawn."""
 
 import sys
+from functools import partial
+from importlib import import_module
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-_PLOT_MODULES = ("dash", "plotly", "plotly.graph_objects")
-
-
-class _StubModule(ModuleType):
-    """A module from which any name can be imported, as a plain object."""
-
-    def __getattr__(self, name: str) -> object:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return object
+_PLOTS = "open3d.visualization.draw_plotly"
+_FUNCTIONS = ("get_plotly_fig", "draw_plotly", "draw_plotly_server")
 
 
-def stub_plotly() -> None:
-    """Keep Open3D from importing Dash and plotly, half of its import time, in processes of this package alone."""
-    for name in _PLOT_MODULES:
-        sys.modules.setdefault(name, _StubModule(name))
+def _draw(name: str, *arguments: Any, **options: Any) -> Any:
+    """Import the plots, put their functions where Open3D has them, and call one."""
+    plots = import_module(_PLOTS)
+    vars(sys.modules["open3d.visualization"]).update({name: getattr(plots, name) for name in _FUNCTIONS})
+    return getattr(plots, name)(*arguments, **options)
+
+
+def _import_open3d() -> ModuleType:
+    if "open3d" not in sys.modules:
+        sys.modules[_PLOTS] = ModuleType(_PLOTS)
+        vars(sys.modules[_PLOTS]).update({name: partial(_draw, name) for name in _FUNCTIONS})
+        try:
+            return import_module("open3d")
+        finally:
+            del sys.modules[_PLOTS]
+    return sys.modules["open3d"]
+
+
+if TYPE_CHECKING:
+    import open3d as o3d
+else:
+    o3d = _import_open3d()
+
+__all__ = ["o3d"]

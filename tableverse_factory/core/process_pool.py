@@ -17,7 +17,6 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.open3d_import import stub_plotly
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -49,7 +48,7 @@ def parallel_map(
         return
     # Forked children would share the threads' locks of libraries that are already at work.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(items)), context, _prepare_worker) as pool, _translate_death(doing):
+    with ProcessPoolExecutor(min(jobs, len(items)), context, prepare_child) as pool, _translate_death(doing):
         with _defer_interrupt():
             results = pool.map(work, items, chunksize=chunk)
         yield from results
@@ -67,7 +66,7 @@ def parallel_stream(
             yield from map(work, items)
         return
     rest, context = iter(items), multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, _prepare_worker)
+    pool = ProcessPoolExecutor(jobs, context, prepare_child)
     try:
         with _translate_death(doing):
             with _defer_interrupt():
@@ -97,12 +96,6 @@ def prepare_child() -> None:
     if parent is None or os.getppid() != parent.pid:
         os._exit(1)  # it was killed just before
     threadpool_limits(1)
-
-
-def _prepare_worker() -> None:
-    """Prepare a child of a pool, which works for this package alone: plots need not be imported there."""
-    prepare_child()
-    stub_plotly()
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 
 CAMERA = Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
+SMALL_CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)  # the same view in a quarter of the pixels
 GEOMETRIC = Config.model_validate({"perceive": {"detector": "geometric"}})
 FAR = 100.0
 
@@ -37,9 +38,12 @@ class Box:
         direction = rays @ rotation_matrix(pose.quaternion_wxyz)
         low = np.array([-self.size[0] / 2, -self.size[1] / 2, 0.0])
         high = np.array([self.size[0] / 2, self.size[1] / 2, self.size[2]])
+        enter, leave = np.full(rays.shape[:-1], -np.inf), np.full(rays.shape[:-1], np.inf)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.sort(np.stack([(low - start) / direction, (high - start) / direction]), axis=0)
-        enter, leave = ends[0].max(axis=-1), ends[1].min(axis=-1)
+            for axis in range(3):
+                first, second = ((end[axis] - start[axis]) / direction[..., axis] for end in (low, high))
+                np.maximum(enter, np.fmin(first, second), out=enter)
+                np.minimum(leave, np.fmax(first, second), out=leave)
         return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
 
@@ -83,11 +87,12 @@ def look(
     floor_z=None,
     wall_y=None,
     scene_id="view",
+    camera=CAMERA,
 ):
     """The observation and the true ids: 0 elsewhere, 1 the table, 2 and on the things."""
     pose = camera_to_table or camera_above()
-    v, u = np.indices((CAMERA.height, CAMERA.width), dtype=np.float64)
-    local = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1)
+    v, u = np.indices((camera.height, camera.width), dtype=np.float64)
+    local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     rays = local @ rotation_matrix(pose.quaternion_wxyz).T
     depth, ids = np.full(u.shape, np.inf), np.zeros(u.shape, dtype=np.int32)
     color = np.full((*u.shape, 3), 30, dtype=np.uint8)
@@ -108,7 +113,7 @@ def look(
         add(thing.hit(pose.position, rays), number, thing.color)
     seen = np.where(np.isfinite(depth) & (depth < 4.5), depth, 0.0)
     noise = np.random.default_rng(seed).normal(0.0, noise_m, seen.shape) if noise_m else 0.0
-    return Observation(scene_id, color, np.where(seen > 0, seen + noise, 0.0).astype(np.float32), CAMERA), ids
+    return Observation(scene_id, color, np.where(seen > 0, seen + noise, 0.0).astype(np.float32), camera), ids
 
 
 def overlap(a, b):

@@ -23,7 +23,6 @@ from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
 from schemas.work import SandboxSetup, ScenePart, StageChain, StageReport
 from tableverse_factory.core.errors import BuildError, TableverseError
-from tableverse_factory.core.open3d_import import stub_plotly
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import parse_path
 from tableverse_factory.dataset.parts import PartWriter
@@ -45,7 +44,6 @@ def main() -> None:
     descriptor, parent = int(sys.argv[1]), int(sys.argv[2])
     _die_with_parent(parent)
     faulthandler.enable()
-    stub_plotly()
     channel = Channel(socket.socket(fileno=descriptor))
     setup: SandboxSetup = decode(channel.receive())
     try:

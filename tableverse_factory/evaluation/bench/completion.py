@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Bool
 from scipy import ndimage
 from scipy.spatial import ConvexHull, cKDTree
@@ -18,6 +17,7 @@ from schemas.objects import PerceivedObject, PerceivedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.open3d_import import o3d
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points

@@ -15,7 +15,7 @@ _LIGHT_SEARCH = {"mcts_nodes": 10, "mcts_iterations": 40, "mcts_max_depth": 2, "
 
 def load_coacd() -> ModuleType:
     """Import CoACD, quiet and after Open3D, which fails with `std::bad_cast` when it is loaded second."""
-    import open3d  # noqa: F401
+    import tableverse_factory.core.open3d_import  # noqa: F401
     import coacd  # isort: skip
 
     coacd.set_log_level("error")

@@ -1,9 +1,9 @@
 """Rays against meshes and nearest points on them: Embree through Open3D, in single precision, on one thread."""
 
 import numpy as np
-import open3d as o3d
 
 from schemas.geometry import TriangleMesh
+from tableverse_factory.core.open3d_import import o3d
 
 RaycastingScene = o3d.t.geometry.RaycastingScene
 

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float64
 from skimage.measure import marching_cubes
 
 from schemas.geometry import Frozen, Points, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.core.open3d_import import o3d
 from tableverse_factory.geometry.mesh.repair import mesh_to_solid, solid_to_mesh
 
 Field = Float64[np.ndarray, "nx ny nz"]

@@ -3,6 +3,7 @@
 import asyncio
 import itertools
 import json
+import ssl
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -34,6 +35,11 @@ def send_at_once(_deadline: float) -> AbstractContextManager[None]:
     return nullcontext()
 
 
+def _no_authorities() -> ssl.SSLContext:
+    """Make the context of a client that speaks http alone: it trusts nobody, and saves 25 ms of reading authorities."""
+    return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+
+
 class BoundedClient(httpx.AsyncClient):
     """HTTP client for one request to one endpoint; every answer that it returns is a success with a JSON object.
 
@@ -52,7 +58,10 @@ class BoundedClient(httpx.AsyncClient):
         try:
             # `auth` keeps a netrc file from replacing our key; loopback addresses bypass proxies.
             super().__init__(
-                auth=lambda request: request, timeout=timeout, trust_env=not is_loopback(endpoint.base_url)
+                auth=lambda request: request,
+                timeout=timeout,
+                trust_env=not is_loopback(endpoint.base_url),
+                verify=True if endpoint.base_url.startswith("https:") else _no_authorities(),
             )
         except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
             # Messages other than that of a missing package may quote the proxy's password.

@@ -6,10 +6,10 @@ About a quarter of the cost of `physics.render`; deterministic, with the same co
 from collections.abc import Sequence
 
 import numpy as np
-import open3d as o3d
 from jaxtyping import Float32
 
 from schemas.geometry import Camera, IdImage, Picture, Pose, Texture, TriangleMesh
+from tableverse_factory.core.open3d_import import o3d
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
 

@@ -10,19 +10,22 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 from scipy.interpolate import BSpline
-from toppra.algorithm import TOPPRA
-from toppra.constraint import (
-    DiscretizationType,
-    JointAccelerationConstraint,
-    JointTorqueConstraint,
-    JointVelocityConstraint,
-)
-from toppra.interpolator import AbstractGeometricPath
 
 from schemas.geometry import Frozen
 from schemas.trajectories import JointPath, JointVector
+from tableverse_factory.core.deferred_modules import defer_modules
 from tableverse_factory.robotics.motion.dynamics import ArmDynamics
 from tableverse_factory.robotics.robots.arm import Arm
+
+with defer_modules("matplotlib", "matplotlib.pyplot"):  # toppra's plots: half a second, and we draw none
+    from toppra.algorithm import TOPPRA
+    from toppra.constraint import (
+        DiscretizationType,
+        JointAccelerationConstraint,
+        JointTorqueConstraint,
+        JointVelocityConstraint,
+    )
+    from toppra.interpolator import AbstractGeometricPath
 
 logging.getLogger("toppra").setLevel(logging.ERROR)
 

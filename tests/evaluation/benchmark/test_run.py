@@ -93,6 +93,15 @@ def policies(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def quick(benchmark, dataset, policies, tmp_path_factory):
+    """The results of a run of `Quick` on the episode of training."""
+    out = tmp_path_factory.mktemp("quick") / "quick.jsonl"
+    rows = run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+    assert [row.episode_id for row in rows] == ["train_0000"]
+    return out
+
+
 @pytest.fixture
 def run_command(run):
     """The command line of `tests/conftest.py`: `run` is a run of a policy here."""
@@ -134,12 +143,11 @@ def test_a_killed_run_goes_on_and_the_number_of_processes_is_not_seen(benchmark,
     assert not journal.exists()
 
 
-def test_a_choice_is_run_and_a_wider_one_later_adds_to_it(benchmark, dataset, policies, tmp_path):
+def test_a_choice_is_run_and_a_wider_one_later_adds_to_it(benchmark, dataset, policies, quick, tmp_path):
     out, name = tmp_path / "some.jsonl", PolicyName(f"{policies}:Quick")
-    rows = run(benchmark, dataset, name, out, splits=("train",))
-    assert [row.episode_id for row in rows] == ["train_0000"]
-    before = out.read_bytes()
-    rows = run(benchmark, dataset, name, out, axes=("none",), jobs=2)
+    before = quick.read_bytes()
+    out.write_bytes(before)
+    rows = run(benchmark, dataset, name, out, axes=("none",))
     assert [row.episode_id for row in rows] == ["train_0000", "test_0000", "test_0001"]
     assert out.read_bytes().startswith(before)
     with pytest.raises(InputError, match="has no episodes of these splits"):
@@ -218,9 +226,9 @@ def test_other_scenes_are_refused_before_anything_is_played(benchmark, tmp_path)
         run(benchmark, open_dataset(fewer), PolicyName("random"), tmp_path / "r.jsonl")
 
 
-def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, dataset, policies, tmp_path):
+def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, dataset, quick, tmp_path):
     out = tmp_path / "r.jsonl"
-    run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
+    out.write_bytes(quick.read_bytes())
     with pytest.raises(
         InputError,
         match=r"another run: policy was 'policies\.py:Quick' and is now 'random'; the digest of the policy's code was ",
@@ -257,11 +265,10 @@ def test_other_weights_are_named_with_their_digests_and_moved_ones_are_the_same(
     assert "code" not in str(caught.value)
 
 
-def test_a_journal_without_rows_goes_with_its_run_and_one_with_rows_stays(benchmark, dataset, policies, tmp_path):
+def test_a_journal_without_rows_goes_with_its_run_and_one_with_rows_stays(quick, tmp_path):
     out, journal = tmp_path / "r.jsonl", tmp_path / "r.jsonl.journal"
-    (row,) = run(benchmark, dataset, PolicyName(f"{policies}:Quick"), out, splits=("train",))
-    header, _ = read_results(out)
-    out.unlink()
+    header, rows = read_results(quick)
+    (row,) = rows.values()
     for line in (b"", encode_line(row)):
         with suppress(KeyboardInterrupt), open_journal(out, header) as (file, _):
             assert journal.read_bytes() == encode_line(header)

@@ -20,7 +20,7 @@ from tableverse_factory.geometry.math.transforms import invert_pose, transform_p
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.scale.surface import measure_distance, measure_sheet
-from tests.helpers.tabletop_views import CAMERA, Box, camera_above, look
+from tests.helpers.tabletop_views import SMALL_CAMERA, Box, camera_above, look
 
 THINGS = (Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08)))
 POSE = camera_above()
@@ -29,7 +29,7 @@ SIZES = {"a4": (0.297, 0.21), "us_letter": (0.2794, 0.2159), "bank_card": (0.085
 
 def pixel(*point):
     """The pixel that shows a point of the table frame."""
-    x, y = project(transform_points(invert_pose(POSE), np.array([point], float)), CAMERA)[0]
+    x, y = project(transform_points(invert_pose(POSE), np.array([point], float)), SMALL_CAMERA)[0]
     return float(x), float(y)
 
 
@@ -70,7 +70,7 @@ def typical(names):
 
 @cache
 def view():
-    return look(THINGS, POSE)[0]
+    return look(THINGS, POSE, camera=SMALL_CAMERA)[0]
 
 
 def estimated(factor, known, bend=0.0, **changes):
@@ -119,7 +119,7 @@ def test_what_is_known_of_bent_depth_is_as_sure_as_it_says(name):
 
     Half a period further, a bend is the same with the other sign.
     """
-    v, u = np.indices(view().depth.shape) / 480.0
+    v, u = np.indices(view().depth.shape) / 240.0
     for phase in (0.0, 1.5):
         bent = 1 + 0.012 * np.sin(4 * u + phase) * np.cos(5 * v + phase)
         item = estimated(0.7, KNOWN[name], bend=0.015)
@@ -139,7 +139,7 @@ def test_scaling_depth_and_length_alike_scales_the_scene(name, factor):
     np.testing.assert_allclose(scaled.observation.depth, factor * plain.observation.depth, rtol=0.003)
     np.testing.assert_allclose(scaled.camera_to_table.position, factor * plain.camera_to_table.position, atol=0.003)
     sizes = [[np.ptp(o.points_camera, axis=0) for o in found.objects] for found in (plain, scaled)]
-    np.testing.assert_allclose(sizes[1], factor * np.array(sizes[0]), atol=0.004)
+    np.testing.assert_allclose(sizes[1], factor * np.array(sizes[0]), atol=0.006)  # less than two pixels
 
 
 @pytest.mark.parametrize("factor", [0.19, 5.5])
@@ -176,17 +176,17 @@ def test_a_sensor_that_contradicts_is_a_reason(name):
     assert "check the length, its pixels and depth_scale" in detail
 
 
-SHORT = distance((0.0, -0.1, 0), (0.01, -0.1, 0))
+SHORT = distance((0.0, -0.1, 0), (0.016, -0.1, 0))
 
 
 @pytest.mark.parametrize(
     ("known", "told"),
     [
-        (KnownDistance(kind="distance", length_m=0.3, pixels=((0.0, 0.0), (300.0, 300.0))), "mark another pixel"),
+        (KnownDistance(kind="distance", length_m=0.3, pixels=((0.0, 0.0), (150.0, 150.0))), "mark another pixel"),
         (SHORT, "too uncertain; mark a longer length"),
-        (KnownSheet(kind="a4", pixels=((10.0, 10.0), (30.0, 10.0), (30.0, 30.0), (10.0, 30.0))), "0 depth readings"),
-        (KnownSheet(kind="a4", pixels=((200.0, 300.0), (420.0, 300.0), (420.0, 320.0), (200.0, 320.0))), "make no a4"),
-        (KnownHeight(kind="height", length_m=0.1, pixels=((320.0, 470.0),)), "no object is found at the pixel"),
+        (KnownSheet(kind="a4", pixels=((5.0, 5.0), (15.0, 5.0), (15.0, 15.0), (5.0, 15.0))), "0 depth readings"),
+        (KnownSheet(kind="a4", pixels=((100.0, 150.0), (210.0, 150.0), (210.0, 160.0), (100.0, 160.0))), "make no a4"),
+        (KnownHeight(kind="height", length_m=0.1, pixels=((160.0, 235.0),)), "no object is found at the pixel"),
         (KnownHeight(kind="height", length_m=0.1, label="mug"), "0 objects are called 'mug' (labels: object)"),
         (KnownHeight(kind="height", length_m=0.1, label="object"), "2 objects are called 'object'"),
     ],
@@ -195,7 +195,7 @@ SHORT = distance((0.0, -0.1, 0), (0.01, -0.1, 0))
 def test_a_length_that_cannot_be_measured_is_a_reason(known, told):
     item = estimated(1.0, known)
     depth = item.depth.copy()
-    depth[:60, :60] = 0.0
+    depth[:30, :30] = 0.0
     reason, detail = refusal(perceived(replace(item, depth=depth)))
     assert reason == "known_length_unmeasured"
     assert told in detail
