@@ -80,6 +80,14 @@ def estimate_underside(footprint: Footprint, support: float) -> Map:
     return ndimage.median_filter(under, size=MEDIAN_CELLS)
 
 
+def measure_sheet(footprint: Footprint, support: float) -> tuple[float, float]:
+    """Measure the share of the visible border that ends above the support, and the thickness of a sheet there [m]."""
+    width = compute_half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
+    edges = _find_edges(footprint, width, _compute_uprightness(footprint), support)
+    raised = edges.raised > 0.0
+    return (float(raised.mean()), float(np.median(edges.sheet[raised]))) if raised.any() else (0.0, 0.0)
+
+
 def compute_half_width(inside: Map) -> Map:
     """Compute the radius of the largest disc in a shape that covers each cell, of each cell's distance to its border.
 
