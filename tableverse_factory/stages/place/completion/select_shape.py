@@ -1,4 +1,4 @@
-"""The mesh model `carved`: the simplest of six kinds of shape that explains the picture."""
+"""The mesh model `carved`: the simplest of seven kinds of shape that explains the picture."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
+from tableverse_factory.stages.place.completion.sheet import carve_sheet
 from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing
 from tableverse_factory.stages.place.completion.turned_profile import build_turned_mesh
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
@@ -75,7 +76,7 @@ class _Search:
 
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
-    """Fit boxes, a surface of revolution, half-turn symmetric and inflated solids and columns, and select the best."""
+    """Fit boxes, a surface of revolution, solids of a half turn, sheets, inflation and columns, and select the best."""
     rays = sample_rays(view)
     search = _Search()
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
@@ -122,6 +123,11 @@ def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
     return Draft(cost, lambda: (mesh, pose, cost))
 
 
+def _draft_sheet(view: ObjectView, rays: RaySample) -> Draft | None:
+    carved = carve_sheet(view)
+    return None if carved is None else _draft_carving(carved, rays, lambda _: 0.0)
+
+
 def _draft_carving(carved: CarvedSurface, rays: RaySample, price: Callable[[TriangleMesh], float]) -> Draft:
     """Draft a carved shape, of which simplification costs the most: as it is it tells how well it can fit."""
 
@@ -148,6 +154,7 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
     ("carved/revolution", 1e-4, _draft_revolution),
     ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
     ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    ("carved/sheet", 1e-3, _draft_sheet),
     ("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     ("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )

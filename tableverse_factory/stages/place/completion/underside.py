@@ -80,6 +80,18 @@ def estimate_underside(footprint: Footprint, support: float) -> Map:
     return ndimage.median_filter(under, size=MEDIAN_CELLS)
 
 
+def measure_sheet(footprint: Footprint, support: float) -> tuple[float, float]:
+    """Measure the share of the visible border that ends above the support, and the thickness of a sheet there [m]."""
+    width = compute_half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
+    edges = _find_edges(footprint, width, _compute_uprightness(footprint), support)
+    raised = edges.raised > 0.0
+    if not raised.any():
+        return 0.0, 0.0
+    # Of a rim that is round, with half the thickness as its radius, the line of sight leaves the lowest part unseen.
+    seen_share = (1.0 + float(np.linalg.norm(footprint.to_eye[:2]))) / 2.0
+    return float(raised.mean()), float(np.median(edges.sheet[raised])) / seen_share
+
+
 def compute_half_width(inside: Map) -> Map:
     """Compute the radius of the largest disc in a shape that covers each cell, of each cell's distance to its border.
 

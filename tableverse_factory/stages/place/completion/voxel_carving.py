@@ -4,7 +4,7 @@ Two priors: columns from the observed top down to the support, and a half turn a
 look much the same from behind). Both are carved by all free space.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -167,8 +167,24 @@ def compute_column_field(
     view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
 ) -> Field:
     """Compute the signed distance to the columns below the observed points [m]."""
-    local = transform_points(invert_pose(pose), view.points)
+    seen = find_footprint(view, pose, grid)
+    closed, top = seen.closed, seen.top
     z = grid.axes()[2] / stretch
+    if bridged:
+        closed, top = _bridge_gaps(closed, top, free, z)
+    inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
+    outside = ndimage.distance_transform_edt(~closed)
+    footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
+    support = view.support_z - pose.position[2]
+    under = estimate_underside(add_free_space(replace(seen, closed=closed, top=top), free, z, support), support)
+    top = np.maximum(top, under + MIN_THICKNESS_M)
+    column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
+    return np.minimum(column, footprint[:, :, None])
+
+
+def find_footprint(view: ObjectView, pose: Pose, grid: VoxelGrid) -> Footprint:
+    """Find the columns of a grid that the observed points stand in, before any free space is known."""
+    local = transform_points(invert_pose(pose), view.points)
     index = np.rint((local[:, :2] - grid.origin[:2]) / grid.cell).astype(int)
     index = np.clip(index, 0, np.array(grid.shape[:2]) - 1)
     top, lowest = np.full(grid.shape[:2], -np.inf), np.full(grid.shape[:2], np.inf)
@@ -179,22 +195,17 @@ def compute_column_field(
         raise GeometryError("no points fall into the grid")
     closed = ndimage.binary_closing(np.pad(seen, 3), iterations=2)[3:-3, 3:-3] | seen
     nearest = ndimage.distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    top = top[nearest[0], nearest[1]]
-    if bridged:
-        closed, top = _bridge_gaps(closed, top, free, z)
-    inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
-    outside = ndimage.distance_transform_edt(~closed)
-    footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
-    support = view.support_z - pose.position[2]
-    below = (free < -EMPTY_M) & (z < top[:, :, None] - EMPTY_M)
-    empty_to = np.where(below, z, support).max(axis=2, initial=support)
     middle = (local[:, 2].min() + local[:, 2].max()) / 2
     to_eye = transform_points(invert_pose(pose), view.eye[None])[0] - np.array([0.0, 0.0, middle])
     to_eye /= float(np.linalg.norm(to_eye))
-    under = estimate_underside(Footprint(grid.cell, closed, top, lowest, empty_to, to_eye), support)
-    top = np.maximum(top, under + MIN_THICKNESS_M)
-    column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
-    return np.minimum(column, footprint[:, :, None])
+    nothing = np.full(grid.shape[:2], view.support_z - pose.position[2])
+    return Footprint(grid.cell, closed, top[nearest[0], nearest[1]], lowest, nothing, to_eye)
+
+
+def add_free_space(footprint: Footprint, free: Field, z: Float64[np.ndarray, " nz"], support: float) -> Footprint:
+    """Add up to which height each column was seen to be empty below its top; `z` are the heights of the cells [m]."""
+    below = (free < -EMPTY_M) & (z < footprint.top[:, :, None] - EMPTY_M)
+    return replace(footprint, empty_to=np.where(below, z, support).max(axis=2, initial=support))
 
 
 def _bridge_gaps(
