@@ -2,24 +2,22 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import ConvexHull, QhullError
 
 from schemas.config import RectifyConfig
 from tableverse_factory.geometry.collision.linear_sweep import LinearSweep
 from tableverse_factory.stages.rectify.fault_check import LET_DOWN_M, is_faultless
 from tableverse_factory.stages.rectify.groups import Group, connect_components, form_entities, ground_groups
 from tableverse_factory.stages.rectify.lccr import RectificationResult
+from tableverse_factory.stages.rectify.leaning import relax_and_find_leaning
 from tableverse_factory.stages.rectify.quarter_turn_symmetry import (
     apply_motion,
     count_quarter_turns,
     rotate_about_origin,
 )
 from tableverse_factory.stages.rectify.radial import compute_azimuths, order_radially, spread_groups
-from tableverse_factory.stages.rectify.relaxation import relax_layout
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, follow_body, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import SupportRelation, read_support
 from tableverse_factory.stages.rectify.vertical import UP, lift_contents, lift_in_turn
@@ -29,8 +27,6 @@ Azimuths = Float64[np.ndarray, " n"]
 AT_REST_M = 1e-6  # lowering ends with a motion smaller than this [m]
 MAX_NOISE_M = 0.025  # where no part moves further, noise explains it, and the radial method is not tried [m]
 SAME_WAY_RAD = 1e-4  # azimuths that differ by less are equal, so that rounding errors do not order a row [rad]
-DOWN = np.array([0.0, 0.0, -1.0])
-MAX_TILT_RAD = np.radians(4.0)  # standing parts are levelled by at most this; more is no noise
 
 
 def rectify_jointly(parts: Sequence[RigidPart], config: RectifyConfig) -> RectificationResult:
@@ -73,18 +69,15 @@ def _rectify_bodies(
     around the most central one would change, or where that moves less.
     """
     clearance = config.clearance_m
-    support = read_support(bodies, config.contact_m)
+    relaxed = None if faultless else relax_and_find_leaning(bodies, config)
+    support = read_support(bodies, config.contact_m) if relaxed is None else relaxed.support
     trees = connect_components(sorted(support.pairs), len(bodies))
     ordered = order_radially(bodies, [tuple((i,) for i in tree) for tree in trees])
-    if faultless:
+    if relaxed is None:
         return list(bodies), ordered, "joint"
-    upright = [
-        _stand_on_table(body) if standing else body for body, standing in zip(bodies, support.standing, strict=True)
-    ]
-    near, unsolved = relax_layout(upright, support, clearance)
-    method = "radial" if len(unsolved) == len(near) else "partly radial" if unsolved else "joint"
-    start = [bodies[i] if i in unsolved else part for i, part in enumerate(near)]
-    moved = _remove_overlaps(start, support, ordered, clearance)
+    unsolved = len(relaxed.unsolved)
+    method = "radial" if unsolved == len(bodies) else "partly radial" if unsolved else "joint"
+    moved = _remove_overlaps(relaxed.parts, support, ordered, clearance)
     kept = is_order_kept(compute_azimuths(bodies, ordered), compute_azimuths(moved, ordered))
     ways = _measure_distances(bodies, moved)
     if kept and ways.max() <= MAX_NOISE_M:
@@ -124,23 +117,6 @@ def _measure_distances(before: Sequence[RigidPart], after: Sequence[RigidPart]) 
     """Measure how far each part has been moved [m]."""
     ways = np.array([b.body.offset - a.body.offset for a, b in zip(before, after, strict=True)])
     return np.linalg.norm(ways, axis=1)
-
-
-def _stand_on_table(part: RigidPart) -> RigidPart:
-    """Put a part on the table on the hull face on which it would rest, if that takes a turn within `MAX_TILT_RAD`.
-
-    Of the downward faces within that angle it is the one nearest to the centre of mass, which is then lowest.
-    """
-    flat = part
-    with suppress(QhullError):  # of a flat part
-        planes = ConvexHull(part.body.solids.points).equations
-        within = planes[planes[:, :3] @ DOWN >= np.cos(MAX_TILT_RAD)]
-        if len(within):
-            normal = within[np.argmin(-(within[:, :3] @ part.mass_center + within[:, 3])), :3]
-            axis = np.cross(normal, DOWN)
-            sine = float(np.linalg.norm(axis))
-            flat = part.turned(axis / sine * np.arctan2(sine, float(normal @ DOWN))) if sine > 0.0 else part
-    return flat.moved(-flat.lowest_now_m * UP)
 
 
 def _remove_overlaps(

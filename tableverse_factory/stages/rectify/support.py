@@ -43,6 +43,11 @@ class SupportRelation:
         pairs = frozenset((place[i], place[j]) for i, j in self.pairs if i in place and j in place)
         return SupportRelation(pairs, tuple(self.standing[i] for i in some))
 
+    def adding(self, upper: int, lower: int) -> "SupportRelation":
+        """Add a pair; its upper part then stands no longer."""
+        standing = tuple(stands and i != upper for i, stands in enumerate(self.standing))
+        return SupportRelation(self.pairs | {(upper, lower)}, standing)
+
 
 def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelation:
     """Infer support from heights, contact, footprints and centres of mass.
@@ -69,6 +74,12 @@ def read_support(parts: Sequence[RigidPart], contact_m: float) -> SupportRelatio
     return SupportRelation(frozenset(pairs), tuple(i not in uppers for i in range(len(parts))))
 
 
+def measure_vertical_gap(upper: RigidPart, lower: RigidPart) -> float:
+    """Measure how far a part must rise or sink to lie upon another one [m]."""
+    rise = _RISING.find_first_clear([upper.body], [lower.body], 0.0)
+    return rise if rise > 0.0 else _SINKING.room([upper.body], [lower.body], 0.0, np.inf)
+
+
 class _Reader:
     def __init__(self, parts: Sequence[RigidPart]) -> None:
         self._parts = parts
@@ -79,7 +90,6 @@ class _Reader:
         self._ranks = [(-float(part.mass_center_now[2]), part.object_id) for part in parts]
         # Parts that the table alone cannot carry, within the noise of their poses.
         self.needy = [fall is not None or hovers for fall, hovers in zip(self._falls, self._hovers, strict=True)]
-        self._up, self._down = LinearSweep(np.array([0.0, 0.0, 1.0])), LinearSweep(np.array([0.0, 0.0, -1.0]))
 
     def upper(self, i: int, j: int) -> int | None:
         """Decide which of two near parts is supported by the other; None if neither."""
@@ -119,10 +129,7 @@ class _Reader:
                 pairs |= {(i, j)}
 
     def _off(self, i: int, j: int) -> float:
-        """Measure how far a part must rise or sink to lie upon another one [m]."""
-        upper, lower = self._parts[i].body, self._parts[j].body
-        rise = self._up.find_first_clear([upper], [lower], 0.0)
-        return rise if rise > 0.0 else self._down.room([upper], [lower], 0.0, np.inf)
+        return measure_vertical_gap(self._parts[i], self._parts[j])
 
     def _is_over(self, i: int, j: int) -> bool:
         outline, center = self._outlines[j], self._parts[i].mass_center_now
@@ -159,3 +166,4 @@ _WITHIN_NOISE = np.concatenate(
     [_list_downward_directions(0.0, 1), *(_list_downward_directions(TILT_NOISE_DEG * k / 3, 12) for k in (1, 2, 3))]
 )
 _BEYOND_NOISE = _list_downward_directions(BASIN_DEG, 24)
+_RISING, _SINKING = LinearSweep(np.array([0.0, 0.0, 1.0])), LinearSweep(np.array([0.0, 0.0, -1.0]))

@@ -213,6 +213,28 @@ def test_what_leans_stays_leaning() -> None:
         assert np.abs(offsets(result)).max() < 0.008
 
 
+@pytest.mark.parametrize(("angle", "leans"), [(-3.5, True), (-0.5, False)])
+def test_what_could_stand_leans_where_it_moves_less_so(angle: float, leans: bool) -> None:
+    """A carton over the rim of a board: that it lies on it shows only in a tilt beyond the noise."""
+    board = placed("board", box(0.06, 0.2, 0.005), (0.062, 0, 0.0025))
+    height = 0.02 + 0.05 * np.sin(np.radians(abs(angle)))
+    carton = tilted(placed("carton", box(0.1, 0.08, 0.04), (0.0, 0.0, height)), 0.0, angle)
+    assert not read_support([part(board), part(carton)], CONFIG.contact_m).pairs
+    result = rectified([board, carton])
+    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+    assert len(result.groups) == (1 if leans else 2)
+    assert (tilt_deg(result.parts[1].pose_now(carton.pose).quaternion_wxyz) > 2.5) == leans
+
+
+def test_what_carries_another_does_not_lean() -> None:
+    """The same carton under a can: it may be seen tilted because of that."""
+    board = placed("board", box(0.06, 0.2, 0.005), (0.062, 0, 0.0025))
+    carton = tilted(placed("carton", box(0.1, 0.08, 0.04), (0.0, 0.0, 0.023)), 0.0, -3.5)
+    can = placed("can", box(0.03, 0.03, 0.06), (0.0, 0.0, 0.074))
+    result = rectified([board, carton, can])
+    assert tilt_deg(result.parts[1].pose_now(carton.pose).quaternion_wxyz) < 0.1
+
+
 @pytest.mark.parametrize("angle", [-30.0, 30.0])
 def test_what_hangs_is_carried_by_what_it_touches(angle: float) -> None:
     """A tilted board in the air beside a box, to which it would fall or not."""
