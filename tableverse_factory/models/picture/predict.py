@@ -15,8 +15,7 @@ from tableverse_factory.geometry.math.camera import backproject, rescale_camera
 from tableverse_factory.models.picture.net import MULTIPLE, REACHES, load_picture_net
 
 LEAST_PIXELS, MOST_PIXELS = 76_800, 118_000  # of the net's input: it was trained at 320 x 240 and more
-MOST_SENSED_PIXELS = 200_000  # of its input with a sensor's depth: small objects need them, and one look is enough
-MOST_CANVAS_PIXELS = 800_000  # of a prediction around a window
+MOST_SENSED_PIXELS = 200_000  # of its input with a sensor's depth, where one look is enough; small objects need them
 MIRRORED_SCALE, STRIDE = 7 / 6, 16  # of a bare picture seen once more; the net takes sides that are multiples of 16
 OTHER, TABLE, OBJECT = range(3)
 _Outputs = dict[str, Float32[np.ndarray, "..."]]
@@ -81,34 +80,43 @@ def predict_window(
 ) -> PicturePrediction:
     """Predict what a sensor shows within a window of rows and columns; around it is neither object nor table.
 
-    The net's pixels all go to the window. Maps are those of the whole picture at the resolution of the window.
+    The net's pixels all go to the window, which grows to half of the picture's length and height at least. Maps are
+    those of the whole picture, as fine as in the window.
 
     Raises:
         WeightsError, ModelError: as `predict_picture`.
     """
-    rows, columns = (part.indices(n) for part, n in zip(window, depth.shape, strict=True))
-    height, width = rows[1] - rows[0], columns[1] - columns[0]
-    own = replace(camera, cx=camera.cx - columns[0], cy=camera.cy - rows[0], width=width, height=height)
-    found = predict_picture(color[window], own, depth[window], weights)
-    zoom = np.array(found.depth.shape) / (height, width)
-    shape = tuple(np.maximum(np.rint(np.array(depth.shape) * zoom).astype(int), found.depth.shape))
-    corner = np.minimum(np.rint((rows[0], columns[0]) * zoom).astype(int), np.subtract(shape, found.depth.shape))
-    inner = tuple(slice(int(start), int(start) + n) for start, n in zip(corner, found.depth.shape, strict=True))
+    part = tuple(_grow(own, n) for own, n in zip(window, depth.shape, strict=True))
+    corner, size = [own.start for own in part], [own.stop - own.start for own in part]
+    own_camera = replace(camera, cx=camera.cx - corner[1], cy=camera.cy - corner[0], width=size[1], height=size[0])
+    found = predict_picture(color[part], own_camera, depth[part], weights)
+    zoom = np.array(found.depth.shape) / size
+    rows, columns = (round(n) for n in np.array(depth.shape) * zoom)
+    top, left = (round(start) for start in corner * zoom)
 
     def surround(map_: np.ndarray, around: np.ndarray | float = 0.0) -> np.ndarray:
-        full = np.full((*map_.shape[:-2], *shape), around, map_.dtype)
-        full[..., inner[0], inner[1]] = map_
+        full = np.full((*map_.shape[:-2], rows, columns), around, map_.dtype)
+        place = full[..., top : top + map_.shape[-2], left : left + map_.shape[-1]]
+        place[...] = map_[..., : place.shape[-2], : place.shape[-1]]
         return full
 
     return replace(
         found,
-        camera=rescale_camera(camera, shape[1], shape[0]),
+        camera=rescale_camera(camera, columns, rows),
         depth=surround(found.depth, float(np.median(found.depth))),
         label=surround(found.label, np.eye(3)[OTHER][:, None, None]),
         votes=surround(found.votes),
         boundary=surround(found.boundary),
         affinity=surround(found.affinity),
     )
+
+
+def _grow(window: slice, length: int) -> slice:
+    """Cut a window to a picture's side and let it grow to half of it."""
+    start, stop, _ = window.indices(length)
+    missing = max(0, length // 2 - (stop - start))
+    start = min(max(0, start - missing // 2), length - (stop - start) - missing)
+    return slice(start, max(stop, start + length // 2))
 
 
 def choose_working_size(height: int, width: int, most: int = MOST_PIXELS) -> tuple[int, int]:
@@ -133,7 +141,9 @@ def compute_rays(camera: Camera) -> Float32[np.ndarray, "3 h w"]:
 
 
 def _predict(color: Picture, camera: Camera, sensed: Float32[np.ndarray, "h w"], weights: str) -> PicturePrediction:
-    rows, columns = choose_working_size(*color.shape[:2], MOST_SENSED_PIXELS if sensed.any() else MOST_PIXELS)
+    most = int(np.clip(sensed.size, MOST_PIXELS, MOST_SENSED_PIXELS)) if sensed.any() else MOST_PIXELS
+    height, width = color.shape[:2]
+    rows, columns = choose_working_size(height, width, most)
     out = _ask(color, camera, sensed, weights, (rows, columns))
     if not sensed.any():  # the errors of the mirrored, larger picture are others: the mean of both is nearer
         larger = round(MIRRORED_SCALE * rows / STRIDE) * STRIDE, round(MIRRORED_SCALE * columns / STRIDE) * STRIDE

@@ -21,6 +21,7 @@ from tableverse_factory.models.picture.predict import (
     choose_working_size,
     compute_rays,
     predict_picture,
+    predict_window,
 )
 from tests.helpers.paths import ROOT
 from tests.helpers.tabletop_views import Box, look
@@ -202,3 +203,29 @@ def test_the_depth_of_a_sensor_is_another_question() -> None:
     assert predict_picture(seen.color, seen.camera, seen.depth.copy()) is sensed
     wrong = predict_picture(seen.color, seen.camera, np.roll(seen.depth, 40, axis=1))
     assert wrong is not sensed
+
+
+@pytest.mark.parametrize(
+    ("window", "grown"),
+    [
+        (np.s_[100:400, 200:500], np.s_[100:400, 190:510]),
+        (np.s_[0:20, 630:700], np.s_[0:240, 320:640]),
+        (np.s_[470:480, 0:5], np.s_[240:480, 0:320]),
+        (np.s_[0:480, 0:640], np.s_[0:480, 0:640]),
+    ],
+    ids=["middle", "corner", "other corner", "all"],
+)
+def test_a_window_is_seen_in_its_place_and_nothing_around_it(
+    window: tuple[slice, slice], grown: tuple[slice, slice]
+) -> None:
+    seen = look(THINGS, floor_z=-0.7, wall_y=1.5)[0]
+    found = predict_window(seen.color, seen.camera, seen.depth, window)
+    check_sound(found, *found.depth.shape)
+    assert (found.camera.height, found.camera.width) == found.depth.shape
+    objects = upsample_ids((found.label[OBJECT] > 0.5).astype(np.int32), seen.depth.shape) > 0
+    around = np.ones(seen.depth.shape, dtype=bool)
+    around[grown] = False
+    assert not (objects & around).any()
+    whole = predict_picture(seen.color, seen.camera, seen.depth)
+    wanted = (upsample_ids((whole.label[OBJECT] > 0.5).astype(np.int32), seen.depth.shape) > 0) & ~around
+    assert (objects != wanted).sum() <= 0.1 * wanted.sum()

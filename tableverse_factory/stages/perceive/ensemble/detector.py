@@ -1,4 +1,4 @@
-"""The detector `ensemble`: each pile by depth alone or by both, as the boundaries that our net sees decide."""
+"""The detector `ensemble`: each group by depth alone or by both, as the boundaries that our net sees decide."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,48 +6,69 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
-from tableverse_factory.stages.perceive.base.table_view import TableView
+from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
 from tableverse_factory.stages.perceive.ensemble.fused import detect_fused, upsample_map
 from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_view
 
-BESIDE_PX = 3  # objects nearer to one another in the picture are of one pile
 REACH_PX = 2  # a boundary this near is that of a border
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
 LEAST_PROBABILITY = 0.02
-FAVOUR = 0.6  # log-likelihood per pixel of border by which the answer of both must be better: depth is measured
+COMMON_SHARE = 0.3  # of the smaller of two objects, one of each answer, from which they are of one group
+# Log-likelihood per pixel of border by which the answer of both must be better, as depth is measured; not where it has
+# more objects, as a sensor joins what touches and misses what is thin but sees no seams where there are none.
+FAVOUR = 0.4
 
 Probabilities = Float32[np.ndarray, "h w"]
 
 
 def detect_with_both(view: TableView, config: Config, services: Services) -> DetectionResult:
-    """Detect objects by depth, and by depth and the net together, and choose one answer for each pile."""
+    """Detect objects by depth, and by depth and the net together, and choose one answer for each group."""
     answers = detect_from_depth(view, config, services), detect_fused(view, config)
     ids = [_get_ids(answer) for answer in answers]
     seen = predict_view(view, config.perceive.detector_weights)
     boundary = upsample_map(seen.boundary, view.valid.shape)
-    near = ndimage.binary_dilation((ids[0] > 0) | (ids[1] > 0), iterations=BESIDE_PX)
-    piles, count = ndimage.label(near)
-    takes_second = np.zeros(count + 1, dtype=bool)
-    for pile, window in enumerate(ndimage.find_objects(piles), start=1):
-        inside = piles[window] == pile
-        takes_second[pile] = prefer_second([part[window] * inside for part in ids], boundary[window], inside)
-    return replace(_merge_answers(answers, ids, piles, takes_second), shown=find_standing(view, seen))
+    groups = [numbers[own] for numbers, own in zip(group_overlapping(*ids), ids, strict=True)]
+    takes_second = np.zeros(max(int(each.max()) for each in groups) + 1, dtype=bool)
+    for group in range(1, len(takes_second)):
+        window = expand_window((groups[0] == group) | (groups[1] == group), 2 * REACH_PX)
+        own = [np.where(each[window] == group, part[window], 0) for each, part in zip(groups, ids, strict=True)]
+        inside = ndimage.binary_dilation((own[0] > 0) | (own[1] > 0), iterations=REACH_PX)
+        takes_second[group] = prefer_second(own, boundary[window], inside)
+    return replace(_merge_answers(answers, ids, groups, takes_second), shown=find_standing(view, seen))
+
+
+def group_overlapping(first: IdImage, second: IdImage) -> tuple[IdImage, IdImage]:
+    """Group objects of two answers that overlap; number the group of each id from 1, and 0 for no object."""
+    sizes = [np.bincount(ids.ravel()) for ids in (first, second)]
+    counts = [len(size) - 1 for size in sizes]
+    total = sum(counts)
+    if not total:
+        return np.zeros(1, np.int32), np.zeros(1, np.int32)
+    pairs, common = np.unique(np.stack([first, second])[:, (first > 0) & (second > 0)], axis=1, return_counts=True)
+    one, other = pairs[:, common > COMMON_SHARE * np.minimum(sizes[0][pairs[0]], sizes[1][pairs[1]])]
+    links = coo_array((np.ones(len(one)), (one - 1, counts[0] + other - 1)), shape=(total, total))
+    group = connected_components(links, directed=False)[1].astype(np.int32) + 1
+    return np.append(np.int32(0), group[: counts[0]]), np.append(np.int32(0), group[counts[0] :])
 
 
 def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
-    """Decide whether the second of two segmentations of a pile explains the boundaries so much better that it is taken.
+    """Decide whether the second of two segmentations explains the boundaries within so much better that it is taken.
 
     `boundary` is their probability at each pixel.
     """
     borders = [_find_borders(each) & inside for each in ids]
     first, second = (_score_borders(border, boundary, inside) for border in borders)
-    return bool(second - first > FAVOUR * max(1, *(int(border.sum()) for border in borders)))
+    counts = [len(np.unique(each[each > 0])) for each in ids]
+    favour = 0.0 if counts[1] > counts[0] else FAVOUR
+    return bool(second - first > favour * max(1, *(int(border.sum()) for border in borders)))
 
 
 def _score_borders(border: Mask, boundary: Probabilities, inside: Mask) -> float:
@@ -70,11 +91,11 @@ def _find_borders(ids: IdImage) -> Mask:
 
 
 def _merge_answers(
-    answers: Sequence[DetectionResult], ids: Sequence[IdImage], piles: IdImage, takes_second: np.ndarray
+    answers: Sequence[DetectionResult], ids: Sequence[IdImage], groups: Sequence[IdImage], takes_second: np.ndarray
 ) -> DetectionResult:
-    """Take from each answer what lies in its piles; `takes_second` says which from the second."""
-    chosen = takes_second[piles]
-    shares = [np.where(chosen == source, own, 0) for source, own in enumerate(ids)]
+    """Take from each answer its groups; those of the second, as `takes_second` says, fill what the first leaves."""
+    shares = [np.where(takes_second[groups[0]], 0, ids[0])]
+    shares.append(np.where(takes_second[groups[1]] & (shares[0] == 0), ids[1], 0))
     kept = [
         (source, index)
         for source, answer in enumerate(answers)

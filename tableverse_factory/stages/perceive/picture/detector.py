@@ -8,7 +8,14 @@ from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
-from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction, predict_picture, predict_window
+from tableverse_factory.models.picture.predict import (
+    OBJECT,
+    OTHER,
+    TABLE,
+    PicturePrediction,
+    predict_picture,
+    predict_window,
+)
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, DetectionResult
 from tableverse_factory.stages.perceive.base.object_filter import (

@@ -1,4 +1,4 @@
-"""The detector `ensemble`: which of two answers a pile gets, and that what it takes overlaps nothing."""
+"""The detector `ensemble`: which of two answers a group gets, and that what it takes overlaps nothing."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,12 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
-from tableverse_factory.stages.perceive.ensemble.detector import _merge_answers, detect_with_both, prefer_second
+from tableverse_factory.stages.perceive.ensemble.detector import (
+    _merge_answers,
+    detect_with_both,
+    group_overlapping,
+    prefer_second,
+)
 from tableverse_factory.stages.perceive.perceive import choose_detector
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import look
@@ -56,16 +61,39 @@ def test_the_answer_whose_borders_are_seen_is_taken(first, second, boundary, sec
     assert prefer_second([first, second], boundary, EVERYWHERE) is second_wins
 
 
-def test_every_pixel_comes_from_the_answer_of_its_pile_and_containers_stay() -> None:
-    """One object of the first answer lies in both piles; contents are listed before their container."""
-    piles = np.array([[1, 1, 1, 0, 2, 2, 2]], dtype=np.int32)
-    ids = [np.array([[2, 1, 1, 0, 1, 1, 1]], dtype=np.int32), np.array([[1, 1, 1, 0, 3, 2, 2]], dtype=np.int32)]
+def test_a_seam_that_is_half_seen_parts_but_joins_nothing() -> None:
+    """Depth knows no seam of two things that touch; one that it knows is not given up for half a reason."""
+    halves = np.where((ONE > 0) & (np.arange(SHAPE[1]) >= 60), 2, ONE).astype(np.int32)
+    boundary = draw_boundary()
+    boundary[20:60, 58:62] = 0.6
+    assert prefer_second([ONE, halves], boundary, EVERYWHERE)
+    boundary[20:60, 58:62] = 0.4
+    assert not prefer_second([halves, ONE], boundary, EVERYWHERE)
+
+
+def test_objects_that_overlap_are_one_group_and_neighbours_are_not() -> None:
+    first = np.array([[1, 1, 1, 2, 2, 2, 2, 0, 3, 0]], dtype=np.int32)
+    second = np.array([[1, 1, 1, 1, 3, 3, 2, 2, 0, 4]], dtype=np.int32)  # a quarter of 1 is too little
+    of_first, of_second = group_overlapping(first, second)
+    assert of_first[0] == of_second[0] == 0
+    assert of_first[1] == of_second[1]
+    assert of_first[2] == of_second[3] == of_second[2]
+    assert len({of_first[1], of_first[2], of_first[3], of_second[4]}) == 4
+    nothing = group_overlapping(np.zeros_like(first), np.zeros_like(first))
+    assert [each.tolist() for each in nothing] == [[0], [0]]
+
+
+def test_every_pixel_comes_from_the_answer_of_its_group_and_containers_stay() -> None:
+    """The second answer's lid lies partly on the first one's cup, which stays; contents come before their container."""
+    ids = [np.array([[2, 1, 1, 0, 3, 3, 0]], dtype=np.int32), np.array([[1, 1, 3, 0, 3, 2, 2]], dtype=np.int32)]
+    groups = [np.array([[1, 1, 1, 0, 2, 2, 0]], dtype=np.int32), np.array([[1, 1, 2, 0, 2, 2, 2]], dtype=np.int32)]
     box = (0.0, 0.0, 1.0, 1.0)
-    first = [Candidate("spoon", 1.0, box, 1, container=1), Candidate("cup", 1.0, box, 2)]
+    first = [Candidate(name, 1.0, box, k) for k, name in enumerate(("spoon", "cup", "gone"), start=1)]
+    first[0] = replace(first[0], container=1)
     second = [Candidate(name, 1.0, box, k) for k, name in enumerate(("lost", "box", "lid"), start=1)]
     second[1] = replace(second[1], container=0)
     answers = [DetectionResult(tuple(each), ids=own) for each, own in zip((first, second), ids, strict=True)]
-    merged = _merge_answers(answers, ids, piles, np.array([False, False, True]))
+    merged = _merge_answers(answers, ids, groups, np.array([False, False, True]))
     assert merged.ids is not None
     assert merged.ids.tolist() == [[2, 1, 1, 0, 4, 3, 3]]
     told = [(item.label, item.instance, item.container) for item in merged.candidates]
