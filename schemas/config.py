@@ -127,10 +127,10 @@ class PerceiveConfig(RemoteModelSection):
     ] = "auto"
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `ensemble`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `geometric` is depth alone;
-    `ensemble` lets depth and the net decide together, group by group of overlapping objects, where that explains the
-    picture better than depth alone; without a sensor it is `picture`. `learned` is a net of `tableverse train segmenter`, `grounding_dino`
-    finds the things of `vocabulary` by colour, `openai` is any server of OpenAI's chat completions, `gemini` Google's
-    own protocol.
+    `ensemble` lets depth and the net decide together, for each group of objects that overlap, where that explains the
+    picture better than depth alone; without a sensor it is `picture`. `learned` is a net of `tableverse train
+    segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of OpenAI's chat
+    completions, `gemini` Google's own protocol.
     """
     detector_weights: Weights = ""
     """The `.onnx` file of `learned`, or of `picture`, whose own is in the package; of `grounding_dino` a folder, or
