@@ -26,6 +26,7 @@ from tableverse_factory.stages.place.completion.voxel_carving import (
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
 SAG_M = 0.002  # least median depth below the chords of the rim [m]: flat things have 0.5 mm of noise
+MAX_HEIGHT = 0.4  # of a sheet, of its length: what is higher is a vessel, whose contents are no part of a wall
 RAISED_SHARE = 0.5  # least share of the visible border that ends above the support
 THICKNESS_RANGE_M = (0.003, 0.015)
 RIM_CELLS = 2
@@ -38,6 +39,8 @@ def carve_sheet(view: ObjectView) -> CarvedSurface | None:
     """Carve a sheet by free space; None where the picture does not show one."""
     rectangle = fit_min_rectangle(view.points[:, :2])
     pose, half = place_frame(view, rectangle, rectangle.center)
+    if half[2] > MAX_HEIGHT * half[:2].max():
+        return None
     grid, stretch = build_flat_grid(view, half)
     footprint = find_footprint(view, pose, grid)
     if _measure_sag(footprint) < SAG_M:
