@@ -35,7 +35,9 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
     ids = [_get_ids(answer) for answer in answers]
     seen = predict_view(view, config.perceive.detector_weights)
     boundary = upsample_map(seen.boundary, view.valid.shape)
-    groups = [numbers[own] for numbers, own in zip(group_overlapping(*ids), ids, strict=True)]
+    contained = [_list_contained(answer) for answer in answers]
+    numbers = group_overlapping(ids[0], ids[1], contained[0], contained[1])
+    groups = [number[own] for number, own in zip(numbers, ids, strict=True)]
     takes_second = np.zeros(max(int(each.max()) for each in groups) + 1, dtype=bool)
     for group in range(1, len(takes_second)):
         window = expand_window((groups[0] == group) | (groups[1] == group), 2 * REACH_PX)
@@ -45,17 +47,38 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
     return replace(_merge_answers(answers, ids, groups, takes_second), shown=find_standing(view, seen))
 
 
-def group_overlapping(first: IdImage, second: IdImage) -> tuple[IdImage, IdImage]:
-    """Group objects of two answers that overlap; number the group of each id from 1, and 0 for no object."""
+def _list_contained(answer: DetectionResult) -> list[tuple[int, int]]:
+    """List the ids of contents and of what holds them."""
+    held = ((each.instance, each.container) for each in answer.candidates)
+    return [(own, answer.candidates[holder].instance) for own, holder in held if holder is not None]
+
+
+def group_overlapping(
+    first: IdImage,
+    second: IdImage,
+    contained_in_first: Sequence[tuple[int, int]] = (),
+    contained_in_second: Sequence[tuple[int, int]] = (),
+) -> tuple[IdImage, IdImage]:
+    """Group objects of two answers that overlap, and contents with what holds them in either answer.
+
+    Returns the number of the group of each id, from 1, and 0 for no object.
+    """
     sizes = [np.bincount(ids.ravel()) for ids in (first, second)]
     counts = [len(size) - 1 for size in sizes]
     total = sum(counts)
     if not total:
         return np.zeros(1, np.int32), np.zeros(1, np.int32)
     pairs, common = np.unique(np.stack([first, second])[:, (first > 0) & (second > 0)], axis=1, return_counts=True)
-    one, other = pairs[:, common > COMMON_SHARE * np.minimum(sizes[0][pairs[0]], sizes[1][pairs[1]])]
-    links = coo_array((np.ones(len(one)), (one - 1, counts[0] + other - 1)), shape=(total, total))
-    group = connected_components(links, directed=False)[1].astype(np.int32) + 1
+    shared = pairs[:, common > COMMON_SHARE * np.minimum(sizes[0][pairs[0]], sizes[1][pairs[1]])]
+    links = np.concatenate(
+        [
+            shared.T + np.array([0, counts[0]]),
+            np.array(contained_in_first, dtype=np.intp).reshape(-1, 2),
+            np.array(contained_in_second, dtype=np.intp).reshape(-1, 2) + counts[0],
+        ]
+    )
+    graph = coo_array((np.ones(len(links)), tuple(links.T - 1)), shape=(total, total))
+    group = connected_components(graph, directed=False)[1].astype(np.int32) + 1
     return np.append(np.int32(0), group[: counts[0]]), np.append(np.int32(0), group[counts[0] :])
 
 

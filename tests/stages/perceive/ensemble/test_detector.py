@@ -79,6 +79,9 @@ def test_objects_that_overlap_are_one_group_and_neighbours_are_not() -> None:
     assert of_first[1] == of_second[1]
     assert of_first[2] == of_second[3] == of_second[2]
     assert len({of_first[1], of_first[2], of_first[3], of_second[4]}) == 4
+    of_first, of_second = group_overlapping(first, second, [(3, 1)], [(4, 2)])  # contents stay with what holds them
+    assert of_first[1] == of_first[3]
+    assert of_second[4] == of_second[2] != of_second[1]
     nothing = group_overlapping(np.zeros_like(first), np.zeros_like(first))
     assert [each.tolist() for each in nothing] == [[0], [0]]
 
