@@ -1,19 +1,15 @@
 """Configuration: read from YAML, overridden by dotted keys, fingerprinted, and written with comments."""
 
-import ast
 import difflib
 import hashlib
-import inspect
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import ValidationError
 
-from schemas import config as config_module
 from schemas.config import Config
 from tableverse_factory.core.errors import ConfigError
 
@@ -103,31 +99,9 @@ def fingerprint_tree(tree: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _make_schema() -> dict[str, Any]:
-    """Make the JSON schema of the configuration, with the docstring of each key as its description."""
-    schema, docstrings = Config.model_json_schema(), _read_docstrings()
-    for name, definition in schema["$defs"].items():
-        for kind in getattr(config_module, name).__mro__:
-            for key, text in docstrings.get(kind.__name__, {}).items():
-                definition["properties"][key].setdefault("description", text)
-    return schema
-
-
-def _read_docstrings() -> dict[str, dict[str, str]]:
-    """Read the docstrings that follow the keys of each section, by the name of its class."""
-    docstrings: dict[str, dict[str, str]] = {}
-    tree = ast.parse(inspect.getsource(config_module))
-    for section in (statement for statement in tree.body if isinstance(statement, ast.ClassDef)):
-        for key, after in pairwise(section.body):
-            match key, after:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as text)):
-                    docstrings.setdefault(section.name, {})[name] = inspect.cleandoc(text)
-    return docstrings
-
-
 def list_keys() -> dict[str, dict[str, Any]]:
     """List the JSON schema of every key (`type`, bounds, `enum`, `default`, `description`) by dotted name, in order."""
-    schema = _make_schema()
+    schema = Config.model_json_schema()
     keys = {}
     for section, reference in schema["properties"].items():
         for name, field in schema["$defs"][_resolve_definition(reference)]["properties"].items():
@@ -141,7 +115,7 @@ def format_commented_yaml(config: Config | None = None) -> str:
         "# Every key there is, with its meaning, its bounds and its default; a key that is deleted has its default.",
         "# tableverse build … --config FILE, or one key alone: --set run.seed=7",
     ]
-    schema, values = _make_schema(), (config or Config()).model_dump(mode="json")
+    schema, values = Config.model_json_schema(), (config or Config()).model_dump(mode="json")
     for section, reference in schema["properties"].items():
         definition = schema["$defs"][_resolve_definition(reference)]
         lines += ["", *_format_comment(definition.get("description", ""), ""), f"{section}:"]

@@ -60,7 +60,7 @@ def find_standing(view: TableView, found: PicturePrediction) -> Mask:
 
 def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Config) -> IdImage:
     """Assign the objects and the table-top that the net sees to the boxes of a detector."""
-    seen = predict_view(view, config.perceive.segmenter_weights)
+    seen = predict_observation(view.observation, config.perceive.segmenter_weights)
     ids = assign_regions_to_boxes(segment_prediction(seen, view.valid.shape), found)
     return np.where((ids == 0) & _find_label(seen, TABLE, view.valid.shape), TABLE_ID, ids)
 

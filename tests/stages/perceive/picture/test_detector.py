@@ -18,8 +18,13 @@ from tableverse_factory.models.picture.predict import PicturePrediction
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
 from tableverse_factory.stages.perceive.perceive import perceive
-from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, find_standing
+from tableverse_factory.stages.perceive.picture.detector import (
+    detect_in_picture,
+    find_standing,
+    segment_boxes_in_picture,
+)
 from tableverse_factory.stages.perceive.recorded import record_segmenter
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import CAMERA, Box, best_overlaps, camera_above, look
@@ -120,6 +125,18 @@ def test_the_net_reads_the_depth_of_a_sensor_too(view: tuple[Path, IdImage]) -> 
     assert shown is not None
     assert not (shown & ~alone.raised).any(), "only what the sensor sees stand has to be explained"
     assert (shown & (ids > 1)).sum() > 0.9 * (alone.raised & (ids > 1)).sum()
+
+
+def test_the_table_of_boxes_reaches_beyond_the_objects() -> None:
+    """A detector's table is fitted to the whole table-top, not to what lies about the objects."""
+    seen, ids = look(THINGS, POSE, floor_z=-0.7, wall_y=1.5)
+    view = find_table(seen, np.random.default_rng(0))
+    assert not isinstance(view, Dropped)
+    rows, columns = np.nonzero(ids == 2)
+    box = (float(columns.min()), float(rows.min()), float(columns.max()), float(rows.max()))
+    found = segment_boxes_in_picture(view, DetectionResult((Candidate("box", 1.0, box),)), Config()) == TABLE_ID
+    assert found[ids == 1].mean() > 0.8
+    assert found[ids > 1].mean() < 0.1
 
 
 @pytest.mark.parametrize(("other", "stands"), [(0.05, True), (0.8, True), (0.95, False)])
