@@ -13,9 +13,9 @@ MAX_SLOW_MESHES = 30  # objects of a scene that may each take the whole `place.m
 
 
 class Section(BaseModel):
-    """Base of the sections; `core.config` reads the docstrings of their keys, which costs every process 30 ms."""
+    """Base of the sections."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 class StageSection(Section):
@@ -127,10 +127,10 @@ class PerceiveConfig(RemoteModelSection):
     ] = "auto"
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `ensemble`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `geometric` is depth alone;
-    `ensemble` lets depth and the net decide together, for each group of objects that overlap, where that explains the
-    picture better than depth alone; without a sensor it is `picture`. `learned` is a net of `tableverse train
-    segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of OpenAI's chat
-    completions, `gemini` Google's own protocol.
+    `ensemble` lets depth and the net decide together, for each group of objects that overlap or hold one another, where
+    that explains the picture better than depth alone; without a sensor it is `picture`. `learned` is a net of
+    `tableverse train segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of
+    OpenAI's chat completions, `gemini` Google's own protocol.
     """
     detector_weights: Weights = ""
     """The `.onnx` file of `learned`, or of `picture`, whose own is in the package; of `grounding_dino` a folder, or

@@ -114,9 +114,9 @@ def predict_window(
 def _grow(window: slice, length: int) -> slice:
     """Cut a window to a picture's side and let it grow to half of it."""
     start, stop, _ = window.indices(length)
-    missing = max(0, length // 2 - (stop - start))
-    start = min(max(0, start - missing // 2), length - (stop - start) - missing)
-    return slice(start, max(stop, start + length // 2))
+    size = max(stop - start, length // 2)
+    start = min(max(0, start - (size - (stop - start)) // 2), length - size)
+    return slice(start, start + size)
 
 
 def choose_working_size(height: int, width: int, most: int = MOST_PIXELS) -> tuple[int, int]:

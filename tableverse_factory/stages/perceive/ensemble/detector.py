@@ -36,7 +36,7 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
     seen = predict_view(view, config.perceive.detector_weights)
     boundary = upsample_map(seen.boundary, view.valid.shape)
     contained = [_list_contained(answer) for answer in answers]
-    numbers = group_overlapping(ids[0], ids[1], contained[0], contained[1])
+    numbers = group_objects(ids[0], ids[1], contained[0], contained[1])
     groups = [number[own] for number, own in zip(numbers, ids, strict=True)]
     takes_second = np.zeros(max(int(each.max()) for each in groups) + 1, dtype=bool)
     for group in range(1, len(takes_second)):
@@ -53,7 +53,7 @@ def _list_contained(answer: DetectionResult) -> list[tuple[int, int]]:
     return [(own, answer.candidates[holder].instance) for own, holder in held if holder is not None]
 
 
-def group_overlapping(
+def group_objects(
     first: IdImage,
     second: IdImage,
     contained_in_first: Sequence[tuple[int, int]] = (),

@@ -16,7 +16,7 @@ from tableverse_factory.stages.perceive.base.interfaces import Candidate, Detect
 from tableverse_factory.stages.perceive.ensemble.detector import (
     _merge_answers,
     detect_with_both,
-    group_overlapping,
+    group_objects,
     prefer_second,
 )
 from tableverse_factory.stages.perceive.perceive import choose_detector
@@ -74,15 +74,15 @@ def test_a_seam_that_is_half_seen_parts_but_joins_nothing() -> None:
 def test_objects_that_overlap_are_one_group_and_neighbours_are_not() -> None:
     first = np.array([[1, 1, 1, 2, 2, 2, 2, 0, 3, 0]], dtype=np.int32)
     second = np.array([[1, 1, 1, 1, 3, 3, 2, 2, 0, 4]], dtype=np.int32)  # a quarter of 1 is too little
-    of_first, of_second = group_overlapping(first, second)
+    of_first, of_second = group_objects(first, second)
     assert of_first[0] == of_second[0] == 0
     assert of_first[1] == of_second[1]
     assert of_first[2] == of_second[3] == of_second[2]
     assert len({of_first[1], of_first[2], of_first[3], of_second[4]}) == 4
-    of_first, of_second = group_overlapping(first, second, [(3, 1)], [(4, 2)])  # contents stay with what holds them
+    of_first, of_second = group_objects(first, second, [(3, 1)], [(4, 2)])  # contents stay with what holds them
     assert of_first[1] == of_first[3]
     assert of_second[4] == of_second[2] != of_second[1]
-    nothing = group_overlapping(np.zeros_like(first), np.zeros_like(first))
+    nothing = group_objects(np.zeros_like(first), np.zeros_like(first))
     assert [each.tolist() for each in nothing] == [[0], [0]]
 
 
