@@ -3,7 +3,8 @@
 import sys
 import time
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live_render import LiveRender
 
 from workers.progress.console import ProgressDisplay
 from workers.progress.tally import Actors, Tally
@@ -11,8 +12,21 @@ from workers.progress.tally import Actors, Tally
 STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "curate", "export")
 
 
+def _draw_slowly() -> None:
+    """Draw as on a busy machine: another thread may print between the start of a drawing and its end."""
+    draw = LiveRender.__rich_console__
+
+    def draw_late(self: LiveRender, console: Console, options: ConsoleOptions) -> RenderResult:
+        time.sleep(0.1)
+        yield from draw(self, console, options)
+
+    LiveRender.__rich_console__ = draw_late
+
+
 def main() -> None:
     wait_s, end = float(sys.argv[1]), sys.argv[2]
+    if end == "slow":
+        _draw_slowly()
     tally = Tally(STAGES, total=400, before=0, shards=4)
     with ProgressDisplay(Console(stderr=True)) as progress:
         progress.note("starting Ray on this machine …")

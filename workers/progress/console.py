@@ -1,5 +1,6 @@
 """Progress of a build: a live table on a terminal, a line now and then in a log."""
 
+import threading
 import time
 
 from rich.console import Console, RenderableType
@@ -36,14 +37,21 @@ class _ElapsedTime:
 
 
 class ProgressDisplay:
-    """Progress on the terminal while the block lasts (a `workers.progress.tally.Display`)."""
+    """Progress on the terminal while the block lasts (a `workers.progress.tally.Display`).
+
+    rich's own refreshing thread moves the cursor by the height of a table that a line printed at the same time has not
+    written yet, and two tables stay. So one lock orders all that is drawn.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console
         # rich takes FORCE_COLOR for a terminal, but a log must not fill with cursor movements
         live = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
         self._started = self._shown = time.monotonic()
-        self._live = Live(_ElapsedTime(self._started), console=console, refresh_per_second=2) if live else None
+        self._live = Live(_ElapsedTime(self._started), console=console, auto_refresh=False) if live else None
+        self._drawing = threading.Lock()
+        self._ended = threading.Event()
+        self._refreshing = threading.Thread(target=self._refresh, name="progress display", daemon=True)
         self._rate = ProgressRate()
         self._tally: Tally | None = None
         self._last_line = ""
@@ -52,10 +60,14 @@ class ProgressDisplay:
     def __enter__(self) -> "ProgressDisplay":
         if self._live:
             self._live.start()
+            self._refreshing.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Leave the last state on the screen, if there was progress."""
+        if self._live:
+            self._ended.set()
+            self._refreshing.join()
         if self._tally is not None and self._tally.accounted > self._tally.before:
             self._draw(time.monotonic())
         elif self._live:
@@ -77,9 +89,9 @@ class ProgressDisplay:
         if self._notes > MAX_NOTES:
             return
         for part in line.splitlines()[:12]:
-            self._console.print(sanitize_line(part, 500), highlight=False, markup=False, soft_wrap=True)
+            self._print(sanitize_line(part, 500))
         if self._notes == MAX_NOTES:
-            self._console.print("… more of this: see `tableverse failures`", markup=False)
+            self._print("… more of this: see `tableverse failures`")
 
     def _draw(self, now: float) -> None:
         if self._tally is None:
@@ -91,7 +103,16 @@ class ProgressDisplay:
         line = format_log_line(self._tally, self._rate, now)
         if line != self._last_line:
             self._last_line = line
+            self._print(line)
+
+    def _print(self, line: str) -> None:
+        with self._drawing:
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _refresh(self) -> None:
+        while self._live and not self._ended.wait(_DRAW_EVERY_S):
+            with self._drawing:
+                self._live.refresh()
 
     def _render(self, tally: Tally, now: float) -> RenderableType:
         """Render the table if it fits, else one line."""

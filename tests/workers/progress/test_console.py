@@ -33,6 +33,12 @@ def test_the_table_is_drawn_over_itself_and_stays_at_the_end():
     assert len(seen.scrolled) < 100
 
 
+def test_what_is_printed_while_the_table_is_drawn_leaves_no_second_table():
+    """rich's own refreshing thread left two in seven of eight runs."""
+    seen = watch([*PRETEND, "0", "slow"], size=(100, 60))
+    assert sum(line.startswith("stage  ") for line in [*seen.scrolled, *seen.screen]) == 1
+
+
 def test_a_failure_of_every_scene_does_not_bury_the_table():
     seen = watch([*PRETEND, "0", "well"], size=(100, 60))
     text = "\n".join(seen.screen)
