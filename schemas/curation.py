@@ -36,6 +36,7 @@ HINGE_CATEGORIES = ("Bottle", "Box", "Bucket", "Laptop", "Pliers", "Scissors", "
 class Answer(BaseModel):
     """Base of answers of models and of what is made of them: unknown keys are ignored."""
 
+    # built at the first use: few of the processes that import answers ask a model
     model_config = ConfigDict(extra="ignore", frozen=True, populate_by_name=True, defer_build=True)
 
 

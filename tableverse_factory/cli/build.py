@@ -96,13 +96,11 @@ def build(
 
 def make_display(out: str, metrics: Path | None) -> "DisplayGroup":
     """Make the display of a build: its progress on the terminal, and a file for Prometheus if one is wanted."""
-    from rich.console import Console
-
-    from workers.progress.console import ProgressDisplay
+    from workers.progress.console import OrderedConsole, ProgressDisplay
     from workers.progress.prometheus import MetricsFile, dataset_name
     from workers.progress.tally import DisplayGroup
 
-    progress = ProgressDisplay(Console(stderr=True))
+    progress = ProgressDisplay(OrderedConsole(stderr=True))
     return DisplayGroup(progress, *(() if metrics is None else (MetricsFile(metrics, dataset_name(out)),)))
 
 

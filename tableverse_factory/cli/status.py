@@ -76,14 +76,12 @@ def status(
 def _follow(out: "StoragePath", every_s: float) -> None:
     import time
 
-    from rich.console import Console
-
     from tableverse_factory.dataset.journals import WORK
-    from workers.progress.console import ProgressDisplay
+    from workers.progress.console import OrderedConsole, ProgressDisplay
     from workers.progress.follow import BuildFollower
     from workers.state.lock import LOCK, describe_writer
 
-    with ProgressDisplay(Console()) as progress:
+    with ProgressDisplay(OrderedConsole()) as progress:
         build = BuildFollower(out)
         if build.read_tally().committed < build.shards and describe_writer(out / WORK / LOCK) is None:
             progress.note("as far as can be seen from here, no build is writing this dataset now")

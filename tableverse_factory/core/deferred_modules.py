@@ -18,9 +18,9 @@ class DeferredModule(ModuleType):
 
 @contextmanager
 def defer_modules(*names: str) -> Iterator[None]:
-    """Defer modules that nobody has imported yet, for the libraries that the block imports and for no one else.
+    """Defer modules that nobody has imported yet, for the libraries that the block imports.
 
-    A package stands before its modules.
+    Not for use while other threads import.
     """
     deferred = {name: DeferredModule(name) for name in names if name not in sys.modules}
     for name, module in deferred.items():

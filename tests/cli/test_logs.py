@@ -12,14 +12,13 @@ from itertools import pairwise
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from rich.console import Console
 
 from tableverse_factory.cli import progress_bar as counter_module
 from tableverse_factory.cli.progress_bar import count_progress
 from tests.helpers.fake_build_display import STAGES
 from tests.helpers.paths import ROOT
 from workers.progress import console as progress_module
-from workers.progress.console import ProgressDisplay, choose_log_interval_s
+from workers.progress.console import OrderedConsole, ProgressDisplay, choose_log_interval_s
 from workers.progress.tally import Tally
 
 SCENES = 100_000
@@ -50,7 +49,7 @@ def test_a_build_of_100_000_scenes_says_few_lines(clock, hours, most):
     """Every scene fails and is noted, as where a model is misconfigured."""
     log = io.StringIO()
     tally = Tally(STAGES, total=SCENES, before=0, shards=1563)
-    with ProgressDisplay(Console(file=log, width=120)) as progress:
+    with ProgressDisplay(OrderedConsole(file=log, width=120)) as progress:
         for scene in range(SCENES):
             clock.now += hours * 3600 / SCENES
             tally.ended["settle", "failed"] += 1

@@ -6,7 +6,7 @@ import time
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live_render import LiveRender
 
-from workers.progress.console import ProgressDisplay
+from workers.progress.console import OrderedConsole, ProgressDisplay
 from workers.progress.tally import Actors, Tally
 
 STAGES = ("manifest", "observe", "perceive", "place", "rectify", "settle", "curate", "export")
@@ -28,7 +28,7 @@ def main() -> None:
     if end == "slow":
         _draw_slowly()
     tally = Tally(STAGES, total=400, before=0, shards=4)
-    with ProgressDisplay(Console(stderr=True)) as progress:
+    with ProgressDisplay(OrderedConsole(stderr=True)) as progress:
         progress.note("starting Ray on this machine …")
         time.sleep(wait_s)
         tally.actors = {"perception": Actors(1, 2), "physics": Actors(2, 2)}
@@ -41,6 +41,8 @@ def main() -> None:
             tally.ended["settle", "dropped"] += step % 10 == 0
             if step % 5 == 0:
                 progress.note(f"scene_{step}: settle failed: \x1b[31mTypeError: {'x' * 300}")
+                if end == "slow":
+                    sys.stderr.write("a warning of a library\n")
             progress.show(tally)
             if step == 150 and end == "error":
                 raise ValueError("the disk is full")

@@ -4,12 +4,10 @@ import os
 import sys
 from pathlib import Path
 
-from rich.console import Console
-
 from tableverse_factory.core.config import load_config
 from tableverse_factory.core.storage.files import parse_path
 from workers.driver.signals import StopSignals
-from workers.progress.console import ProgressDisplay
+from workers.progress.console import OrderedConsole, ProgressDisplay
 from workers.run import BuildRequest, run_build
 
 
@@ -24,7 +22,7 @@ def main() -> None:
         workers=int(workers) if executor == "ray" else None,
         pipeline=os.environ.get("PIPELINES_OF_TEST", "tests.helpers.tiny_pipeline:PIPELINES"),
     )
-    with ProgressDisplay(Console(stderr=True)) as progress:
+    with ProgressDisplay(OrderedConsole(stderr=True)) as progress:
         summary = run_build(request, progress, StopSignals())
     sys.exit(128 + summary.signal if summary.signal else 0)
 

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from typing import IO, Any, Self
 
 from rich.console import Console, RenderableType
 from rich.live import Live
@@ -36,22 +37,40 @@ class _ElapsedTime:
         return Text(f"preparing, {format_duration(time.monotonic() - self._started)}", style="dim")
 
 
-class ProgressDisplay:
-    """Progress on the terminal while the block lasts (a `workers.progress.tally.Display`).
+class OrderedConsole(Console):
+    """Console whose prints wait for one another.
 
-    rich's own refreshing thread moves the cursor by the height of a table that a line printed at the same time has not
-    written yet, and two tables stay. So one lock orders all that is drawn.
+    A print beside a live table moves the cursor by the table's height. If two threads do so at once and the height
+    changes, the old table stays.
     """
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, *, stderr: bool = False, file: IO[str] | None = None, width: int | None = None) -> None:
+        self._order = threading.RLock()
+        super().__init__(stderr=stderr, file=file, width=width)
+
+    def __enter__(self) -> Self:
+        self._order.acquire()
+        super().__enter__()
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        try:
+            super().__exit__(*raised)
+        finally:
+            self._order.release()
+
+
+class ProgressDisplay:
+    """Progress on the terminal while the block lasts (a `workers.progress.tally.Display`)."""
+
+    def __init__(self, console: OrderedConsole) -> None:
         self._console = console
         # rich takes FORCE_COLOR for a terminal, but a log must not fill with cursor movements
         live = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
         self._started = self._shown = time.monotonic()
         self._live = Live(_ElapsedTime(self._started), console=console, auto_refresh=False) if live else None
-        self._drawing = threading.Lock()
         self._ended = threading.Event()
-        self._refreshing = threading.Thread(target=self._refresh, name="progress display", daemon=True)
+        self._refreshing: threading.Thread | None = None
         self._rate = ProgressRate()
         self._tally: Tally | None = None
         self._last_line = ""
@@ -60,12 +79,13 @@ class ProgressDisplay:
     def __enter__(self) -> "ProgressDisplay":
         if self._live:
             self._live.start()
+            self._refreshing = threading.Thread(target=self._refresh, args=[self._live], daemon=True)
             self._refreshing.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         """Leave the last state on the screen, if there was progress."""
-        if self._live:
+        if self._refreshing:
             self._ended.set()
             self._refreshing.join()
         if self._tally is not None and self._tally.accounted > self._tally.before:
@@ -73,7 +93,8 @@ class ProgressDisplay:
         elif self._live:
             self._live.update(Text(""))
         if self._live:
-            self._live.stop()
+            with self._console:
+                self._live.stop()
 
     def show(self, tally: Tally) -> None:
         """Draw, if enough time has passed since the last time."""
@@ -106,13 +127,12 @@ class ProgressDisplay:
             self._print(line)
 
     def _print(self, line: str) -> None:
-        with self._drawing:
-            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
-    def _refresh(self) -> None:
-        while self._live and not self._ended.wait(_DRAW_EVERY_S):
-            with self._drawing:
-                self._live.refresh()
+    def _refresh(self, live: Live) -> None:
+        while not self._ended.wait(_DRAW_EVERY_S):
+            with self._console:  # before the lock of `live`, as for every print: the other order would never end
+                live.refresh()
 
     def _render(self, tally: Tally, now: float) -> RenderableType:
         """Render the table if it fits, else one line."""

@@ -13,7 +13,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from tableverse_factory.core.text import sanitize_line
-from workers.progress.console import MAX_NOTES, ProgressDisplay
+from workers.progress.console import MAX_NOTES, OrderedConsole, ProgressDisplay
 from workers.progress.eta import ProgressRate
 from workers.progress.table import render_table
 from workers.progress.tally import Display, DisplayGroup, Tally
@@ -67,7 +67,7 @@ def open_display(display: Display | Literal["auto"] | None) -> AbstractContextMa
         return nullcontext(DisplayGroup())
     if display != "auto":
         return display if isinstance(display, AbstractContextManager) else nullcontext(display)
-    return NotebookDisplay() if _is_notebook() else ProgressDisplay(Console(stderr=True))
+    return NotebookDisplay() if _is_notebook() else ProgressDisplay(OrderedConsole(stderr=True))
 
 
 def _is_notebook() -> bool:

@@ -60,7 +60,7 @@ def predict_picture(
     """Predict from a picture and its camera; with a sensor's `depth` [m], 0 where unknown, the net reads that too.
 
     A bare picture is seen twice, the second time mirrored and larger, and what both say is averaged.
-    The latest prediction is remembered: two stages ask the same of one picture.
+    The latest prediction is remembered: two stages ask the same of a bare picture, and two detectors of a sensed one.
 
     Raises:
         WeightsError: if the net of `weights`, empty for the one of this package, cannot be loaded.
@@ -78,10 +78,11 @@ def predict_picture(
 def predict_window(
     color: Picture, camera: Camera, depth: DepthImage, window: tuple[slice, slice], weights: str = ""
 ) -> PicturePrediction:
-    """Predict what a sensor shows within a window of rows and columns; around it is neither object nor table.
+    """Predict what a sensor shows within a window of rows and columns; `depth` is in metres, 0 where unknown.
 
-    The net's pixels all go to the window, which grows to half of the picture's length and height at least. Maps are
-    those of the whole picture, as fine as in the window.
+    All of the net's pixels go to the window, which is cut to the picture and grows to half of its height and width
+    at least. The maps are those of the whole picture, as fine as in the window; outside of it is neither object nor
+    table, at the median depth.
 
     Raises:
         WeightsError, ModelError: as `predict_picture`.

@@ -35,9 +35,9 @@ def send_at_once(_deadline: float) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-def _no_authorities() -> ssl.SSLContext:
-    """Make the context of a client that speaks http alone: it trusts nobody, and saves 25 ms of reading authorities."""
-    return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+def choose_authorities(url: str) -> ssl.SSLContext | bool:
+    """Choose whom to trust: True for the usual authorities; for http nobody, which saves 25 ms of reading them."""
+    return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if httpx.URL(url).scheme == "http" else True
 
 
 class BoundedClient(httpx.AsyncClient):
@@ -61,7 +61,7 @@ class BoundedClient(httpx.AsyncClient):
                 auth=lambda request: request,
                 timeout=timeout,
                 trust_env=not is_loopback(endpoint.base_url),
-                verify=True if endpoint.base_url.startswith("https:") else _no_authorities(),
+                verify=choose_authorities(endpoint.base_url),
             )
         except (ImportError, ValueError, OSError, httpx.InvalidURL) as error:
             # Messages other than that of a missing package may quote the proxy's password.

@@ -36,7 +36,7 @@ MAX_STEP = np.array([0.006] * 3 + [np.radians(2.0)] * 3)
 REACH_M = 0.012
 WISHED_REACH_M = 0.025  # the same for a part and its carrier, which noise may have moved this far apart [m]
 STEPS, LAST_STEPS = 10, 5
-MAX_WORK = 3e9  # of all steps, in constraints times unknowns squared: thirty times that of ten objects in one place
+MAX_WORK = 3e9  # of a layout, in constraints times unknowns squared: thirty times that of ten objects in one place
 MAX_ENTRIES = 2e7  # corners near planes times unknowns of a step, at most: 160 MB; ten boxes in one place have 2e4
 MAX_WAYS_OUT = 5000  # entangled pairs times parts of a layout: some seconds; a dozen objects have at most 800
 CONVERGED = 2e-5
@@ -49,16 +49,21 @@ UPWARD = 0.3  # least vertical part of the normal of a wished contact
 UNIT = 1e-3  # unit of the constraints, so that all numbers are near one [m]
 
 
+def make_effort() -> Effort:
+    """Make the budget of a layout."""
+    return SolverEffort(MAX_WORK), SolverEffort(MAX_WAYS_OUT)
+
+
 def relax_layout(
-    parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float
+    parts: Sequence[RigidPart], support: SupportRelation, clearance_m: float, effort: Effort
 ) -> tuple[list[RigidPart], set[int]]:
     """Find the least motion of every cluster, where those that would meet are joined; standing parts are upright.
 
-    All share one budget, the smallest first, so that a heap does not use up what the others need. Returns the parts,
-    and which of them have not been moved because the least motion of their cluster is too much work or was not found.
+    All spend from one budget, the smallest first, so that a heap does not use up what the others need. Returns the
+    parts, and which of them have not been moved because the least motion of their cluster is too much work or was not
+    found.
     """
     pairs = set(support.pairs) | _find_near_pairs(parts, [(i,) for i in range(len(parts))], LINK_M)
-    effort = SolverEffort(MAX_WORK), SolverEffort(MAX_WAYS_OUT)
     known: dict[Cluster, list[RigidPart] | None] = {}
     while True:
         moved, solved = list(parts), []

@@ -213,17 +213,38 @@ def test_what_leans_stays_leaning() -> None:
         assert np.abs(offsets(result)).max() < 0.008
 
 
-@pytest.mark.parametrize(("angle", "leans"), [(-3.5, True), (-0.5, False)])
-def test_what_could_stand_leans_where_it_moves_less_so(angle: float, leans: bool) -> None:
+def make_carton_over_board(name: str, angle: float = -3.5, y: float = 0.0) -> list[PlacedObject]:
     """A carton over the rim of a board: that it lies on it shows only in a tilt beyond the noise."""
-    board = placed("board", box(0.06, 0.2, 0.005), (0.062, 0, 0.0025))
+    board = placed(f"{name}_board", box(0.06, 0.2, 0.005), (0.062, y, 0.0025))
     height = 0.02 + 0.05 * np.sin(np.radians(abs(angle)))
-    carton = tilted(placed("carton", box(0.1, 0.08, 0.04), (0.0, 0.0, height)), 0.0, angle)
-    assert not read_support([part(board), part(carton)], CONFIG.contact_m).pairs
-    result = rectified([board, carton])
-    assert smallest_gap(result.parts) >= CONFIG.clearance_m - 1e-6
+    return [board, tilted(placed(name, box(0.1, 0.08, 0.04), (0.0, y, height)), 0.0, angle)]
+
+
+@pytest.mark.parametrize("clearance_m", [CONFIG.clearance_m, 0.003])
+@pytest.mark.parametrize(("angle", "leans"), [(-3.5, True), (-0.5, False)])
+def test_what_could_stand_leans_where_it_moves_less_so(angle: float, leans: bool, clearance_m: float) -> None:
+    items = make_carton_over_board("carton", angle)
+    parts = [part(item) for item in items]
+    assert not read_support(parts, CONFIG.contact_m).pairs
+    result = rectify_jointly(parts, CONFIG.model_copy(update={"clearance_m": clearance_m}))
+    assert smallest_gap(result.parts) >= clearance_m - 1e-6
     assert len(result.groups) == (1 if leans else 2)
-    assert (tilt_deg(result.parts[1].pose_now(carton.pose).quaternion_wxyz) > 2.5) == leans
+    assert (tilt_deg(result.parts[1].pose_now(items[1].pose).quaternion_wxyz) > 2.5) == leans
+
+
+def test_each_of_several_may_lean_whatever_they_are_called() -> None:
+    """Each carton lies over two boards and leans on one: the other is not tried, and does not count as a trial."""
+    for names in ("abcdef", "fedcba"):
+        items: list[PlacedObject] = []
+        for k, name in enumerate(names):
+            board, carton = make_carton_over_board(name, y=0.205 * k)
+            half = box(0.06, 0.095, 0.005)
+            x, y, z = board.pose.position
+            items += [placed(f"{name}_{side}", half, (x, y + aside, z)) for side, aside in enumerate((-0.05, 0.05))]
+            items.append(carton)
+        result = rectified(items)
+        pairs = zip(result.parts[2::3], items[2::3], strict=True)
+        assert all(tilt_deg(moved.pose_now(item.pose).quaternion_wxyz) > 2.5 for moved, item in pairs)
 
 
 def test_what_carries_another_does_not_lean() -> None:

@@ -120,12 +120,12 @@ def fill_holes(ids: IdImage) -> IdImage:
 
 def to_detections(ids: IdImage, holders: Mapping[int, int]) -> DetectionResult:
     """Turn the result of `segment_depth` into candidates without names, in the order of their ids."""
-    boxes = enumerate(map(_to_box, ndimage.find_objects(ids)), start=1)
+    boxes = enumerate(map(to_box, ndimage.find_objects(ids)), start=1)
     things = (Candidate("object", 1.0, box, k, holders[k] - 1 if k in holders else None) for k, box in boxes)
     return DetectionResult(tuple(things), ids=ids)
 
 
-def _to_box(window: tuple[slice, slice] | None) -> PixelBox:
+def to_box(window: tuple[slice, slice] | None) -> PixelBox:
     """Convert a window to a box; all zero for an id without pixels."""
     rows, columns = window or (slice(0, 0), slice(0, 0))
     return float(columns.start), float(rows.start), float(columns.stop), float(rows.stop)

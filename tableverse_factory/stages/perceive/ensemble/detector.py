@@ -1,5 +1,6 @@
 """The detector `ensemble`: each group by depth alone or by both, as the boundaries that our net sees decide."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,13 +15,14 @@ from schemas.geometry import IdImage, Mask
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
-from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth
+from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth, to_box
 from tableverse_factory.stages.perceive.ensemble.fused import detect_fused, upsample_map
-from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_view
+from tableverse_factory.stages.perceive.picture.detector import predict_view
 
-REACH_PX = 2  # a boundary this near is that of a border
+REACH_PX = 2  # a boundary this near is that of a border: the net sees every second or third pixel of a picture
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
-LEAST_PROBABILITY = 0.02
+LEAST_PROBABILITY = 0.02  # and most certainty: so that no single pixel decides
+MIN_LEFT = 0.5  # share of an object of the second answer that the first must leave, else it is none
 COMMON_SHARE = 0.3  # of the smaller of two objects, one of each answer, from which they are of one group
 # Log-likelihood per pixel of border by which the answer of both must be better, as depth is measured; not where it has
 # more objects, as a sensor joins what touches and misses what is thin but sees no seams where there are none.
@@ -31,20 +33,20 @@ Probabilities = Float32[np.ndarray, "h w"]
 
 def detect_with_both(view: TableView, config: Config, services: Services) -> DetectionResult:
     """Detect objects by depth, and by depth and the net together, and choose one answer for each group."""
-    answers = detect_from_depth(view, config, services), detect_fused(view, config)
-    ids = [_get_ids(answer) for answer in answers]
     seen = predict_view(view, config.perceive.detector_weights)
+    answers = detect_from_depth(view, config, services), detect_fused(view, seen)
+    ids = [_get_ids(answer) for answer in answers]
     boundary = upsample_map(seen.boundary, view.valid.shape)
     contained = [_list_contained(answer) for answer in answers]
     numbers = group_objects(ids[0], ids[1], contained[0], contained[1])
     groups = [number[own] for number, own in zip(numbers, ids, strict=True)]
     takes_second = np.zeros(max(int(each.max()) for each in groups) + 1, dtype=bool)
-    for group in range(1, len(takes_second)):
+    for group in np.setdiff1d(groups, 0):
         window = expand_window((groups[0] == group) | (groups[1] == group), 2 * REACH_PX)
         own = [np.where(each[window] == group, part[window], 0) for each, part in zip(groups, ids, strict=True)]
         inside = ndimage.binary_dilation((own[0] > 0) | (own[1] > 0), iterations=REACH_PX)
         takes_second[group] = prefer_second(own, boundary[window], inside)
-    return replace(_merge_answers(answers, ids, groups, takes_second), shown=find_standing(view, seen))
+    return replace(_merge_answers(answers, ids, groups, takes_second), shown=answers[1].shown)
 
 
 def _list_contained(answer: DetectionResult) -> list[tuple[int, int]]:
@@ -61,18 +63,23 @@ def group_objects(
 ) -> tuple[IdImage, IdImage]:
     """Group objects of two answers that overlap, and contents with what holds them in either answer.
 
-    Returns the number of the group of each id, from 1, and 0 for no object.
+    `contained_in_…` lists the ids of contents and of what holds them. Returns the number of the group of each id of
+    either answer, from 1, and 0 for no object. Shapes (n + 1,) and (m + 1,), where n and m are the highest ids.
     """
-    sizes = [np.bincount(ids.ravel()) for ids in (first, second)]
-    counts = [len(size) - 1 for size in sizes]
+    counts = [
+        max(int(ids.max(initial=0)), *(max(pair) for pair in contained), 0)
+        for ids, contained in ((first, contained_in_first), (second, contained_in_second))
+    ]
     total = sum(counts)
     if not total:
         return np.zeros(1, np.int32), np.zeros(1, np.int32)
-    pairs, common = np.unique(np.stack([first, second])[:, (first > 0) & (second > 0)], axis=1, return_counts=True)
-    shared = pairs[:, common > COMMON_SHARE * np.minimum(sizes[0][pairs[0]], sizes[1][pairs[1]])]
+    numbers, shape = first.astype(np.int64) * (counts[1] + 1) + second, (counts[0] + 1, counts[1] + 1)
+    common = np.bincount(numbers.ravel(), minlength=math.prod(shape)).reshape(shape)
+    smaller = np.minimum(common.sum(axis=1)[:, None], common.sum(axis=0))
+    shared = np.argwhere(common[1:, 1:] > COMMON_SHARE * smaller[1:, 1:]) + 1
     links = np.concatenate(
         [
-            shared.T + np.array([0, counts[0]]),
+            shared + np.array([0, counts[0]]),
             np.array(contained_in_first, dtype=np.intp).reshape(-1, 2),
             np.array(contained_in_second, dtype=np.intp).reshape(-1, 2) + counts[0],
         ]
@@ -83,9 +90,10 @@ def group_objects(
 
 
 def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
-    """Decide whether the second of two segmentations explains the boundaries within so much better that it is taken.
+    """Decide whether the second of two segmentations explains the boundaries so much better that it is taken.
 
-    `boundary` is their probability at each pixel.
+    `boundary` is their probability at each pixel, of which those `inside` count. A second that has more objects need
+    only be better at all, see `FAVOUR`.
     """
     borders = [_find_borders(each) & inside for each in ids]
     first, second = (_score_borders(border, boundary, inside) for border in borders)
@@ -123,7 +131,7 @@ def _merge_answers(
         (source, index)
         for source, answer in enumerate(answers)
         for index, candidate in enumerate(answer.candidates)
-        if (shares[source] == candidate.instance).any()
+        if _measure_share(shares[source], ids[source], candidate.instance) >= MIN_LEFT
     ]
     instances = {key: k for k, key in enumerate(kept, start=1)}
     merged, candidates = np.zeros_like(ids[0]), []
@@ -133,7 +141,14 @@ def _merge_answers(
         holder = None if candidate.container is None else instances.get((source, candidate.container))
         container = None if holder is None else holder - 1
         candidates.append(replace(candidate, instance=instance, container=container))
-    return DetectionResult(tuple(candidates), ids=merged)
+    boxes = map(to_box, ndimage.find_objects(merged))
+    boxed = (replace(candidate, box=box) for candidate, box in zip(candidates, boxes, strict=True))
+    return DetectionResult(tuple(boxed), ids=merged)
+
+
+def _measure_share(left: IdImage, ids: IdImage, instance: int) -> float:
+    """Measure the share of an object that is left; 0 for one without pixels."""
+    return float((left == instance).sum() / max((ids == instance).sum(), 1))
 
 
 def _get_ids(answer: DetectionResult) -> IdImage:

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float32
 from PIL import Image
 
-from schemas.config import Config
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.models.picture.instances import sum_affinities
 from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction, take_nearest
@@ -42,7 +41,7 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import (
 )
 from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface, compute_surface
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
-from tableverse_factory.stages.perceive.picture.detector import find_standing, predict_view
+from tableverse_factory.stages.perceive.picture.detector import find_standing
 
 SURELY_OBJECT = 0.6  # probability of an object from which a pixel is one that the sensor does not see rise
 # Strength of a border up to which two regions are one; the best of eight on rendered tables, and a sum of fractions of
@@ -51,11 +50,15 @@ FUSED_BELOW = 1.3125
 AFFINITY_WEIGHT = 0.35  # strength in depth that a logit of the net outweighs: logistic regression on 32 such tables
 
 
-def detect_fused(view: TableView, config: Config) -> DetectionResult:
-    """Detect objects as unnamed candidates, the largest first, by a sensor's depth and by the net together."""
-    seen = predict_view(view, config.perceive.detector_weights)
+def detect_fused(view: TableView, seen: PicturePrediction) -> DetectionResult:
+    """Detect objects as unnamed candidates, the largest first, by a sensor's depth and what the net has `seen`."""
+    standing = find_standing(view, seen)
+    return replace(_detect(view, seen, standing), shown=standing)
+
+
+def _detect(view: TableView, seen: PicturePrediction, standing: Mask) -> DetectionResult:
     shape = view.valid.shape
-    mask = find_standing(view, seen) | (upsample_map(seen.label[OBJECT], shape) > SURELY_OBJECT)
+    mask = standing | (upsample_map(seen.label[OBJECT], shape) > SURELY_OBJECT)
     if not mask.any():
         return to_detections(np.zeros(shape, dtype=np.int32), {})
     window = find_working_window(mask, WORKING_PIXELS, MARGIN_PX)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from schemas.config import Config
 from schemas.geometry import IdImage, Mask
@@ -32,8 +33,8 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import (
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
 
 SURELY_OTHER = 0.9  # probability of neither object nor table from which what rises over the table is no object
-
-SURROUNDED = 0.05  # of the picture's length, on each side of what rises
+MARGIN_SHARE = 0.05  # of the picture's length, on each side of what rises
+SPECK_PX = 2  # half the width of the holes that every sensor has between readings
 
 
 def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
@@ -71,12 +72,17 @@ def find_table_top(item: Observation, weights: str) -> Mask:
 
 
 def predict_view(view: TableView, weights: str) -> PicturePrediction:
-    """Ask the net; with a sensor, about what rises over the table alone, so that small things have more pixels."""
+    """Ask the net; with a sensor, about the part where objects may be alone, so that small ones have more pixels.
+
+    They may be where something rises, and where the table has holes: a sensor reads nothing on glass.
+    """
     item = view.observation
-    if item.bend or not view.raised.any():
+    unread = ndimage.binary_fill_holes(view.on_plane | view.raised) & ~view.valid
+    possible = view.raised | ndimage.binary_opening(unread, iterations=SPECK_PX)
+    if item.bend or not possible.any():
         return predict_observation(item, weights)
-    margin = round(SURROUNDED * max(item.depth.shape))
-    return predict_window(item.color, item.camera, item.depth, expand_window(view.raised, margin), weights)
+    margin = round(MARGIN_SHARE * max(item.depth.shape))
+    return predict_window(item.color, item.camera, item.depth, expand_window(possible, margin), weights)
 
 
 def predict_observation(item: Observation, weights: str) -> PicturePrediction:

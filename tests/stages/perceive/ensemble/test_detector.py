@@ -86,21 +86,56 @@ def test_objects_that_overlap_are_one_group_and_neighbours_are_not() -> None:
     assert [each.tolist() for each in nothing] == [[0], [0]]
 
 
+def test_ids_without_pixels_have_groups_too() -> None:
+    first, second = np.array([[1, 1, 0, 3]], dtype=np.int32), np.array([[0, 0, 0, 1]], dtype=np.int32)
+    of_first, of_second = group_objects(first, second, [(5, 1)])
+    assert of_first[5] == of_first[1] != of_first[3] == of_second[1]
+    assert len(set(of_first[1:].tolist())) == 4
+
+
+BOX = (0.0, 0.0, 1.0, 1.0)
+
+
+def merge(
+    ids: list[list[int]], groups: list[list[int]], candidates: list[list[Candidate]], takes_second: list[bool]
+) -> DetectionResult:
+    """Merge two answers about a picture of one row."""
+    rows = [np.array([own], dtype=np.int32) for own in ids]
+    answers = [DetectionResult(tuple(each), ids=own) for each, own in zip(candidates, rows, strict=True)]
+    numbers = [np.array([own], dtype=np.int32) for own in groups]
+    return _merge_answers(answers, rows, numbers, np.array(takes_second))
+
+
 def test_every_pixel_comes_from_the_answer_of_its_group_and_containers_stay() -> None:
-    """The second answer's lid lies partly on the first one's cup, which stays; contents come before their container."""
-    ids = [np.array([[2, 1, 1, 0, 3, 3, 0]], dtype=np.int32), np.array([[1, 1, 3, 0, 3, 2, 2]], dtype=np.int32)]
-    groups = [np.array([[1, 1, 1, 0, 2, 2, 0]], dtype=np.int32), np.array([[1, 1, 2, 0, 2, 2, 2]], dtype=np.int32)]
-    box = (0.0, 0.0, 1.0, 1.0)
-    first = [Candidate(name, 1.0, box, k) for k, name in enumerate(("spoon", "cup", "gone"), start=1)]
-    first[0] = replace(first[0], container=1)
-    second = [Candidate(name, 1.0, box, k) for k, name in enumerate(("lost", "box", "lid"), start=1)]
-    second[1] = replace(second[1], container=0)
-    answers = [DetectionResult(tuple(each), ids=own) for each, own in zip((first, second), ids, strict=True)]
-    merged = _merge_answers(answers, ids, groups, np.array([False, False, True]))
+    """The second answer's box lies partly on the first one's cup, which stays, as does the spoon in it."""
+    first = [Candidate(name, 1.0, BOX, k) for k, name in enumerate(("cup", "spoon", "gone"), start=1)]
+    second = [Candidate(name, 1.0, BOX, k) for k, name in enumerate(("lost", "lid", "box"), start=1)]
+    merged = merge(
+        [[2, 1, 1, 0, 3, 3, 0], [1, 1, 3, 0, 3, 2, 2]],
+        [[1, 1, 1, 0, 2, 2, 0], [1, 1, 2, 0, 2, 2, 2]],
+        [
+            [first[0], replace(first[1], container=0), first[2]],
+            [second[0], second[1], replace(second[2], container=0)],
+        ],
+        [False, False, True],
+    )
     assert merged.ids is not None
     assert merged.ids.tolist() == [[2, 1, 1, 0, 4, 3, 3]]
-    told = [(item.label, item.instance, item.container) for item in merged.candidates]
-    assert told == [("spoon", 1, 1), ("cup", 2, None), ("box", 3, None), ("lid", 4, None)]
+    told = [(item.label, item.instance, item.container, item.box) for item in merged.candidates]
+    assert told == [
+        ("cup", 1, None, (1.0, 0.0, 3.0, 1.0)),
+        ("spoon", 2, 0, (0.0, 0.0, 1.0, 1.0)),
+        ("lid", 3, None, (5.0, 0.0, 7.0, 1.0)),
+        ("box", 4, None, (4.0, 0.0, 5.0, 1.0)),
+    ]
+
+
+def test_a_sliver_of_an_object_is_none() -> None:
+    candidates = [[Candidate("box", 1.0, BOX, 1)], [Candidate("jug", 1.0, BOX, 1)]]
+    merged = merge(
+        [[1, 1, 1, 0, 0], [0, 1, 1, 1, 0]], [[1, 1, 1, 0, 0], [0, 2, 2, 2, 0]], candidates, [False, False, True]
+    )
+    assert [item.label for item in merged.candidates] == ["box"]
 
 
 @pytest.mark.parametrize(("bend", "chosen"), [(0.0, "ensemble"), (0.015, "picture")])

@@ -1,6 +1,7 @@
 """A bare picture through `observe` and `perceive`: its table, its boxes, and where its metres come from."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from schemas.objects import PerceivedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import ConfigError, ModelAccessError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.models.picture.predict import PicturePrediction
+from tableverse_factory.models.picture.instances import upsample_ids
+from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
@@ -23,6 +25,7 @@ from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.picture.detector import (
     detect_in_picture,
     find_standing,
+    predict_view,
     segment_boxes_in_picture,
 )
 from tableverse_factory.stages.perceive.recorded import record_segmenter
@@ -137,6 +140,20 @@ def test_the_table_of_boxes_reaches_beyond_the_objects() -> None:
     found = segment_boxes_in_picture(view, DetectionResult((Candidate("box", 1.0, box),)), Config()) == TABLE_ID
     assert found[ids == 1].mean() > 0.8
     assert found[ids > 1].mean() < 0.1
+
+
+@pytest.mark.heavy
+def test_what_a_sensor_reads_nothing_on_is_looked_at_too() -> None:
+    """As on glass; the near box alone rises, in a part of the picture that the far one is no part of."""
+    seen, ids = look(THINGS, POSE, floor_z=-0.7, wall_y=1.5)
+    far = ids == ids[ids > 1].min()
+    holed = replace(seen, depth=np.where(far, np.float32(0.0), seen.depth))
+    view = find_table(holed, np.random.default_rng(0))
+    assert not isinstance(view, Dropped)
+    assert not (view.raised & far).any()
+    found = predict_view(view, "")
+    objects = upsample_ids((found.label[OBJECT] > 0.5).astype(np.int32), far.shape) > 0
+    assert (objects & far).sum() > 0.8 * far.sum()
 
 
 @pytest.mark.parametrize(("other", "stands"), [(0.05, True), (0.8, True), (0.95, False)])
