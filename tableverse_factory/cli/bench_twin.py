@@ -40,7 +40,7 @@ def bench_twin(
     from tableverse_factory.evaluation.bench.twin import find_captures, measure_twin, summarize_twins
 
     settings = load_config(config)
-    rows = find_captures(captures, settings)
+    rows = find_captures(captures, settings, dataset)
     measure = partial(measure_twin, config=settings, dataset=dataset, pictures=pictures)
     scores = []
     with count_progress("captures", len(rows)) as done:

@@ -106,6 +106,7 @@ def make_display(out: str, metrics: Path | None) -> "DisplayGroup":
 
 def report_summary(summary: "BuildSummary", out: str) -> None:
     """Print how a build ended, and end the process with its exit code unless that is 0."""
+    from tableverse_factory.cli.failures import format_dropped
     from tableverse_factory.core.text import pluralize
     from tableverse_factory.dataset.model_costs import format_cost
     from workers.driver.signals import STOPPED_MESSAGE
@@ -128,8 +129,10 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
     if state.done:
         place = shlex.quote(str(out))
         print(f"look at them: tableverse view {place}, or a gallery of files: tableverse report {place}")
-    if state.failed or (state.dropped and not state.done):
+    if state.failed:
         print(f"see why: tableverse failures {shlex.quote(str(out))}")
+    if state.dropped:
+        print(format_dropped(state.dropped, str(out)))
     if tally.postponed:
         later = pluralize(tally.postponed, "scene")
         print(f"left for a later run: {later}, because a model did not answer; run it again for them")

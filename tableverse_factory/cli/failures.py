@@ -1,5 +1,6 @@
 """`tableverse failures`: reasons of lost scenes, and how to retry them."""
 
+import shlex
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -87,7 +88,13 @@ def _check_filters(lost: list["LostScene"], ran: list[str], stage: str | None, r
 def _format_none_failed(lost: list["LostScene"], out: str) -> str:
     if not (dropped := sum(scene.status == "dropped" for scene in lost)):
         return "none"
-    return f"none failed; {dropped} {'was' if dropped == 1 else 'were'} dropped: tableverse status {out}"
+    return f"none failed\n{format_dropped(dropped, out)}"
+
+
+def format_dropped(count: int, out: str) -> str:
+    """Format how many scenes were dropped, and the command that lists why."""
+    which = "--where \"status = 'dropped'\" --columns scene_id,reason,detail"
+    return f"why {count} {'was' if count == 1 else 'were'} dropped: tableverse query {shlex.quote(out)} {which}"
 
 
 def _print_scenes(selected: list["LostScene"], nothing: str) -> None:

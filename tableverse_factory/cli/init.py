@@ -10,7 +10,8 @@ from tableverse_factory.cli.options import require_local_path
 _CAPTURES_TEXT = """\
 # Your captures
 
-They belong in `captures/`, each in a folder of its own with three files, and a fourth for those who pass scenes on:
+They belong in `captures/`. A bare photograph is a file there, PNG or JPEG. A capture with depth is a folder of its own
+with three files, and a fourth for those who pass scenes on:
 
 | file | what it holds |
 |---|---|

@@ -10,6 +10,7 @@ import mujoco
 
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import pluralize
 from tableverse_factory.dataset.scene_meta import SceneMeta, read_meta
 from tableverse_factory.dataset.trajectory_files import strip_motions
 from tableverse_factory.physics.mjcf.load import load_model
@@ -107,7 +108,7 @@ def _check_files(files: Mapping[str, bytes], meta: SceneMeta) -> list[str]:
     found = compute_file_digests({name: data for name, data in exported.items() if name != "meta.json"})
     names = sorted(set(found) | set(meta.files))
     changed = [name for name in names if found.get(name) != meta.files.get(name)]
-    return [f"{len(changed)} files are not those that were exported: {', '.join(changed[:3])}"] if changed else []
+    return [f"{pluralize(len(changed), 'file')} changed since the export: {', '.join(changed[:3])}"] if changed else []
 
 
 def _check_state(measured: Measurement, epsilon_m: float) -> list[str]:

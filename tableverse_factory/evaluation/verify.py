@@ -65,7 +65,7 @@ def verify_scenes(path: str, jobs: int, trajectories: bool = False, robot: str |
             ) from None
     done = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=["scene_id"])
     if not done.num_rows:
-        raise InputError(f"{path}: no finished scene to verify; see `tableverse failures {path}`")
+        raise InputError(f"{path}: no finished scene to verify; see `tableverse status {path}`")
     if trajectories and not dataset.trajectories.count_rows():
         raise InputError(f"{path}: no trajectories to replay; `tableverse trajectories {path}` adds them")
     _open_dataset.cache_clear()  # the dataset may have changed since an earlier call

@@ -37,7 +37,7 @@ def verify_in_engine(path: str, engine: str, device: str | None = None) -> Itera
     columns = ["scene_id", "n_objects", "epsilon_m"]
     rows = dataset.scenes.to_table(filter=pc.field("status") == "done", columns=columns).to_pylist()
     if not rows:
-        raise InputError(f"{path}: no finished scene to verify; see `tableverse failures {path}`")
+        raise InputError(f"{path}: no finished scene to verify; see `tableverse status {path}`")
     rows.sort(key=lambda row: (row["n_objects"], row["scene_id"]))
     name, size, measure = ENGINES[engine]
     for first in range(0, len(rows), size):

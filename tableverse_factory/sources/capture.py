@@ -1,5 +1,6 @@
 """Capture folder: `color.png` (or .jpg), `depth.png`, `camera.json`, and recorded answers beside them."""
 
+import json
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -107,7 +108,7 @@ def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> fl
         raise InputError(f"{CAMERA_NAME} lacks {key}", "bad_intrinsics")
     number = parse_finite(value[key])
     if number is None or not low <= number <= high:
-        given = f"{key} is {str(value[key])[:80]!r}"
+        given = f"{key} is {json.dumps(value[key])[:80]}"
         raise InputError(f"{CAMERA_NAME}: {given}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
     return number
 

@@ -2,8 +2,9 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
@@ -28,6 +29,7 @@ from tableverse_factory.sources.urls.fetch_lists import NO_LISTS, NO_ORIGIN, Fet
 from tableverse_factory.sources.urls.image_filter import FilterCriteria, ImageStats, filter_rows, measure_image
 
 MAX_SIDECAR_BYTES = 64 * 1024
+_SOURCE_KEYS = ("source", "licence", "known_length")
 _SLUG_CHARS = 40
 
 
@@ -208,17 +210,29 @@ def _read_provenance(entry: ManifestEntry, origin: Origin) -> tuple[str, str, Kn
     uri = next((candidate for candidate in candidates if exists(candidate)), None)
     if uri is None:
         return "", "", None
-    value = parse_json(read_bytes(uri, MAX_SIDECAR_BYTES, "bad_source"), "source.json", "bad_source")
+    name = sanitize_line(uri.rpartition("/")[2], 80)
+    value = parse_json(read_bytes(uri, MAX_SIDECAR_BYTES, "bad_source"), name, "bad_source")
+    if not isinstance(value, dict):
+        raise InputError(f'{name}: give {{"source": …, "licence": …}}', "bad_source")
+    value = {"licence" if key == "license" else key: given for key, given in value.items()}
+    _check_spelling(value, name)
     texts = []
     for key, limit in (("source", 2048), ("licence", 512)):
-        text = value.get(key, "") if isinstance(value, dict) else None
+        text = value.get(key, "")
         if not isinstance(text, str) or len(text) > limit:
-            raise InputError(f'source.json: give {{"{key}": text of at most {limit} characters}}', "bad_source")
+            raise InputError(f"{name}: {key} is no text of at most {limit} characters", "bad_source")
         texts.append(sanitize_line(text, limit))
     given = value.get("known_length")
     if given is not None and entry.kind is SceneKind.LAYOUT:
-        raise InputError("source.json: a layout is given in metres, so known_length has no use: leave it out", REASON)
-    return texts[0], texts[1], None if given is None else read_known_length(given, "source.json: known_length")
+        raise InputError(f"{name}: a layout is given in metres, so known_length has no use: leave it out", REASON)
+    return texts[0], texts[1], None if given is None else read_known_length(given, f"{name}: known_length")
+
+
+def _check_spelling(value: Mapping[str, object], name: str) -> None:
+    """Refuse keys that look like a misspelt one; others are the user's own."""
+    for key in sorted(value.keys() - _SOURCE_KEYS):
+        if close := get_close_matches(key.lower(), _SOURCE_KEYS, n=1, cutoff=0.8):
+            raise InputError(f"{name}: {sanitize_line(key, 60)!r} is no key: did you mean {close[0]}?", "bad_source")
 
 
 def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:

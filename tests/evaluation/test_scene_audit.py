@@ -57,8 +57,8 @@ def test_an_untouched_scene_passes_with_equal_figures(scene: ExportedScene) -> N
 @pytest.mark.parametrize(
     ("name", "old", "new", "found"),
     [
-        ("scene.xml", b'mass="0.2"', b'mass="0.3"', "not those that were exported: scene.xml"),
-        ("assets/obj_000.obj", b"0.0500000", b"0.0530000", "not those that were exported: assets/obj_000.obj"),
+        ("scene.xml", b'mass="0.2"', b'mass="0.3"', "1 file changed since the export: scene.xml"),
+        ("assets/obj_000.obj", b"0.0500000", b"0.0530000", "1 file changed since the export: assets/obj_000.obj"),
         ("meta.json", b'"at_rest": true', b'"at_rest": false', "at_rest: certificate says False"),
         ("meta.json", b"tableverse-scene-1", b"tableverse-scene-9", "this version reads"),
         ("meta.json", b'"certificate": {', b'"certificate": {"x": 1,', "meta.json is not of a scene"),

@@ -284,6 +284,21 @@ def test_bounds_are_those_of_the_configuration(tmp_path):
     assert rows_of(tmp_path, bounds=ObserveConfig(max_file_bytes=100))[0].rejected == "file_too_large"
 
 
+@pytest.mark.parametrize(
+    ("note", "licence", "detail"),
+    [
+        ('{"license": "MIT"}', "MIT", ""),
+        ('{"Licence": "MIT"}', "", "b.source.json: 'Licence' is no key: did you mean licence?"),
+        ('{"known_lenght": {}}', "", "b.source.json: 'known_lenght' is no key: did you mean known_length?"),
+    ],
+)
+def test_a_misspelt_key_is_not_passed_over(tmp_path, note, licence, detail):
+    write_picture(tmp_path / "b.png", 1)
+    (tmp_path / "b.source.json").write_text(note)
+    [row] = make_manifest([str(tmp_path)], ObserveConfig()).rows
+    assert (row.licence, row.rejected_detail) == (licence, detail)
+
+
 def test_source_and_licence_come_from_the_sidecar(tmp_path):
     note = '{"source": "https://example.org/1", "licence": "CC-BY-4.0", "more": 1}'
     (write_capture(tmp_path / "c", 1) / "source.json").write_text(note)

@@ -73,12 +73,20 @@ class TwinPair(Frozen):
     shown: IdImage
 
 
-def find_captures(folder: Path, config: Config) -> list[ImageRow]:
-    """List the sound captures of a folder, sorted by name; raise `no_scenes` if there are none."""
+def find_captures(folder: Path, config: Config, dataset: str = "") -> list[ImageRow]:
+    """List the sound captures of a folder, sorted by name.
+
+    Raises:
+        InputError: `no_scenes`, if there are none, or none is in the dataset that is given.
+    """
     rows = make_manifest([str(folder)], config.observe).rows
     captures = sorted((r for r in rows if r.kind is SceneKind.CAPTURE and not r.rejected), key=lambda r: r.name)
     if not captures:
         raise InputError(f"{folder}: no captures; each is a folder with color.png, depth.png, camera.json", "no_scenes")
+    if dataset:
+        known = set(open_dataset(dataset).scenes.to_table(columns=["scene_id"])["scene_id"].to_pylist())
+        if known.isdisjoint(row.scene_id for row in captures):
+            raise InputError(f"{dataset}: no scene of a capture in {folder}", "no_scenes")
     return captures
 
 

@@ -58,7 +58,8 @@ def test_nothing_failed_is_said(run, tmp_path):
 
 def test_where_scenes_were_dropped_none_failed_is_not_all(run, tmp_path):
     build_tiny(write_manifest(tmp_path / "m.parquet", ["fine", "empty", "fell"]), tmp_path / "out")
-    said = f"none failed; 2 were dropped: tableverse status {tmp_path / 'out'}\n"
+    query = f"""tableverse query {tmp_path / "out"} --where "status = 'dropped'" --columns scene_id,reason,detail"""
+    said = f"none failed\nwhy 2 were dropped: {query}\n"
     assert run("failures", tmp_path / "out")[:2] == (0, said)
     assert run("failures", tmp_path / "out", "--stage", "pack")[:2] == (0, "none\n")
 
@@ -94,7 +95,8 @@ def test_build_ends_with_its_own_code_where_scenes_failed(run, tmp_path):
     found = json.loads(run("status", tmp_path / "out", "--json")[1])
     assert found["remaining"] == 0
     assert code == (3 if found["failed"] else 0)
-    assert "tableverse failures" in text
+    assert ("tableverse failures" in text) == bool(found["failed"])
+    assert ("tableverse query" in text) == bool(found["dropped"])
 
 
 @pytest.mark.parametrize(
