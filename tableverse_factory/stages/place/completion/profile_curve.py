@@ -188,8 +188,9 @@ def _build_thin_wall(
     rows = np.flatnonzero(completed.any(axis=0))
     flat = completed[:, min(int(rows[0]) + max(1, round(0.002 / votes.cell)), completed.shape[1] - 1)]
     foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
-    if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
-        foot = min(foot, float(outer[0, 0]))
+    # The outside seen below the floor is that of the foot, which may be wider than the floor.
+    if len(outer) >= 2 and outer[0, 1] < floor_z:
+        foot = float(outer[0, 0])
     if lowest - wall > RESTING_M:
         solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
         gap = floor_z - wall - votes.bottom
