@@ -244,7 +244,7 @@ def _find_outer_profile(
     lowest = int(np.flatnonzero(reach)[0])
     reach[max(lowest - FLOOR_CELLS, 0) : lowest] = reach[lowest]
     row = np.clip(((profile[:, 1] - votes.bottom) / votes.cell).astype(int), 0, len(reach) - 1)
-    outer = (outward > 0.3) & (profile[:, 0] > reach[row])
+    outer = (outward > 0.3) & (profile[:, 0] > reach[row] + votes.cell)
     rows = [k for k in np.unique(slices[outer]) if (outer & (slices == k)).sum() >= 5]
     return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
 
