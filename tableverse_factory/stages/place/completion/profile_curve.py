@@ -231,9 +231,7 @@ def _build_cavity(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection
     return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
 
 
-def _find_outer_profile(
-    votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"]
-) -> Profile:
+def _find_outer_profile(votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
     """Find the distance of the outer surface by height, from slices in which it was seen, lowest first.
 
     Points within the reach of the cavity lie on its floor, whose noise turns normals outward.
