@@ -3,7 +3,8 @@
 Rays that touch a body whose sections are centrally symmetric, as ellipses and boxes are, do so at opposite points: the
 body's middle lies on the chord between them. A membrane stretched over the depth of the silhouette continues these
 chords to free shapes, and along each ray the body ends as far behind it as it begins before it. Columns below reach the
-support where the body so estimated almost does.
+support where the body so estimated almost does. Elsewhere its underside lies between that of the body and that which
+its visible edges tell: the errors of the two are independent.
 """
 
 import numpy as np
@@ -39,7 +40,9 @@ MAX_LOST = 0.6  # most share of half a thickness that lies between the last read
 THICKNESS_RANGE_M = (0.002, 0.2)
 MARGIN_PX = 2.0
 FILLED_SHARE = 0.5  # of a column that inflation fills from which the column reaches the support
-WIDE_M = 0.016  # half width from which a column that seems to reach the support does [m]
+MIRROR_WEIGHT = 0.7  # of the body against the columns above their underside, where these do not reach the support
+RIM_SMOOTHING_PX, THICKNESS_SMOOTHING_PX = 2.0, 1.5  # both are doubled differences of depths, and as noisy
+WIDE_M = 0.024  # half width from which a column that seems to reach the support does [m]
 BAND = 3  # clamp of the field, in cells
 
 
@@ -60,8 +63,9 @@ def inflate(view: ObjectView) -> CarvedSurface:
     inside = np.minimum(depth - first, last - depth).reshape(grid.shape)
     columns = compute_column_field(view, pose, grid, stretch, free)
     resting = _find_resting(inside, columns, grid.cell)[:, :, None]
+    between = MIRROR_WEIGHT * inside + (1.0 - MIRROR_WEIGHT) * columns
     reach = BAND * grid.cell
-    field = np.clip(np.minimum(free, np.where(resting, np.maximum(inside, columns), inside)), -reach, reach)
+    field = np.clip(np.minimum(free, np.where(resting, np.maximum(inside, columns), between)), -reach, reach)
     return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 
@@ -92,12 +96,20 @@ def estimate_thickness(view: ObjectView) -> tuple[DepthImage, DepthImage]:
         raise GeometryError("no silhouette of the object was seen")
     from_rim = ndimage.distance_transform_edt(~rim, return_distances=False, return_indices=True)
     unread = away + 1.0
-    at_outline = front + _measure_outward_slope(view, front) * unread * front / view.camera.fx
+    beyond = _measure_outward_slope(view, front) * unread * front / view.camera.fx
+    at_outline = front + _smooth_within(rim, beyond, RIM_SMOOTHING_PX)
     middle = _stretch_membrane(view.own, front, rim, at_outline[from_rim[0], from_rim[1]])
     lost = _estimate_lost_share(view, unread[from_rim[0], from_rim[1]])
     thickness = np.clip(2.0 * (middle - front) / (1.0 - lost), *THICKNESS_RANGE_M)
+    thickness = _smooth_within(view.own, thickness, THICKNESS_SMOOTHING_PX)
     nearest = ndimage.distance_transform_edt(~view.own, return_distances=False, return_indices=True)
     return front, thickness[nearest[0], nearest[1]]
+
+
+def _smooth_within(inside: Mask, values: DepthImage, sigma: float) -> DepthImage:
+    """Smooth values inside a mask by a Gaussian of `sigma` pixels, without those outside."""
+    weight = ndimage.gaussian_filter(inside.astype(float), sigma)
+    return np.asarray(ndimage.gaussian_filter(np.where(inside, values, 0.0), sigma) / np.maximum(weight, 1e-9))
 
 
 def _measure_outward_slope(view: ObjectView, front: DepthImage) -> DepthImage:

@@ -171,7 +171,7 @@ def _build_thin_wall(
     votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], swelling: float, upright: bool
 ) -> tuple[CrossSection, CrossSection]:
     """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
-    outer = _find_outer_profile(profile, outward)
+    outer = _find_outer_profile(votes, cavity, profile, outward)
     rim = votes.bottom + votes.cell * (int(np.flatnonzero(cavity.any(axis=0))[-1]) + 1)
     flat = profile[np.abs(outward) < FLAT]
     completed, floor_z = _complete_cavity(votes, cavity, outer, USUAL_WALL_M, flat)
@@ -188,8 +188,9 @@ def _build_thin_wall(
     rows = np.flatnonzero(completed.any(axis=0))
     flat = completed[:, min(int(rows[0]) + max(1, round(0.002 / votes.cell)), completed.shape[1] - 1)]
     foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
-    if len(outer) >= 2 and outer[0, 1] < votes.bottom + 2 * SLICE_M:
-        foot = min(foot, float(outer[0, 0]))
+    # The outside seen below the floor is that of the foot, which may be wider than the floor.
+    if len(outer) >= 2 and outer[0, 1] < floor_z:
+        foot = float(outer[0, 0])
     if lowest - wall > RESTING_M:
         solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
         gap = floor_z - wall - votes.bottom
@@ -230,10 +231,18 @@ def _build_cavity(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection
     return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
 
 
-def _find_outer_profile(profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
-    """Find the distance of the outer surface by height, from slices in which it was seen, lowest first."""
+def _find_outer_profile(votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
+    """Find the distance of the outer surface by height, from slices in which it was seen, lowest first.
+
+    Points within the reach of the cavity lie on its floor, whose noise turns normals outward.
+    """
     slices = np.floor(profile[:, 1] / SLICE_M).astype(int)
-    outer = outward > 0.3
+    index = np.arange(cavity.shape[0])[:, None]
+    reach = votes.cell * np.where(cavity, index + 1, 0).max(axis=0)
+    lowest = int(np.flatnonzero(reach)[0])
+    reach[max(lowest - FLOOR_CELLS, 0) : lowest] = reach[lowest]
+    row = np.clip(((profile[:, 1] - votes.bottom) / votes.cell).astype(int), 0, len(reach) - 1)
+    outer = (outward > 0.3) & (profile[:, 0] > reach[row] + votes.cell)
     rows = [k for k in np.unique(slices[outer]) if (outer & (slices == k)).sum() >= 5]
     return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
 

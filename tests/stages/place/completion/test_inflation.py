@@ -67,6 +67,16 @@ def test_what_stands_behind_the_silhouette_is_completed_better_than_by_columns(n
     assert scores[0] > max(0.8, scores[1] + 0.05)
 
 
+@pytest.mark.parametrize("elevation", [0.6, 0.8, 1.0])
+@pytest.mark.parametrize("thickness", [0.003, 0.005])
+def test_a_raised_flat_thing_has_about_the_volume_that_it_has(thickness, elevation):
+    lying = stand_on_table(from_trimesh(trimesh.creation.box((0.1, 0.06, thickness))))
+    view = look(TriangleMesh(lying.vertices + np.array([0.0, 0.0, 0.016]), lying.faces), elevation)
+    found = inflate(view).simplify()
+    volume = trimesh.Trimesh(found.vertices, found.faces).volume
+    assert 0.75 < volume / (0.1 * 0.06 * thickness) < 1.25
+
+
 @pytest.mark.parametrize("name", SHAPES)
 def test_no_free_space_is_filled_and_no_seen_surface_carved(name):
     view = look(lie(SHAPES[name]()), noise_m=0.0)

@@ -86,3 +86,24 @@ def test_under_the_domed_floor_of_a_plate_that_rests_on_its_rim_nothing_is_fille
     )
     starts = [np.array([0.008 * np.cos(a), 0.008 * np.sin(a), -0.001]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
     assert np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.0025) for start in starts]) < 0.0007
+
+
+@pytest.mark.parametrize("elevation", [0.44, 0.61, 0.87])
+def test_a_thin_plate_with_a_raised_middle_has_one_thickness_from_low_and_high(elevation):
+    """The noise of the floor looks like an outside at the height of the ring on which the plate rests."""
+    thickness = 0.0012
+    under = np.array([(0.0, 0.0024), (0.05, 0.0016), (0.078, 0.0), (0.09, 0.01), (0.128, 0.022)])
+    outline = np.vstack([under, under[::-1] + np.array([0.0, thickness])])
+    plate = complete(from_trimesh(trimesh.creation.revolve(outline, sections=96)), elevation)
+    for radius in (0.02, 0.05, 0.1):
+        starts = [np.array([radius * np.cos(a), radius * np.sin(a), -0.001]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+        found = np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.05) for start in starts])
+        assert abs(found - thickness) < 0.0006, radius
+
+
+@pytest.mark.parametrize("elevation", [0.44, 0.61, 0.87])
+def test_a_foot_is_as_wide_as_the_outside_seen_below_the_floor(elevation):
+    outline = np.array([(0, 0), (0.035, 0), (0.045, 0.06), (0.039, 0.06), (0.022, 0.012), (0, 0.012)])
+    whole = complete(from_trimesh(trimesh.creation.revolve(outline, sections=96)), elevation)
+    low = whole.vertices[whole.vertices[:, 2] < whole.vertices[:, 2].min() + 0.001]
+    assert abs(np.linalg.norm(low[:, :2], axis=1).max() - 0.035) < 0.0025
