@@ -1,20 +1,25 @@
 """Profile curve of a surface of revolution, carved by free space over all azimuths, with its observed cavity."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from manifold3d import CrossSection, FillRule, JoinType
 from scipy import ndimage
 from skimage.measure import find_contours
 
-from schemas.geometry import Frozen, Pose
+from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.object_view import ObjectView, measure_clearances
+from tableverse_factory.stages.place.completion.ring_votes import (
+    Cells,
+    Field,
+    Profile,
+    RingVotes,
+    collect_votes,
+    is_upright,
+)
+from tableverse_factory.stages.place.view.object_view import ObjectView
 
-AZIMUTHS = 32
-CELLS = 4500
-CELL_RANGE_M = (0.0007, 0.0025)
 WALL_RANGE_M = (0.001, 0.012)
 USUAL_WALL_M = 0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls
 WALL_POINTS, LEAST_POINTS = 300, 30
@@ -28,7 +33,6 @@ MIN_HOLLOW_M = 0.008
 HOLLOW_TILT_COS = 0.8
 SLICE_M = 0.002
 DETAIL_M = 0.0002
-HIDDEN_SHARE = 0.3
 SWELLINGS = (0.0, 0.4, 0.8)
 NOISY_HOLLOW_SHARE = 0.25  # least depth of a cavity in noise, as a share of the height
 BORED_SHARE = 0.6  # widest hole in a solid as a share of the body's width; a wider cavity has a wall around it
@@ -40,21 +44,6 @@ RESTING_M = 0.001  # most height of a wall's lowest part at which it rests on th
 FOOT_RING_M = 0.0025  # least width of the ring on which a floor above the support stands [m]
 HOLLOW_FOOT_M = (0.0008, 0.008)  # hollow gaps below a floor: narrower ones are filled, taller ones are no foot ring
 
-Field = Float64[np.ndarray, "nr nz"]
-Cells = Bool[np.ndarray, "nr nz"]
-Profile = Float64[np.ndarray, "n 2"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Votes(Frozen):
-    """A field: sample (i, k) lies (i + 1/2) cell from the axis, at the height bottom + (k + 1/2) cell along it."""
-
-    field: Field  # mean signed distance to the surface over the observed azimuths [m], positive inside; else NaN
-    hidden: Cells  # by another object
-    cell: float  # spacing [m]
-    bottom: float  # [m]
-    band: float  # clamp of the field [m]
-
 
 def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSection] | None:
     """Fit the section in the plane of distance and height [m], and its cavity's; None where nothing is left."""
@@ -62,7 +51,7 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
     normals = view.normals @ rotation_matrix(axis.quaternion_wxyz)
     profile = np.stack([np.linalg.norm(points[:, :2], axis=1), points[:, 2]], axis=1)
     outward = (points[:, :2] * normals[:, :2]).sum(axis=1) / np.maximum(profile[:, 0], 1e-9)
-    votes = _collect_votes(view, axis, profile)
+    votes = collect_votes(view, axis, profile)
     if votes is None:
         return None
     if rotation_matrix(axis.quaternion_wxyz)[2, 2] > HOLLOW_TILT_COS:
@@ -77,45 +66,12 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
                 body, hole = _build_solid(votes), _build_cavity(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
             if cavity is not None:
-                return _build_thin_wall(swollen, cavity, profile, outward, swelling * votes.band, _is_upright(axis))
+                return _build_thin_wall(swollen, cavity, profile, outward, swelling * votes.band, is_upright(axis))
     section = _build_solid(votes)
     return None if section.is_empty() else (section, CrossSection())
 
 
-def _is_upright(axis: Pose) -> bool:
-    """Whether an axis is vertical, so that the lowest end of what turns about it rests on the support."""
-    return bool(axis.quaternion_wxyz[0] > 1.0 - 1e-9)
-
-
-def _collect_votes(view: ObjectView, axis: Pose, profile: Profile) -> _Votes | None:
-    """Average the observed free space of each ring over all azimuths."""
-    low, top = float(np.quantile(profile[:, 1], 0.002)), float(np.quantile(profile[:, 1], 0.998))
-    bottom = min(view.support_z - axis.position[2], top - 0.003) if _is_upright(axis) else low
-    reach = float(np.quantile(profile[:, 0], 0.998))
-    if not 0.002 < reach < 1.0 or top - bottom < 0.002:
-        return None
-    cell = float(np.clip(np.sqrt(reach * (top - bottom) / CELLS), *CELL_RANGE_M))
-    nr, nz = int(np.ceil(reach / cell)) + 4, int(np.ceil((top - bottom) / cell)) + 4
-    if nr * nz > 8 * CELLS:
-        return None
-    r, z = (np.arange(nr) + 0.5) * cell, bottom + (np.arange(nz) + 0.5) * cell
-    angle = 2 * np.pi * (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS
-    shape = (AZIMUTHS, nr, nz)
-    x, y = np.cos(angle)[:, None, None] * r[:, None], np.sin(angle)[:, None, None] * r[:, None]
-    rings = np.stack([np.broadcast_to(a, shape) for a in (x, y, z[None, None, :])], axis=-1).reshape(-1, 3)
-    clearance, behind, hidden = measure_clearances(view, rings, axis)
-    height = rings @ rotation_matrix(axis.quaternion_wxyz)[2] + axis.position[2]
-    clearance = np.minimum(clearance, height - view.support_z + cell).reshape(shape)
-    band = max(2.0 * cell, 0.0025)
-    known = (clearance < 0.0) | (behind.reshape(shape) < band)
-    count = known.sum(axis=0)
-    total = np.where(known, np.clip(clearance, -band, band), 0.0).sum(axis=0)
-    field = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    unseen = (count == 0) & (hidden.reshape(shape).mean(axis=0) > HIDDEN_SHARE)
-    return _Votes(field, unseen, cell, bottom, band)
-
-
-def _find_cavity_cells(votes: _Votes, least: float) -> Cells | None:
+def _find_cavity_cells(votes: RingVotes, least: float) -> Cells | None:
     """Find the empty cells of a cavity that opens upward around the axis; None where none is `least` deep [m]."""
     solid = votes.field > 0.0
     rows = np.flatnonzero(solid.any(axis=0))
@@ -159,7 +115,7 @@ def _measure_wall_across(hole: CrossSection, outer: Profile, low: float, high: f
     return float(np.clip(np.median(distance.min(axis=1)[beside]), *WALL_RANGE_M))
 
 
-def _measure_inside_height(votes: _Votes, inner: Profile, mouth: float) -> float:
+def _measure_inside_height(votes: RingVotes, inner: Profile, mouth: float) -> float:
     """Measure the least height of the seen inside over the support [m]: what rests there is no thicker."""
     slices = np.floor(inner[:, 0] / SLICE_M).astype(int)
     rows = [slices == k for k in range(int(mouth / SLICE_M))]
@@ -168,7 +124,12 @@ def _measure_inside_height(votes: _Votes, inner: Profile, mouth: float) -> float
 
 
 def _build_thin_wall(
-    votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"], swelling: float, upright: bool
+    votes: RingVotes,
+    cavity: Cells,
+    profile: Profile,
+    outward: Float64[np.ndarray, " n"],
+    swelling: float,
+    upright: bool,
 ) -> tuple[CrossSection, CrossSection]:
     """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
     outer = _find_outer_profile(votes, cavity, profile, outward)
@@ -185,18 +146,8 @@ def _build_thin_wall(
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
     if len(outer) >= 2:
         solid = solid + _fill_profile(outer)
-    rows = np.flatnonzero(completed.any(axis=0))
-    flat = completed[:, min(int(rows[0]) + max(1, round(0.002 / votes.cell)), completed.shape[1] - 1)]
-    foot = max(float(flat.sum()) * votes.cell, 2 * votes.cell)
-    # The outside seen below the floor is that of the foot, which may be wider than the floor.
-    if len(outer) >= 2 and outer[0, 1] < floor_z:
-        foot = float(outer[0, 0])
     if lowest - wall > RESTING_M:
-        solid = solid + _build_rectangle(foot, votes.bottom, floor_z + wall / 2)
-        gap = floor_z - wall - votes.bottom
-        if HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
-            within = foot - max(wall, FOOT_RING_M)
-            solid = solid - _build_rectangle(max(within, 0.0), votes.bottom - 1.0, votes.bottom + gap)
+        solid = _add_foot(solid, votes, completed, outer, floor_z, wall)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
     carved = _build_solid(votes)
     thin = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24)
@@ -205,7 +156,25 @@ def _build_thin_wall(
     return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
 
 
-def _has_lid(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
+def _add_foot(
+    solid: CrossSection, votes: RingVotes, cavity: Cells, outer: Profile, floor_z: float, wall: float
+) -> CrossSection:
+    """Add what carries a floor above the support: a ring where the gap below it is that of one, else all of it."""
+    rows = np.flatnonzero(cavity.any(axis=0))
+    floor = cavity[:, min(int(rows[0]) + max(1, round(0.002 / votes.cell)), cavity.shape[1] - 1)]
+    reach = max(float(floor.sum()) * votes.cell, 2 * votes.cell)
+    # The outside seen below the floor is that of the foot, which may be wider than the floor.
+    if len(outer) >= 2 and outer[0, 1] < floor_z:
+        reach = float(outer[0, 0])
+    footed = solid + _build_rectangle(reach, votes.bottom, floor_z + wall / 2)
+    gap = floor_z - wall - votes.bottom
+    if not HOLLOW_FOOT_M[0] < gap < HOLLOW_FOOT_M[1]:
+        return footed
+    within = max(reach - max(wall, FOOT_RING_M), 0.0)
+    return footed - _build_rectangle(within, votes.bottom - 1.0, votes.bottom + gap)
+
+
+def _has_lid(votes: RingVotes, cavity: Cells, profile: Profile) -> bool:
     """Whether the middle of the mouth was seen to be closed: an occluder of a can leaves votes for a cavity."""
     rows = np.flatnonzero(cavity.any(axis=0))
     mouth = votes.cell * float(cavity[:, max(int(rows[-1]) - 3, 0) : int(rows[-1]) + 1].sum(axis=0).max())
@@ -214,24 +183,26 @@ def _has_lid(votes: _Votes, cavity: Cells, profile: Profile) -> bool:
     return len(middle) >= LID_POINTS and float((middle > rim - LID_DEPTH * depth).mean()) > 0.5
 
 
-def _is_bored(votes: _Votes, cavity: Cells) -> bool:
+def _is_bored(votes: RingVotes, cavity: Cells) -> bool:
     """Whether the cavity is a narrow hole in a solid rather than the inside of a wall."""
     body = np.flatnonzero((votes.field > 0.0).any(axis=1))
     return int(cavity.sum(axis=0).max()) < BORED_SHARE * int(body[-1])
 
 
-def _build_solid(votes: _Votes) -> CrossSection:
+def _build_solid(votes: RingVotes) -> CrossSection:
     """Build the largest section that the votes allow: what was not seen is solid."""
     return _trace_outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
 
 
-def _build_cavity(votes: _Votes, cavity: Cells, swelling: float) -> CrossSection:
+def _build_cavity(votes: RingVotes, cavity: Cells, swelling: float) -> CrossSection:
     inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
     inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
     return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
 
 
-def _find_outer_profile(votes: _Votes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"]) -> Profile:
+def _find_outer_profile(
+    votes: RingVotes, cavity: Cells, profile: Profile, outward: Float64[np.ndarray, " n"]
+) -> Profile:
     """Find the distance of the outer surface by height, from slices in which it was seen, lowest first.
 
     Points within the reach of the cavity lie on its floor, whose noise turns normals outward.
@@ -247,7 +218,9 @@ def _find_outer_profile(votes: _Votes, cavity: Cells, profile: Profile, outward:
     return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
 
 
-def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float, flat: Profile) -> tuple[Cells, float]:
+def _complete_cavity(
+    votes: RingVotes, cavity: Cells, outer: Profile, wall: float, flat: Profile
+) -> tuple[Cells, float]:
     """Complete the cavity by cells that its own wall hid, down to the visible floor or to a usual one.
 
     `flat` are the points of the profile whose surface is level.
@@ -280,7 +253,7 @@ def _complete_cavity(votes: _Votes, cavity: Cells, outer: Profile, wall: float, 
     return completed, votes.bottom + votes.cell * floor
 
 
-def _trace_outline(field: Field, votes: _Votes, *, open_top: bool = False) -> CrossSection:
+def _trace_outline(field: Field, votes: RingVotes, *, open_top: bool = False) -> CrossSection:
     """Trace the largest region of positive (or, for a cavity open at the top, negative) cells as a section [m]."""
     inside = -field if open_top else field
     nr = inside.shape[0]
