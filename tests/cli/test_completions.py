@@ -81,6 +81,7 @@ def test_the_printed_script_works_in_bash(here):
     assert run(here, shutil.which("bash") or "bash", "--norc", "-c", f"{script}\n{press}") == "c-3 c-4\n"
 
 
+@pytest.mark.slow  # those of bash are tested above
 def test_zsh_and_fish_are_answered_in_their_own_terms(here):
     asked = {
         "_TYPER_COMPLETE_ARGS": "tableverse extract out there --scene c",

@@ -126,7 +126,7 @@ def test_a_command_that_is_stopped_says_nothing(home, sent, code):
     assert err == ""
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("latin-1", marks=pytest.mark.slow)])
 def test_a_terminal_that_lacks_letters_shows_their_codes(home, encoding):
     for command in (("query", "out", "--table", "objects"), ("config",), ("--help",)):
         ended = run(home, *command, PYTHONIOENCODING=encoding)
@@ -140,7 +140,7 @@ def test_a_terminal_that_lacks_letters_shows_their_codes(home, encoding):
         ({}, False),
         ({"FORCE_COLOR": "1", "TERM": "xterm-256color"}, True),
         ({"FORCE_COLOR": "1", "NO_COLOR": "1", "TERM": "xterm-256color"}, False),
-        ({"FORCE_COLOR": "1", "TERM": "dumb"}, False),
+        pytest.param({"FORCE_COLOR": "1", "TERM": "dumb"}, False, marks=pytest.mark.slow),
     ],
 )
 def test_colours_only_where_they_are_wanted(home, variables, coloured):

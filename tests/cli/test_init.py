@@ -42,6 +42,7 @@ def test_nothing_is_overwritten(tableverse, tmp_path, monkeypatch):
     assert not (tmp_path / "config.yaml").exists()
 
 
+@pytest.mark.slow  # `make demo` makes captures too
 @pytest.mark.heavy
 def test_captures_are_made_and_found_in_it(tableverse, tmp_path, monkeypatch):
     """What `init` says comes next works in the folder that it made."""

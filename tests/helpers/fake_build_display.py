@@ -17,7 +17,7 @@ def _draw_slowly() -> None:
     draw = LiveRender.__rich_console__
 
     def draw_late(self: LiveRender, console: Console, options: ConsoleOptions) -> RenderResult:
-        time.sleep(0.1)
+        time.sleep(0.05)
         yield from draw(self, console, options)
 
     LiveRender.__rich_console__ = draw_late

@@ -52,6 +52,7 @@ def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
     assert "holds no meshes: give a folder with *.obj in it\n" in err
 
 
+@pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 def test_views_are_those_that_were_asked_for(tmp_path, run):
     (tmp_path / "box.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))

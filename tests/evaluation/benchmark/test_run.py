@@ -154,6 +154,7 @@ def test_a_choice_is_run_and_a_wider_one_later_adds_to_it(benchmark, dataset, po
         run(benchmark, dataset, name, out, splits=("validation",))
 
 
+@pytest.mark.slow  # a process for each kind of failure; the test below shows how they are told
 def test_failures_of_a_policy_are_rows_with_reasons(benchmark, dataset, policies, tmp_path, capfd):
     rows = run(benchmark, dataset, PolicyName(f"{policies}:Unlucky"), tmp_path / "u.jsonl", jobs=2, episode_s=15.0)
     assert [row.episode_id for row in rows] == [episode.episode_id for episode in benchmark.episodes]
@@ -249,6 +250,7 @@ def test_results_of_another_run_or_one_under_way_are_not_mixed(benchmark, datase
             pass
 
 
+@pytest.mark.slow  # two runs of a policy with weights
 def test_other_weights_are_named_with_their_digests_and_moved_ones_are_the_same(benchmark, dataset, tmp_path):
     policy, out = tmp_path / "weighed.py", tmp_path / "r.jsonl"
     policy.write_text(POLICIES + "\nclass Weighed(Quick):\n    def __init__(self, weights): pass\n")
@@ -321,6 +323,7 @@ def test_no_word_of_a_policy_makes_a_failure_a_success(benchmark, dataset, polic
     assert found["test_0001"] == found["test_0000"] == (False, "policy_error")
 
 
+@pytest.mark.slow  # a whole run of a policy
 def test_a_process_that_ends_between_episodes_costs_none(benchmark, dataset, policies, tmp_path):
     processes = EpisodeProcesses(PlayPlan(benchmark, dataset.path, PolicyName(f"{policies}:Mortal")), 60.0)
     with processes:

@@ -195,6 +195,7 @@ def test_the_camera_joins_the_frames_of_a_capture_and_its_result(tmp_path):
     assert not all(m.found for m in compare_scene("k", lost, find_truths(tmp_path)["kitchen"](lost), tmp_path).matches)
 
 
+@pytest.mark.slow  # the command five times, for its messages
 def test_the_command_names_what_is_missing(layouts, monkeypatch):
     monkeypatch.setenv("TABLEVERSE_CACHE", str(layouts / "cache"))
     write_result(layouts)

@@ -161,6 +161,7 @@ def test_rows_are_restored_from_the_dataset(made):
     )
 
 
+@pytest.mark.slow  # one more build
 def test_a_dataset_that_was_built_anew_is_noticed(made, tmp_path):
     """The rows name what they were planned with."""
     shutil.copytree(made / "out", tmp_path / "out")
@@ -212,6 +213,7 @@ def test_cousins_of_a_damaged_parent_fail_and_are_made_once_it_is_restored(made,
     assert {row["status"] for row in rows_of(dest)} == {"done"}
 
 
+@pytest.mark.slow  # two builds; test_commands.py puts scenes back
 def test_lost_cousins_are_put_back_for_the_command_that_made_them(made, tmp_path, run):
     """Also those of an open shard, whose rows are in its journal."""
     rows = [row.model_copy(update={"content_sha256": "0" * 64}) for row in plan(made / "out", 2)]

@@ -68,6 +68,7 @@ def test_a_full_disk_stops_the_build_and_more_room_lets_it_go_on(whole, small_di
     assert digests(out) == expected
 
 
+@pytest.mark.slow  # as the full disk above
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of another process are set on Linux alone")
 def test_a_limit_on_the_size_of_files_is_met_in_the_same_way(whole, tmp_path):
     manifest, expected = whole

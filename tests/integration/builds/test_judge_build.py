@@ -55,6 +55,7 @@ def answer() -> str:
     )
 
 
+@pytest.mark.slow  # two builds; test_provider_failures.py refuses keys without one
 def test_a_refused_key_stops_the_build_and_the_right_one_goes_on(server, request_of, monkeypatch, tmp_path):
     monkeypatch.setenv("JUDGE_KEY", KEY)
     server.say(Scripted({"error": {"message": KEY}}, 401))

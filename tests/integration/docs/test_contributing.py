@@ -92,6 +92,7 @@ def tableverse(home: Path, *arguments: object) -> str:
     return in_copy(home, "-c", "from tableverse_factory.cli.main import main; main()", *arguments)
 
 
+@pytest.mark.slow  # builds of a page for contributors
 def test_the_examples_build_what_the_page_says(home):
     write_layouts(home / "layouts")
     tableverse(home, "manifest", "layouts", "--out", "m.parquet")

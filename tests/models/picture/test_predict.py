@@ -208,8 +208,8 @@ def test_the_depth_of_a_sensor_is_another_question() -> None:
 @pytest.mark.parametrize(
     ("window", "grown"),
     [
-        (np.s_[100:400, 200:500], np.s_[100:400, 190:510]),
-        (np.s_[0:20, 630:700], np.s_[0:240, 320:640]),
+        pytest.param(np.s_[100:400, 200:500], np.s_[100:400, 190:510], marks=pytest.mark.slow),
+        pytest.param(np.s_[0:20, 630:700], np.s_[0:240, 320:640], marks=pytest.mark.slow),
         (np.s_[470:480, 0:5], np.s_[240:480, 0:320]),
     ],
     ids=["middle", "corner", "other corner"],

@@ -76,6 +76,7 @@ def test_what_placement_and_motion_settled_for_stands_in_the_row():
     assert fallbacks[1:] == list(found.attempt.motion.fallbacks)
 
 
+@pytest.mark.slow  # a second search, for a count
 def test_a_cell_has_one_planner_however_much_it_is_asked(monkeypatch):
     made = []
 

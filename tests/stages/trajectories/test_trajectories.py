@@ -118,7 +118,10 @@ def _hang() -> None:
     time.sleep(3600)
 
 
-@pytest.mark.parametrize(("befall", "reason", "said"), [(_crash, "crash", "SIGSEGV"), (_hang, "timeout", "6 s")])
+@pytest.mark.parametrize(
+    ("befall", "reason", "said"),
+    [(_crash, "crash", "SIGSEGV"), pytest.param(_hang, "timeout", "6 s", marks=pytest.mark.slow)],
+)
 def test_a_planner_that_crashes_or_hangs_costs_that_task_alone(finished, monkeypatch, befall, reason, said):
     """Both tasks whose motions are planned carry the same object: only the place tells the first from the last."""
     undisturbed = trajectories_module.search_trajectory

@@ -38,6 +38,7 @@ def end_at_once(_: Path, ranks: Ranks) -> None:
     os._exit(7 if ranks.rank else 0)
 
 
+@pytest.mark.slow  # several processes that import torch
 def test_processes_average_follow_the_first_one_and_gather(tmp_path: Path) -> None:
     with start_ranks(2, "cpu", take_part, tmp_path) as ranks:
         take_part(tmp_path, ranks)

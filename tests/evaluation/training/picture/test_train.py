@@ -86,6 +86,7 @@ def test_it_learns(pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
 
 
+@pytest.mark.slow  # a training; that of policies refuses the same
 def test_checkpoints_of_other_settings_or_another_network_or_of_nothing_are_refused(
     pool_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,6 +122,7 @@ def test_a_checkpoint_is_continued_with_the_meshes_that_it_knows(
     train(tmp_path, pool_file, minutes=0.0)
 
 
+@pytest.mark.slow  # a training
 def test_weights_are_the_averages_in_half_precision(pool_file: Path, tmp_path: Path) -> None:
     train(tmp_path, pool_file, replace(SETTINGS, steps=1))
     network, saved = make_network(0), load_file(tmp_path / CHECKPOINT)
@@ -165,6 +167,7 @@ def test_held_out_views_are_measured_at_a_checkpoint(
         assert all(0 <= each[name] <= 1 for name in ("covered", "things", "table"))
 
 
+@pytest.mark.slow  # a training
 def test_a_loss_that_is_not_finite_ends_the_training_and_keeps_the_checkpoint(pool_file: Path, tmp_path: Path) -> None:
     wild = replace(SETTINGS, rate=1e30)
     train(tmp_path, pool_file, wild, minutes=0.0)

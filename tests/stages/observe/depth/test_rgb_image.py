@@ -177,6 +177,7 @@ def test_a_capture_has_its_own_depth_whatever_the_key_says(tmp_path, view):
         assert encode(other) == encode(plain)
 
 
+@pytest.mark.slow  # a whole line; test_picture.py has bent depth
 @pytest.mark.heavy
 def test_a_model_that_bends_the_table_still_gives_its_things(tmp_path, view):
     v, u = np.indices(view.depth.shape) / 480.0
