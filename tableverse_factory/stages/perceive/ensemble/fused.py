@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 from PIL import Image
+from scipy import ndimage
 
-from schemas.geometry import IdImage, Mask
+from schemas.geometry import DepthImage, IdImage, Mask
 from tableverse_factory.models.picture.instances import sum_affinities
 from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction, take_nearest
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
@@ -43,6 +44,8 @@ from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface, 
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
 from tableverse_factory.stages.perceive.picture.detector import find_standing
 
+MAX_OPENING_SHARE = 0.02  # of the picture
+RING_PX, MIN_STEP_M = 3, 0.02  # the sensor loses readings at edges; what stands near an opening is so much nearer
 SURELY_OBJECT = 0.6  # probability of an object from which a pixel is one that the sensor does not see rise
 # Strength of a border up to which two regions are one; the best of eight on rendered tables, and a sum of fractions of
 # two, so that the mean over a border of which nothing is known is no more.
@@ -58,7 +61,8 @@ def detect_fused(view: TableView, seen: PicturePrediction) -> DetectionResult:
 
 def _detect(view: TableView, seen: PicturePrediction, standing: Mask) -> DetectionResult:
     shape = view.valid.shape
-    mask = standing | (upsample_map(seen.label[OBJECT], shape) > SURELY_OBJECT)
+    sure = upsample_map(seen.label[OBJECT], shape) > SURELY_OBJECT
+    mask = standing | (sure & ~find_openings(standing, view.observation.depth))
     if not mask.any():
         return to_detections(np.zeros(shape, dtype=np.int32), {})
     window = find_working_window(mask, WORKING_PIXELS, MARGIN_PX)
@@ -83,6 +87,26 @@ def _detect(view: TableView, seen: PicturePrediction, standing: Mask) -> Detecti
     regions = np.where(part.valid, regions, 0)
     holders = find_containers(regions, find_rims(regions, part), part)
     return to_detections(full, holders)
+
+
+def find_openings(standing: Mask, depth: DepthImage) -> Mask:
+    """Find the table that is seen through handles: what is read within something that stands nearer; shapes (h, w).
+
+    The floor of a plate, which its rim surrounds too, lies no step behind it.
+    """
+    parts, count = ndimage.label((depth > 0) & ~standing)
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)
+    openings = np.zeros(depth.shape, dtype=bool)
+    for k, window in enumerate(ndimage.find_objects(parts), start=1):
+        if sizes[k] > MAX_OPENING_SHARE * depth.size:
+            continue
+        wider = tuple(slice(max(side.start - RING_PX, 0), side.stop + RING_PX) for side in window)
+        inside, own = parts[wider] == k, depth[wider]
+        around = ndimage.binary_dilation(inside, iterations=RING_PX) & standing[wider] & (own > 0)
+        nearest = ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        steps = own[nearest[0], nearest[1]][around] - own[around]
+        openings[wider] |= inside & (len(steps) > 0 and float(np.median(steps)) > MIN_STEP_M)
+    return openings
 
 
 def _merge_patches(

@@ -19,6 +19,7 @@ from tableverse_factory.stages.perceive.ensemble.detector import (
     group_objects,
     prefer_second,
 )
+from tableverse_factory.stages.perceive.ensemble.fused import find_openings
 from tableverse_factory.stages.perceive.perceive import choose_detector
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import look
@@ -159,3 +160,17 @@ def test_ids_are_dense_and_containers_come_first(tmp_path: Path, count: int) -> 
         for index, candidate in enumerate(found.candidates):
             assert candidate.instance == index + 1
             assert candidate.container is None or candidate.container < index
+
+
+@pytest.mark.parametrize(("behind_m", "is_opening"), [(0.08, True), (0.002, False)], ids=["a handle", "a plate"])
+def test_the_table_is_seen_through_a_handle_and_not_through_a_plate(behind_m: float, is_opening: bool) -> None:
+    """A ring stands, half of whose inner edge the sensor lost; only a step in depth tells what lies within."""
+    depth = np.full((240, 320), 0.9 + behind_m, dtype=np.float32)
+    rows, columns = np.indices(depth.shape)
+    away = np.hypot(rows - 120, columns - 160)
+    standing = (away > 15) & (away < 25)
+    depth[standing] = 0.9
+    depth[(away > 13) & (away <= 15) & (columns < 160)] = 0.0
+    found = find_openings(standing, depth)
+    assert found[away < 13].all() == found.any() == is_opening
+    assert not found[away > 15].any()
