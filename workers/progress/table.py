@@ -58,8 +58,8 @@ def _format_awaited(tally: Tally) -> str:
 
 def _format_running(tally: Tally) -> str:
     """Format the calls in flight by their first stage."""
-    begun = [f"{stage} {tally.running[stage]}" for stage in tally.stages if tally.running[stage]]
-    return f"running from {', '.join(begun)}" if begun else ""
+    begun = [f"{tally.running[stage]} from {stage}" for stage in tally.stages if tally.running[stage]]
+    return f"in work: {', '.join(begun)}" if begun else ""
 
 
 def _format_outcomes(tally: Tally) -> str:

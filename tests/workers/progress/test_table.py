@@ -16,8 +16,8 @@ def test_a_call_is_named_by_where_it_began_and_only_once():
     assert "waiting for the first worker" in format_log_line(tally, pace, 3.0)
     tally.running["observe"] = 2
     line = format_log_line(tally, pace, 31.0)
-    assert "0/4 scenes, no scene is back yet; running from observe 2, 31 s so far" in line
+    assert "0/4 scenes, no scene is back yet; in work: 2 from observe, 31 s so far" in line
     assert line.count("observe") == 1
     tally.record_call("observe", 1.0, 1.0)
     tally.ended["export", "done"] += 1
-    assert format_log_line(tally, pace, 40.0).endswith("; running from observe 2")
+    assert format_log_line(tally, pace, 40.0).endswith("; in work: 2 from observe")
