@@ -7,6 +7,8 @@ import pytest
 from tableverse_factory.physics.render.views import FAST
 from tableverse_factory.viz.gallery import pictures
 
+FULL = pictures.QUALITY
+
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_pictures() -> Iterator[None]:
