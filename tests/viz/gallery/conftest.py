@@ -7,7 +7,7 @@ import pytest
 from tableverse_factory.physics.render.views import FAST
 from tableverse_factory.viz.gallery import pictures
 
-FULL = pictures.QUALITY
+_FULL = pictures.QUALITY
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -16,3 +16,9 @@ def quick_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(pictures, "QUALITY", FAST)
         yield
+
+
+@pytest.fixture
+def full_quality(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Render as other processes do, to which no patch comes."""
+    monkeypatch.setattr(pictures, "QUALITY", _FULL)

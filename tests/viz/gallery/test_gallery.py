@@ -18,10 +18,8 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
-from tableverse_factory.viz.gallery import pictures
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tests.helpers.gallery_dataset import CAMERA, EYE, HOSTILE, scene_members, write_dataset
-from tests.viz.gallery.conftest import FULL
 
 pytestmark = pytest.mark.heavy
 
@@ -192,8 +190,8 @@ def test_the_dataset_stays_as_it_was(out, gallery):
 
 
 @pytest.mark.slow
-def test_two_processes_draw_the_same_gallery(out, tmp_path, monkeypatch):
-    monkeypatch.setattr(pictures, "QUALITY", FULL)  # as other processes have it
+@pytest.mark.usefixtures("full_quality")
+def test_two_processes_draw_the_same_gallery(out, tmp_path):
     before = digest(out)
     one, two = (write_gallery(open_dataset(out), tmp_path / str(jobs), jobs=jobs).parent for jobs in (1, 2))
     assert digest(out) == before

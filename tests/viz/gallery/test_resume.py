@@ -43,6 +43,7 @@ def rewrite_dataset(out: Path, done: dict[str, dict[str, bytes]]) -> None:
 
 
 @pytest.mark.slow  # the test below stops it in the middle, and it goes on
+@pytest.mark.usefixtures("full_quality")
 def test_a_killed_report_goes_on(tmp_path):
     out = write_dataset(tmp_path / "out", photographs("a", "b", "c"), [])
     whole = write_gallery(open_dataset(out), tmp_path / "whole", jobs=1).parent
