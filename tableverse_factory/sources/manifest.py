@@ -27,10 +27,11 @@ from tableverse_factory.sources.known_length import REASON, check_pixels, read_k
 from tableverse_factory.sources.layout_file import read_layout_file, resolve_mesh_uri
 from tableverse_factory.sources.urls.fetch_lists import NO_LISTS, NO_ORIGIN, FetchedLists, Origin
 from tableverse_factory.sources.urls.image_filter import FilterCriteria, ImageStats, filter_rows, measure_image
+from tableverse_factory.sources.urls.lists import COLUMN_ALIASES, MAX_LICENCE_CHARS, MAX_SOURCE_CHARS
 
 MAX_SIDECAR_BYTES = 64 * 1024
-_SOURCE_KEYS = ("source", "licence", "known_length")
 _SLUG_CHARS = 40
+_SOURCE_KEYS = [name for name in COLUMN_ALIASES if name != "url"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,10 +215,10 @@ def _read_provenance(entry: ManifestEntry, origin: Origin) -> tuple[str, str, Kn
     value = parse_json(read_bytes(uri, MAX_SIDECAR_BYTES, "bad_source"), name, "bad_source")
     if not isinstance(value, dict):
         raise InputError(f'{name}: give {{"source": …, "licence": …}}', "bad_source")
-    value = {"licence" if key == "license" else key: given for key, given in value.items()}
+    value = {COLUMN_ALIASES.get(key, key): given for key, given in value.items()}
     _check_spelling(value, name)
     texts = []
-    for key, limit in (("source", 2048), ("licence", 512)):
+    for key, limit in (("source", MAX_SOURCE_CHARS), ("licence", MAX_LICENCE_CHARS)):
         text = value.get(key, "")
         if not isinstance(text, str) or len(text) > limit:
             raise InputError(f"{name}: {key} is no text of at most {limit} characters", "bad_source")
@@ -230,9 +231,10 @@ def _read_provenance(entry: ManifestEntry, origin: Origin) -> tuple[str, str, Kn
 
 def _check_spelling(value: Mapping[str, object], name: str) -> None:
     """Refuse keys that look like a misspelt one; others are the user's own."""
-    for key in sorted(value.keys() - _SOURCE_KEYS):
+    for key in sorted(value.keys() - COLUMN_ALIASES):
         if close := get_close_matches(key.lower(), _SOURCE_KEYS, n=1, cutoff=0.8):
-            raise InputError(f"{name}: {sanitize_line(key, 60)!r} is no key: did you mean {close[0]}?", "bad_source")
+            meant = COLUMN_ALIASES[close[0]]
+            raise InputError(f"{name}: {sanitize_line(key, 60)!r} is no key: did you mean {meant}?", "bad_source")
 
 
 def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:

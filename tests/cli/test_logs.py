@@ -105,7 +105,8 @@ def test_a_real_build_in_a_pipe_keeps_its_streams_apart(tmp_path):
     assert built.returncode == 0
     counts, why = built.stdout.splitlines()
     assert counts == "0 done, 2000 dropped, 0 failed of 2000 scenes, in out"
-    assert why.startswith("why 2000 were dropped: tableverse query out ")
+    query = """tableverse query out --where "status = 'dropped'" --columns scene_id,reason,detail"""
+    assert why == f"why 2000 were dropped: {query}"
     assert len(built.stderr.splitlines()) < 20
     assert not re.search(r"\x1b\[[0-9;?]*[A-HJKfhl]", built.stderr), "the cursor moves in a log"
     status = run("status", "out", "--json")

@@ -25,8 +25,8 @@ MAX_LIST_BYTES = 512 * 1024 * 1024
 MAX_ROWS = 1_000_000
 MAX_SOURCE_CHARS = 2048
 MAX_LICENCE_CHARS = 512
-_COLUMN_ALIASES = {name: name for name in ("url", "source", "licence", "known_length")} | {"license": "licence"}
-"""Columns by their lower-case names."""
+COLUMN_ALIASES = {name: name for name in ("url", "source", "licence", "known_length")} | {"license": "licence"}
+"""Columns, and keys of `source.json`, by their lower-case names."""
 
 _OTHER_DELIMITERS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _LIMITS = {
@@ -129,7 +129,7 @@ def _parse_json_lines(name: str, text: str) -> UrlList:
         if not isinstance(value, Mapping):
             rows.append(ListRow("", problem=("bad_list_row", f"row {number} is no object of names and texts")))
             continue
-        known = {column: given for given in value if (column := _COLUMN_ALIASES.get(given.strip().lower()))}
+        known = {column: given for given in value if (column := COLUMN_ALIASES.get(given.strip().lower()))}
         others |= dict.fromkeys(given for given in value if given not in known.values())
         rows.append(_make_row({column: value[given] for column, given in known.items()}))
     if rows and not any(row.url for row in rows):
@@ -181,7 +181,7 @@ def _measure_column(column: pa.Array) -> int:
 def _match_columns(name: str, header: list[str]) -> dict[str, str]:
     known: dict[str, str] = {}
     for given in header:
-        column = _COLUMN_ALIASES.get(given.strip().lower())
+        column = COLUMN_ALIASES.get(given.strip().lower())
         if column is not None and known.setdefault(column, given) != given:
             raise InputError(f"{name} has two columns for {column}: {known[column]!r} and {given!r}", "unreadable_list")
     if "url" not in known:

@@ -127,11 +127,12 @@ def _merge_answers(
     """Take from each answer its groups; those of the second, as `takes_second` says, fill what the first leaves."""
     shares = [np.where(takes_second[groups[0]], 0, ids[0])]
     shares.append(np.where(takes_second[groups[1]] & (shares[0] == 0), ids[1], 0))
+    left = [_list_left(own, share) for own, share in zip(ids, shares, strict=True)]
     kept = [
         (source, index)
         for source, answer in enumerate(answers)
         for index, candidate in enumerate(answer.candidates)
-        if _measure_share(shares[source], ids[source], candidate.instance) >= MIN_LEFT
+        if candidate.instance in left[source]
     ]
     instances = {key: k for k, key in enumerate(kept, start=1)}
     merged, candidates = np.zeros_like(ids[0]), []
@@ -146,9 +147,11 @@ def _merge_answers(
     return DetectionResult(tuple(boxed), ids=merged)
 
 
-def _measure_share(left: IdImage, ids: IdImage, instance: int) -> float:
-    """Measure the share of an object that is left; 0 for one without pixels."""
-    return float((left == instance).sum() / max((ids == instance).sum(), 1))
+def _list_left(ids: IdImage, share: IdImage) -> list[int]:
+    """List the objects that keep most of their pixels in a share of them."""
+    sizes = np.bincount(ids.ravel())
+    left = np.bincount(share.ravel(), minlength=len(sizes))
+    return [k for k in range(1, len(sizes)) if left[k] >= MIN_LEFT * sizes[k] > 0]
 
 
 def _get_ids(answer: DetectionResult) -> IdImage:
