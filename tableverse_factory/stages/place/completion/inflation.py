@@ -23,6 +23,7 @@ from tableverse_factory.stages.place.completion.underside import compute_half_wi
 from tableverse_factory.stages.place.completion.voxel_carving import (
     CarvedSurface,
     build_flat_grid,
+    close_floor,
     compute_column_field,
     drop_crumbs,
     place_frame,
@@ -66,6 +67,7 @@ def inflate(view: ObjectView) -> CarvedSurface:
     between = MIRROR_WEIGHT * inside + (1.0 - MIRROR_WEIGHT) * columns
     reach = BAND * grid.cell
     field = np.clip(np.minimum(free, np.where(resting, np.maximum(inside, columns), between)), -reach, reach)
+    field = close_floor(field, view, pose, grid, stretch)
     return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 

@@ -84,6 +84,7 @@ def carve_columns(view: ObjectView) -> CarvedSurface:
     field = np.minimum(compute_column_field(view, pose, grid, stretch, free), free)
     if _is_torn(field):
         field = np.minimum(compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
+    field = close_floor(field, view, pose, grid, stretch)
     return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 
@@ -124,6 +125,15 @@ def drop_crumbs(field: Field) -> Field:
     sizes = np.bincount(labels.ravel())[1:]
     crumbs = np.concatenate([[False], sizes < CRUMB_SHARE * sizes.max()])
     return np.where(crumbs[labels], -np.abs(field), field)
+
+
+def close_floor(field: Field, view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float) -> Field:
+    """Close holes that only noise makes: where the object was seen no higher than the support, within its outline."""
+    solid = (field > 0.0).any(axis=2)
+    holes = ndimage.binary_fill_holes(solid) & ~solid & find_footprint(view, pose, grid).closed
+    height = grid.axes()[2] / stretch - (view.support_z - pose.position[2])
+    floor = np.minimum(height, MIN_THICKNESS_M - height)
+    return np.where(ndimage.binary_dilation(holes)[:, :, None], np.maximum(field, floor), field)
 
 
 def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
