@@ -14,7 +14,7 @@ from schemas.geometry import Points
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.voxel_solids import extract_surface
-from tableverse_factory.stages.place.completion.underside import Footprint, measure_sheet
+from tableverse_factory.stages.place.completion.underside import Footprint, measure_thickness
 from tableverse_factory.stages.place.completion.voxel_carving import (
     CarvedSurface,
     add_free_space,
@@ -48,12 +48,12 @@ def carve_sheet(view: ObjectView) -> CarvedSurface | None:
     local = grid.points() / np.array([1.0, 1.0, stretch])
     free = np.minimum(measure_free_space(view, local, pose), local[:, 2] + half[2]).reshape(grid.shape)
     footprint = add_free_space(footprint, free, grid.axes()[2] / stretch, -half[2])
-    raised, thickness = measure_sheet(footprint, -half[2])
+    raised, thickness = measure_thickness(footprint, -half[2])
     if raised < RAISED_SHARE or thickness > THICKNESS_RANGE_M[1]:
         return None
     radius = max(thickness, THICKNESS_RANGE_M[0]) / 2
     step = max(1, len(view.points) // MIDDLE_POINTS)
-    middle = _bridge_gaps(view, view.points[::step] - radius * view.normals[::step])
+    middle = _continue_hidden(view, view.points[::step] - radius * view.normals[::step])
     reach = BAND * grid.cell
     near = cKDTree(transform_points(invert_pose(pose), middle))
     distance, _ = near.query(local, distance_upper_bound=radius + reach)
@@ -73,7 +73,7 @@ def _measure_sag(footprint: Footprint) -> float:
     return float(np.median(sag)) if len(sag) else 0.0
 
 
-def _bridge_gaps(view: ObjectView, middle: Points) -> Points:
+def _continue_hidden(view: ObjectView, middle: Points) -> Points:
     """Continue a surface linearly over what it hides itself [m]."""
     low, high = middle[:, :2].min(axis=0), middle[:, :2].max(axis=0)
     axes = [np.arange(low[k], high[k], BRIDGE_M) for k in range(2)]

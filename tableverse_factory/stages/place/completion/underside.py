@@ -80,7 +80,7 @@ def estimate_underside(footprint: Footprint, support: float) -> Map:
     return ndimage.median_filter(under, size=MEDIAN_CELLS)
 
 
-def measure_sheet(footprint: Footprint, support: float) -> tuple[float, float]:
+def measure_thickness(footprint: Footprint, support: float) -> tuple[float, float]:
     """Measure the share of the visible border that ends above the support, and the thickness of a sheet there [m]."""
     width = compute_half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
     edges = _find_edges(footprint, width, _compute_uprightness(footprint), support)
