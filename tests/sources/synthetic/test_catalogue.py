@@ -111,7 +111,7 @@ def test_containers_and_roles_exist() -> None:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 10), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 10), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", RECIPES)
 def test_recipes_place_things_apart_and_above_the_table(name: str, seeds: range) -> None:
     for seed in seeds:

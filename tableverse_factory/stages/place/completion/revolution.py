@@ -1,6 +1,5 @@
 """Fit of a surface of revolution, with handles."""
 
-import numpy as np
 from manifold3d import Manifold
 
 from schemas.geometry import Pose, TriangleMesh
@@ -10,7 +9,6 @@ from tableverse_factory.stages.place.completion.handle import add_handles
 from tableverse_factory.stages.place.completion.profile_curve import fit_profile
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit
 from tableverse_factory.stages.place.completion.revolution_axis import propose_axes
-from tableverse_factory.stages.place.completion.warp import fit_warp
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MAX_SPREAD_M = 0.0025  # most spread of the distances of a slice's points from an axis [m]
@@ -44,14 +42,11 @@ def _fit_about_axis(view: ObjectView, rays: RaySample, axis: Pose, freedom: floa
     body = Manifold.revolve(sections[0], SEGMENTS).transform(to_table)
     if body.is_empty():
         return None
-    hole = None if sections[1].is_empty() else Manifold.revolve(sections[1], SEGMENTS).transform(to_table)
-    # Of a solid only the front is seen, and bent depth there would slant its back; a wall shows its far side as well.
-    if hole is not None:
-        warp = fit_warp(view, body, axis.position)
-        body, hole = (part.warp_batch(lambda places: warp(np.asarray(places))) for part in (body, hole))
     bare = _to_frame(body, axis)
     cost = compute_mesh_misfit(rays, bare, axis)
+    hollow = not sections[1].is_empty()
     if cost < WORTH_HANDLES_M:
+        hole = Manifold.revolve(sections[1], SEGMENTS).transform(to_table) if hollow else None
         whole = simplify_solid(add_handles(view, body, hole), MAX_FACES, TOLERANCE_M)
         mesh = _to_frame(whole, axis)
         better = compute_mesh_misfit(rays, mesh, axis)
@@ -59,7 +54,7 @@ def _fit_about_axis(view: ObjectView, rays: RaySample, axis: Pose, freedom: floa
             bare, cost = mesh, better + HANDLE_FREEDOM * (cost - better)
     middle = (bare.vertices.min(axis=0) + bare.vertices.max(axis=0)) / 2
     pose = Pose(transform_points(axis, middle[None])[0], axis.quaternion_wxyz)
-    return TriangleMesh(bare.vertices - middle, bare.faces), pose, cost + freedom, hole is not None
+    return TriangleMesh(bare.vertices - middle, bare.faces), pose, cost + freedom, hollow
 
 
 def _to_frame(solid: Manifold, axis: Pose) -> TriangleMesh:

@@ -128,12 +128,17 @@ def drop_crumbs(field: Field) -> Field:
 
 
 def close_floor(field: Field, view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float) -> Field:
-    """Close holes that only noise makes: where the object was seen no higher than the support, within its outline."""
+    """Close holes where the object itself was seen, but no higher than `MIN_THICKNESS_M` over its support.
+
+    Noise makes them in floors of bowls. What shows the table, as the middle of a ring does, stays open.
+    """
+    seen, support = find_footprint(view, pose, grid), view.support_z - pose.position[2]
     solid = (field > 0.0).any(axis=2)
-    holes = ndimage.binary_fill_holes(solid) & ~solid & find_footprint(view, pose, grid).closed
-    height = grid.axes()[2] / stretch - (view.support_z - pose.position[2])
+    holes = ndimage.binary_fill_holes(solid) & ~solid & seen.closed & (seen.top < support + MIN_THICKNESS_M)
+    height = grid.axes()[2] / stretch - support
     floor = np.minimum(height, MIN_THICKNESS_M - height)
-    return np.where(ndimage.binary_dilation(holes)[:, :, None], np.maximum(field, floor), field)
+    wider = ndimage.binary_dilation(holes)  # so that the floor joins what surrounds it
+    return np.where(wider[:, :, None], np.maximum(field, floor), field)
 
 
 def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
