@@ -26,6 +26,7 @@ from tableverse_factory.stages.place.completion.voxel_carving import (
     close_floor,
     compute_column_field,
     drop_crumbs,
+    find_footprint,
     place_frame,
 )
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space, sample_nearest
@@ -62,12 +63,13 @@ def inflate(view: ObjectView) -> CarvedSurface:
     start, end = np.where(near, front, np.inf), front + thickness
     depth, (first, last) = sample_nearest(view, local, pose, (start, end))
     inside = np.minimum(depth - first, last - depth).reshape(grid.shape)
-    columns = compute_column_field(view, pose, grid, stretch, free)
+    footprint, z = find_footprint(view, pose, grid), grid.axes()[2] / stretch
+    columns = compute_column_field(footprint, -half[2], z, free)
     resting = _find_resting(inside, columns, grid.cell)[:, :, None]
     between = MIRROR_WEIGHT * inside + (1.0 - MIRROR_WEIGHT) * columns
     reach = BAND * grid.cell
     field = np.clip(np.minimum(free, np.where(resting, np.maximum(inside, columns), between)), -reach, reach)
-    field = close_floor(field, view, pose, grid, stretch)
+    field = close_floor(field, footprint, -half[2], z)
     return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 

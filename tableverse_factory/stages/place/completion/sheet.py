@@ -14,7 +14,7 @@ from schemas.geometry import Points
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.voxel_solids import extract_surface
-from tableverse_factory.stages.place.completion.underside import Footprint, measure_thickness
+from tableverse_factory.stages.place.completion.underside import Footprint, measure_raised_edge
 from tableverse_factory.stages.place.completion.voxel_carving import (
     CarvedSurface,
     add_free_space,
@@ -48,7 +48,7 @@ def carve_sheet(view: ObjectView) -> CarvedSurface | None:
     local = grid.points() / np.array([1.0, 1.0, stretch])
     free = np.minimum(measure_free_space(view, local, pose), local[:, 2] + half[2]).reshape(grid.shape)
     footprint = add_free_space(footprint, free, grid.axes()[2] / stretch, -half[2])
-    raised, thickness = measure_thickness(footprint, -half[2])
+    raised, thickness = measure_raised_edge(footprint, -half[2])
     if raised < RAISED_SHARE or thickness > THICKNESS_RANGE_M[1]:
         return None
     radius = max(thickness, THICKNESS_RANGE_M[0]) / 2

@@ -18,10 +18,7 @@ from schemas.geometry import Frozen, Vector3
 MIN_THICKNESS_M = 0.002
 BAR_HALF_WIDTH_M = 0.0125  # greatest half width of a bar [m]; wider parts are sheets or solids
 BAR_SHAPE = 3.2  # most thickness of a bar in half widths: a thicker part stands, and is no bar
-SHEET_SHARE, SHEET_M = (
-    0.3,
-    0.008,
-)  # most thickness of a sheet's edge, in half widths and [m]: round bodies have more
+SHEET_SHARE, SHEET_M = 0.3, 0.008  # most thickness of a sheet's edge, in half widths and [m]: round bodies have more
 SETTLED_M = 0.004  # height above the support up to which an edge rests on it [m]
 FACING_COS = 0.1  # least cosine between an edge's outward direction and the camera: others hide their end
 EDGES = 12
@@ -80,7 +77,7 @@ def estimate_underside(footprint: Footprint, support: float) -> Map:
     return ndimage.median_filter(under, size=MEDIAN_CELLS)
 
 
-def measure_thickness(footprint: Footprint, support: float) -> tuple[float, float]:
+def measure_raised_edge(footprint: Footprint, support: float) -> tuple[float, float]:
     """Measure the share of the visible border that ends above the support, and the thickness of a sheet there [m]."""
     width = compute_half_width(ndimage.distance_transform_edt(np.pad(footprint.closed, 1))[1:-1, 1:-1]) * footprint.cell
     edges = _find_edges(footprint, width, _compute_uprightness(footprint), support)

@@ -50,6 +50,8 @@ TURN_POINTS = 800
 WORST_TURN_M = 0.01
 SLACK = 0.05  # weight of distance from free space against depth in it, in the search for the axis of the half turn
 
+Heights = Float64[np.ndarray, " nz"]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarvedSurface(Frozen):
@@ -81,10 +83,11 @@ def carve_columns(view: ObjectView) -> CarvedSurface:
     grid, stretch = build_flat_grid(view, half)
     local = grid.points() / np.array([1.0, 1.0, stretch])
     free = measure_free_space(view, local, pose).reshape(grid.shape)
-    field = np.minimum(compute_column_field(view, pose, grid, stretch, free), free)
+    footprint, z = find_footprint(view, pose, grid), grid.axes()[2] / stretch
+    field = np.minimum(compute_column_field(footprint, -half[2], z, free), free)
     if _is_torn(field):
-        field = np.minimum(compute_column_field(view, pose, grid, stretch, free, bridged=True), free)
-    field = close_floor(field, view, pose, grid, stretch)
+        field = np.minimum(compute_column_field(footprint, -half[2], z, free, bridged=True), free)
+    field = close_floor(field, footprint, -half[2], z)
     return CarvedSurface(extract_surface(drop_crumbs(field), grid), stretch, grid.cell, pose)
 
 
@@ -127,16 +130,16 @@ def drop_crumbs(field: Field) -> Field:
     return np.where(crumbs[labels], -np.abs(field), field)
 
 
-def close_floor(field: Field, view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float) -> Field:
+def close_floor(field: Field, footprint: Footprint, support: float, z: Heights) -> Field:
     """Close holes where the object itself was seen, but no higher than `MIN_THICKNESS_M` over its support.
 
-    Noise makes them in floors of bowls. What shows the table, as the middle of a ring does, stays open.
+    Noise makes them in floors of bowls. What shows the table, as the middle of a ring does, stays open. `z` are
+    the heights of the cells, and `support` is that of the support, in the frame of the footprint [m].
     """
-    seen, support = find_footprint(view, pose, grid), view.support_z - pose.position[2]
     solid = (field > 0.0).any(axis=2)
-    holes = ndimage.binary_fill_holes(solid) & ~solid & seen.closed & (seen.top < support + MIN_THICKNESS_M)
-    height = grid.axes()[2] / stretch - support
-    floor = np.minimum(height, MIN_THICKNESS_M - height)
+    low = footprint.closed & (footprint.top < support + MIN_THICKNESS_M)
+    holes = ndimage.binary_fill_holes(solid) & ~solid & low
+    floor = np.minimum(z - support, support + MIN_THICKNESS_M - z)
     wider = ndimage.binary_dilation(holes)  # so that the floor joins what surrounds it
     return np.where(wider[:, :, None], np.maximum(field, floor), field)
 
@@ -179,22 +182,19 @@ def build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]:
 
 
 def compute_column_field(
-    view: ObjectView, pose: Pose, grid: VoxelGrid, stretch: float, free: Field, *, bridged: bool = False
+    footprint: Footprint, support: float, z: Heights, free: Field, *, bridged: bool = False
 ) -> Field:
-    """Compute the signed distance to the columns below the observed points [m]."""
-    seen = find_footprint(view, pose, grid)
-    closed, top = seen.closed, seen.top
-    z = grid.axes()[2] / stretch
+    """Compute the signed distance to the columns below the observed points [m]; arguments as in `close_floor`."""
+    closed, top = footprint.closed, footprint.top
     if bridged:
         closed, top = _bridge_gaps(closed, top, free, z)
     inside = ndimage.distance_transform_edt(np.pad(closed, 1))[1:-1, 1:-1]
     outside = ndimage.distance_transform_edt(~closed)
-    footprint = np.where(closed, inside - 0.5, 0.5 - outside) * grid.cell
-    support = view.support_z - pose.position[2]
-    under = estimate_underside(add_free_space(replace(seen, closed=closed, top=top), free, z, support), support)
+    beside = np.where(closed, inside - 0.5, 0.5 - outside) * footprint.cell
+    under = estimate_underside(add_free_space(replace(footprint, closed=closed, top=top), free, z, support), support)
     top = np.maximum(top, under + MIN_THICKNESS_M)
     column = np.minimum(top[:, :, None] - z, z - under[:, :, None])
-    return np.minimum(column, footprint[:, :, None])
+    return np.minimum(column, beside[:, :, None])
 
 
 def find_footprint(view: ObjectView, pose: Pose, grid: VoxelGrid) -> Footprint:
@@ -217,14 +217,14 @@ def find_footprint(view: ObjectView, pose: Pose, grid: VoxelGrid) -> Footprint:
     return Footprint(grid.cell, closed, top[nearest[0], nearest[1]], lowest, nothing, to_eye)
 
 
-def add_free_space(footprint: Footprint, free: Field, z: Float64[np.ndarray, " nz"], support: float) -> Footprint:
+def add_free_space(footprint: Footprint, free: Field, z: Heights, support: float) -> Footprint:
     """Add up to which height each column was seen to be empty below its top; `z` are the heights of the cells [m]."""
     below = (free < -EMPTY_M) & (z < footprint.top[:, :, None] - EMPTY_M)
     return replace(footprint, empty_to=np.where(below, z, support).max(axis=2, initial=support))
 
 
 def _bridge_gaps(
-    closed: Bool[np.ndarray, "nx ny"], top: Float64[np.ndarray, "nx ny"], free: Field, z: Float64[np.ndarray, " nz"]
+    closed: Bool[np.ndarray, "nx ny"], top: Float64[np.ndarray, "nx ny"], free: Field, z: Heights
 ) -> tuple[Bool[np.ndarray, "nx ny"], Float64[np.ndarray, "nx ny"]]:
     """Join separate parts over the hidden columns between them; return the columns and their tops."""
     between = np.argwhere(~closed)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from manifold3d import CrossSection
 
 from schemas.geometry import TriangleMesh
 from tableverse_factory.core.errors import GeometryError
@@ -15,6 +16,7 @@ from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays, to_tensor
+from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.inflation import estimate_thickness, inflate
 from tableverse_factory.stages.place.completion.voxel_carving import carve_columns
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space, view_object
@@ -99,3 +101,19 @@ def test_without_a_silhouette_nothing_is_inflated():
     hidden = ObjectView(**{name: getattr(view, name) for name in view.__slots__} | {"past": np.zeros_like(view.past)})
     with pytest.raises(GeometryError, match="silhouette"):
         estimate_thickness(hidden)
+
+
+@pytest.mark.parametrize("carve", [carve_columns, inflate])
+def test_a_floor_that_was_seen_no_higher_than_the_table_has_no_hole(carve):
+    profile = [[0.0, 0.0], [0.03, 0.0], [0.06, 0.04], [0.056, 0.04], [0.028, 0.0004], [0.0, 0.0004]]
+    carved = carve(look(stand_on_table(from_trimesh(trimesh.creation.revolve(profile))), 0.9))
+    at_floor = to_manifold(carved.simplify()).slice(0.001 - carved.pose.position[2])
+    true_floor = CrossSection.circle(0.024, 64).translate(-carved.pose.position[:2])
+    assert (at_floor ^ true_floor).area() > 0.98 * true_floor.area()
+
+
+@pytest.mark.parametrize("carve", [carve_columns, inflate])
+def test_a_hole_that_shows_the_table_stays_open(carve):
+    ring = stand_on_table(from_trimesh(trimesh.creation.annulus(0.006, 0.025, 0.01)))
+    carved = carve(look(ring, 1.3))
+    assert to_manifold(carved.simplify()).genus() == 1
