@@ -1,6 +1,7 @@
 """Fixtures and options of all tests."""
 
 import gc
+import os
 import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -21,6 +22,9 @@ hypothesis.settings.register_profile("same-everywhere", derandomize=True, deadli
 hypothesis.settings.register_profile("fewer", derandomize=True, deadline=None, max_examples=30)
 hypothesis.settings.load_profile("same-everywhere")
 
+AUTHORITIES = {
+    name: os.environ.get(name) for name in ("SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE", "AWS_CA_BUNDLE")
+}
 PROCESS_EVENTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"}
 
 
@@ -93,9 +97,19 @@ def one_authority(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     path = tmp_path_factory.mktemp("authority") / "one.pem"
     path.write_text(first)
     with pytest.MonkeyPatch.context() as patched:
-        for variable in ("SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE", "AWS_CA_BUNDLE"):
+        for variable in AUTHORITIES:
             patched.setenv(variable, str(path))
         yield
+
+
+@pytest.fixture
+def own_authorities(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The authorities that this machine trusts, for a test that asks its package index."""
+    for variable, path in AUTHORITIES.items():
+        if path is None:
+            monkeypatch.delenv(variable)
+        else:
+            monkeypatch.setenv(variable, path)
 
 
 @pytest.fixture(scope="session")

@@ -154,6 +154,7 @@ def test_it_runs_where_the_checkout_is_out_of_reach(tableverse, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("own_authorities")
 def test_it_installs_with_all_it_needs_into_an_empty_environment(wheel, tmp_path):
     """As a user does it, from the index that pip is set to: about 2 GB."""
     venv.create(tmp_path / "environment", with_pip=True)
