@@ -22,6 +22,8 @@ DepthImage = Float[np.ndarray, "h w"]
 IdImage = Int32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 
+TABLE_ID = -1  # of table-top pixels in an image of ids
+
 
 class Frozen:
     """Mixin that makes the arrays of frozen dataclasses read-only, which `frozen=True` alone does not."""

@@ -10,6 +10,8 @@ from schemas.detection import DetectionRecord
 from schemas.geometry import Camera, Colors, ConvexPieces, Frozen, IdImage, Points, Pose, TriangleMesh
 from schemas.observation import IntrinsicsSource, Observation, ScaleSource
 
+SMALLEST_M, LARGEST_M = 0.001, 5.0  # sides of plausible objects
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table(Frozen):

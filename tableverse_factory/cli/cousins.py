@@ -20,7 +20,9 @@ def cousins(
     per_scene: Annotated[
         int, typer.Option("--per-scene", min=1, max=1000, metavar="N", help="Cousins of a scene.")
     ] = 10,
-    seed: Annotated[int, typer.Option("--seed", min=0, metavar="N", help="Another seed, other cousins.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, metavar="N", help="Another run.seed, other cousins.")
+    ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     executor: options.Executor = "ray",
@@ -58,8 +60,8 @@ def cousins(
     source, place = parse_path(out), parse_path(dest)
     require_apart(place, source)
     manifest = place.parent / f"{place.name}.parquet"
-    overrides = [*(overrides or []), f"run.seed={seed}"]
-    load_config(config, overrides)  # what is refused leaves no manifest behind
+    overrides = [*(overrides or []), *([] if seed is None else [f"run.seed={seed}"])]
+    seed = load_config(config, overrides).run.seed  # what is refused leaves no manifest behind
     rows = ImageRows.from_rows(list_cousins(open_dataset(str(source.absolute())), per_scene, seed, find_kind))
     if written := not manifest.exists():
         write_manifest(manifest, rows)

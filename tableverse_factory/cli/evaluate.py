@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon, Overrides
+from tableverse_factory.cli.options import AsJson, ConfigFile, Epsilon, Overrides, require_local_path
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.cache_dir import get_cache_dir
 from tableverse_factory.core.text import sanitize_line
@@ -99,7 +99,9 @@ def _percent(share: float | None) -> str:
 
 @evaluate.command("gpt-score")
 def evaluate_gpt_score(
-    out: Annotated[Path, typer.Option("--out", help="Folder for grids, answers and results.")],
+    out: Annotated[
+        Path, typer.Option("--out", callback=require_local_path, help="Folder for grids, answers and results.")
+    ],
     paths: Paths = None,
     method: Methods = None,
     reference: Reference = None,
@@ -224,7 +226,10 @@ def evaluate_tables(
     folder: Annotated[
         Path, typer.Argument(help="Results: a subfolder for each method, and answers/.", exists=True, file_okay=False)
     ],
-    out: Annotated[Path, typer.Option("--out", help="Folder for table1.md, table2.md and tables.json.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", callback=require_local_path, help="Folder for table1.md, table2.md and tables.json."),
+    ],
     answers: Annotated[
         Path | None,
         typer.Option(help="Answers that `evaluate gpt-score` recorded, if elsewhere.", exists=True, file_okay=False),

@@ -12,7 +12,6 @@ from typer.core import TyperGroup
 
 from tableverse_factory.cli.arm import check_robot_option
 from tableverse_factory.cli.options import BuiltOut, FinishedOut, Robot, require_local_path
-from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import pluralize, sanitize_line
 
 if TYPE_CHECKING:
@@ -72,14 +71,14 @@ def export_dataset(
 
     Example: `tableverse export dataset out out-public --profile permissive`; the word `dataset` may be left out.
     """
+    from tableverse_factory.core.storage.apart import require_apart
     from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.dataset.journals import WORK
     from tableverse_factory.delivery.license_filter import write_filtered_dataset
     from workers.state.lock import LOCK, create_writer_lock
 
     place = parse_path(dest)
-    if place == parse_path(out):
-        raise InputError(f"{dest} is the dataset itself: give a new or empty folder as DEST")
+    require_apart(place, parse_path(out))
     with _remove_if_unused(place), create_writer_lock(place / WORK / LOCK):
         result = write_filtered_dataset(parse_path(out), place, profile, unfinished)
     print(f"{pluralize(result.kept, 'scene')}, {result.done} of them with files, in {dest}")

@@ -111,8 +111,8 @@ def _print_scenes(selected: list["LostScene"], nothing: str) -> None:
     table = make_table("status", "stage", "why", figures=["scenes"])
     table.add_column("for example", overflow="fold")
     for (status, stage, why), scenes in sorted(groups.items(), key=lambda item: (-len(item[1]), item[0])):
-        example = f"{scenes[0].scene_id}: {sanitize_line(scenes[0].detail)}"
-        table.add_row(status, stage, sanitize_line(why, 80), str(len(scenes)), example)
+        example = f"{sanitize_line(scenes[0].scene_id)}: {sanitize_line(scenes[0].detail)}"
+        table.add_row(*(sanitize_line(text, 80) for text in (status, stage, why)), str(len(scenes)), example)
     Console(markup=False).print(table)
     for line in explain_reasons(why for _, _, why in groups):
         print(line)

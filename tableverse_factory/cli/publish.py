@@ -1,5 +1,6 @@
 """`tableverse publish`: upload of a dataset to the Hugging Face Hub."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,7 +47,8 @@ def publish(
     if not upload:
         given = {"--public": public, "--replace": replace, "--card": card, "--unfinished": unfinished}
         options = "".join(f" {option}" for option, on in given.items() if on)
-        print(f"Nothing was uploaded. This does it:\n  tableverse publish {out} --repo {name}{options} --upload")
+        command = f"tableverse publish {shlex.quote(str(out))} --repo {name}{options} --upload"
+        print(f"Nothing was uploaded. This does it:\n  {command}")
         return
     from tableverse_factory.delivery.hub.upload import UploadOptions
     from tableverse_factory.delivery.hub.upload import upload as send

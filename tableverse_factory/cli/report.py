@@ -11,14 +11,17 @@ from typing import Annotated
 import typer
 
 from tableverse_factory.cli.arm import check_robot_option
-from tableverse_factory.cli.options import Jobs, Robot
+from tableverse_factory.cli.options import Jobs, Robot, require_local_path
 
 
 def report(
     out: Annotated[str, typer.Argument(help="The dataset: OUT of `tableverse build`, finished or not.")],
     dest: Annotated[
         Path | None,
-        typer.Option(help="Folder of the gallery; by default OUT-gallery beside the dataset, or here for s3://…."),
+        typer.Option(
+            callback=require_local_path,
+            help="Folder of the gallery; by default OUT-gallery beside the dataset, or here for s3://….",
+        ),
     ] = None,
     jobs: Jobs = None,
     renders: Annotated[

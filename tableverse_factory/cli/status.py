@@ -64,9 +64,8 @@ def status(
     else:
         _print_state(state, place)
         if cut:
-            print(
-                f"damaged, as by a loss of power: {pluralize(len(cut), 'scene')} of those done ({', '.join(cut[:3])})"
-            )
+            shown = ", ".join(map(sanitize_line, cut[:3]))
+            print(f"damaged, as by a loss of power: {pluralize(len(cut), 'scene')} of those done ({shown})")
         _print_judgements(verdicts)
         _print_doubts(doubtful)
         _print_costs(*asked)
@@ -148,7 +147,7 @@ def _print_state(state: "BuildState", out: "StoragePath") -> None:
     if losses:
         table = make_table("status", "stage", "why", figures=["scenes"], title="lost")
         for (status, stage, why), count in losses.items():
-            table.add_row(status, stage, sanitize_line(why, 80), str(count))
+            table.add_row(*(sanitize_line(text, 80) for text in (status, stage, why)), str(count))
         console.print(table)
         for line in explain_reasons(why for _, _, why in losses):
             print(line)
@@ -157,7 +156,7 @@ def _print_state(state: "BuildState", out: "StoragePath") -> None:
         table = make_table("stage", figures=("scenes", "median", "p90", "total", "share"), title="CPU seconds")
         for cost in costs:
             figures = (f"{cost.median_cpu_s:.2f}", f"{cost.p90_cpu_s:.2f}", f"{cost.total_cpu_s:.1f}")
-            table.add_row(cost.stage, str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
+            table.add_row(sanitize_line(cost.stage, 80), str(cost.scenes), *figures, f"{cost.total_cpu_s / total:.0%}")
         console.print(table)
     writer = describe_writer(out / WORK / LOCK)
     if writer is not None:
@@ -193,7 +192,7 @@ def _print_doubts(doubtful: "Sequence[str]") -> None:
     from tableverse_factory.dataset.doubtful_scales import DOUBTFUL_DEVIATION
 
     if doubtful:
-        shown = f"{', '.join(doubtful[:3])}{', …' if len(doubtful) > 3 else ''}"
+        shown = f"{', '.join(map(sanitize_line, doubtful[:3]))}{', …' if len(doubtful) > 3 else ''}"
         print(
             f"known length over {DOUBTFUL_DEVIATION:g} standard deviations from what the depth model estimated, "
             f"check it: {pluralize(len(doubtful), 'scene')} ({shown})"

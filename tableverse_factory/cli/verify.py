@@ -70,6 +70,8 @@ def verify(
         raise typer.BadParameter("--robot is the arm of trajectories: give --trajectories too")
     if epsilon_m is not None and _is_dataset(path):
         raise typer.BadParameter("--epsilon is for MJCF files: the certificates of a dataset state theirs")
+    if root is not None and _is_dataset(path):
+        raise typer.BadParameter("--root is for MJCF files: the scenes of a dataset are whole")
     if engine != "mujoco" and (trajectories or not _is_dataset(path)):
         raise typer.BadParameter("--engine is for the scenes of a dataset, without --trajectories")
     if trajectories and _is_dataset(path):

@@ -5,6 +5,11 @@ import re
 
 _TOKEN = re.compile(r"hf_[A-Za-z0-9]{4,}|(?i:bearer\s+\S+)")
 _QUERY = re.compile(r"\?[^\s\"'<>)]*")
+_IRREGULAR_PLURALS = (
+    "people:person men:man women:woman children:child feet:foot gentlemen:gentleman knives:knife loaves:loaf "
+    "halves:half shelves:shelf leaves:leaf mice:mouse glasses:glasses scissors:scissors"
+)
+_IRREGULAR = dict(pair.split(":") for pair in _IRREGULAR_PLURALS.split())
 _HOST = re.compile(r"(?<=://)[^/\s\"'<>)?]*")
 
 
@@ -29,6 +34,17 @@ def describe_change(name: str, before: object, now: object) -> str:
 def pluralize(number: int, noun: str) -> str:
     """Format a number with a noun that takes an s: `1 row`, `2 rows`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def to_singular(word: str) -> str:
+    """Turn a lower-case English noun into its singular; *glasses* and *scissors* are words of their own."""
+    if word in _IRREGULAR:
+        return _IRREGULAR[word]
+    if len(word) > 4 and word.endswith("ies"):
+        return f"{word[:-3]}y"
+    if len(word) > 4 and word.endswith(("ches", "shes", "xes", "sses", "oes")):
+        return word[:-2]
+    return word[:-1] if len(word) > 3 and word.endswith("s") and not word.endswith(("ss", "us", "is")) else word
 
 
 def describe_error(error: BaseException) -> str:

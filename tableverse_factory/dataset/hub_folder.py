@@ -5,7 +5,6 @@ from typing import Any
 
 from tableverse_factory.dataset.http_dataset import WebFolder
 from tableverse_factory.dataset.hub_client import call_hub
-from tableverse_factory.dataset.hub_errors import translate_errors
 from tableverse_factory.dataset.hub_names import LIBRARY, make_hub_api, parse_hub_address
 
 
@@ -45,6 +44,6 @@ class HubFolder(WebFolder):
 def open_hub_folder(text: str) -> HubFolder:
     """Open the dataset at `hf://datasets/OWNER/NAME[@REVISION]` at the commit that the revision names now."""
     (name, revision), api = parse_hub_address(text), make_hub_api()
-    with translate_errors(f"hf://datasets/{name}@{revision}"):
-        commit = api.repo_info(name, revision=revision, repo_type="dataset").sha
+    place = f"hf://datasets/{name}@{revision}"
+    commit = call_hub(place, lambda: api.repo_info(name, revision=revision, repo_type="dataset").sha)
     return HubFolder(f"{api.endpoint}/datasets/{name}/resolve/{commit}", name, str(commit))

@@ -48,6 +48,9 @@ def tokenize(text: str) -> list[Token]:
             bad = Token("end", text[start], start, start + 1)
             raise make_query_error(f"{bad.text!r} is not understood{_HINTS.get(bad.text, '')}", text, bad)
         kind = str(match.lastgroup)
+        if not match[kind].isascii() and any("\ud800" <= c <= "\udfff" for c in match[kind]):  # bytes of the shell
+            token = Token(kind, match[kind], match.start(kind), match.end())
+            raise make_query_error(f"{token.text!r} is not UTF-8", text, token)
         found = match[kind].lower() if match[kind].lower() in _KEYWORDS else match[kind]
         tokens.append(Token("keyword" if found in _KEYWORDS else kind, found, match.start(kind), match.end()))
         position = match.end()

@@ -10,6 +10,7 @@ import numpy as np
 from schemas.geometry import Picture
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.png import encode_png
+from tableverse_factory.core.storage.untrusted import parse_json
 from tableverse_factory.physics.render.domain_randomization import randomize_appearance
 from tableverse_factory.sources.textures.catalogue import TILE_M, make_texture, name_texture, parse_texture_seed
 
@@ -65,10 +66,7 @@ def _describe_texture(table_texture: TableTexture | None) -> str | None:
 def _update_meta(files: Mapping[str, bytes], changed: Mapping[str, bytes], style: dict[str, Any]) -> bytes:
     """Update the digests of changed files in `meta.json`, so that `verify` accepts the rest as exported."""
     data = files["meta.json"]
-    try:
-        meta = json.loads(data)
-    except ValueError as error:
-        raise InputError(f"meta.json does not parse: {error}"[:300], "bad_meta") from None
+    meta = parse_json(data, "meta.json", "bad_meta")
     if not isinstance(meta, dict) or not isinstance(meta.get("files"), dict):
         return data
     for name in changed:

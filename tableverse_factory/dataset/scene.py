@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.dataset.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -58,7 +58,11 @@ class Scene:
     @property
     def xml(self) -> str:
         """MJCF text."""
-        return self._read_file("scene.xml").decode()
+        try:
+            return self._read_file("scene.xml").decode()
+        except UnicodeDecodeError as error:
+            problem = f"scene {self.scene_id}: scene.xml is not UTF-8: {describe_error(error)}"
+            raise InputError(problem) from error
 
     @property
     def meta(self) -> dict[str, Any]:

@@ -32,8 +32,10 @@ class SceneMeta:
 
 def read_meta(data: bytes) -> SceneMeta:
     """Read the stored certificate, and the poses before settling."""
+    from tableverse_factory.core.storage.untrusted import parse_json  # imports Pillow, which queries need not load
+
+    content = parse_json(data, "meta.json", "bad_meta")
     try:
-        content = json.loads(data)
         if content["format"] != FORMAT:
             raise InputError(f"meta.json: format {content['format']!r:.60}; this version reads {FORMAT!r}", "bad_meta")
         stored = content["certificate"]
@@ -65,8 +67,10 @@ def read_meta_camera(meta: Mapping[str, Any]) -> PosedCamera | None:
         width, height = int(camera["width"]), int(camera["height"])
         if not (0 < width <= 100_000 and 0 < height <= 100_000 and height <= TALLEST * width):
             raise ValueError(f"{width} × {height} pixels")
+        if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0.0):
+            raise ValueError(f"focal lengths {fx:g}, {fy:g} px, centre {cx:g}, {cy:g}")
         return PosedCamera(Camera(fx, fy, cx, cy, width, height), read_meta_pose(pose, "the camera"))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         problem = f"meta.json: invalid camera: {json.dumps(camera)[:200]}: {error}"[:400]
         raise InputError(problem, "bad_meta") from error
 

@@ -5,6 +5,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
+
 SPLITS = {"train": 0.8, "validation": 0.1, "test": 0.1}
 """Expected shares."""
 _DIGEST = re.compile(r"[0-9a-f]{12}")
@@ -12,7 +15,11 @@ _DIGEST = re.compile(r"[0-9a-f]{12}")
 
 def get_split(row: Mapping[str, Any]) -> str:
     """Get the split that a row of scenes/ states, or where it is of a dataset without, the one of its `scene_id`."""
-    return str(row["split"] or find_split(row["scene_id"]))
+    split = str(row["split"] or find_split(row["scene_id"]))
+    if split not in SPLITS:
+        scene, stated = sanitize_line(str(row["scene_id"]), 80), sanitize_line(repr(split), 80)
+        raise InputError(f"scene {scene}: split {stated} is none of {', '.join(SPLITS)}", "bad_table")
+    return split
 
 
 def find_split(family: str) -> str:

@@ -241,13 +241,15 @@ def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
     """Reject entries with the content of an earlier one as `duplicate_of`; repeated ids get a number."""
     first_of: dict[tuple[SceneKind, str], ImageRow] = {}
     used: set[str] = set()
+    last_number: dict[str, int] = {}  # of each repeated id
     unique = []
     for row in rows:
-        scene_id, number = row.scene_id, 1
+        scene_id, number = row.scene_id, last_number.get(row.scene_id, 1)
         while scene_id in used:
             number += 1
             scene_id = f"{row.scene_id}-{number}"
         used.add(scene_id)
+        last_number[row.scene_id] = number
         row = row.model_copy(update={"scene_id": scene_id})
         if not row.rejected:
             first = first_of.setdefault((row.kind, row.content_sha256), row)

@@ -188,6 +188,7 @@ ERRORS = [
     ("(i < 1", 6, "expected ')'"),
     ("i < 1)", 5, "expected and, or"),
     ("i < 1; drop", 5, "';' is not understood"),
+    ("s = '\udcff'", 4, "is not UTF-8"),
     ("i < 1 && b", 6, "write and"),
     ("b || b", 2, "write or"),
     ("s = 'open", 4, "not closed"),

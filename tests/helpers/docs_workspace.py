@@ -1,9 +1,9 @@
 """A folder in which a page of the documentation is read: what its commands speak of lies there.
 
-`my_captures/`, `my_pictures/` and `captures/` (one synthetic capture), `photos/` with one picture, `images.parquet` of the
-first, `layouts/` with its `truth/`, `meshes/`, `recording/` as Open3D unpacks one, and `out`: the dataset as the first
-command of the page that builds it would leave it, so that building it finds nothing left to do. It is not there where a
-page makes its manifest from something else. `SCENE_ID` is the id of a scene of `out`.
+`my_captures/`, `my_pictures/` and `captures/` (one synthetic capture), `photos/` with one picture, `images.parquet` of
+the first, `layouts/` with its `truth/`, `meshes/`, `recording/` as Open3D unpacks one, and `out`: the dataset as the
+first command of the page that builds it would leave it, so that building it finds nothing left to do. It is not there
+where a page makes its manifest from something else. `SCENE_ID` is the id of a scene of `out`.
 """
 
 import json

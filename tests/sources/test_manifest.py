@@ -123,6 +123,13 @@ def test_the_mesh_counts_for_the_id_of_a_layout(tmp_path):
     assert rows_of(path)[0].scene_id != before
 
 
+def test_rows_of_one_id_are_numbered_each_once(tmp_path):
+    for k in range(40):
+        write_picture(tmp_path / f"{k:02d}" / "a.png", seed=1)
+    ids = [row.scene_id for row in rows_of(tmp_path)]
+    assert ids[1:] == [f"{ids[0]}-{k}" for k in range(2, 41)]
+
+
 def test_a_second_entry_of_the_same_content_is_a_duplicate(tmp_path):
     for name in ("a/mug", "b/mug", "c/other"):
         write_capture(tmp_path / name, 1)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Camera, Points, Pose, Vector3
-from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.scene_meta import read_meta_camera
 from tableverse_factory.delivery.episodes.actors import ArmMeshes
 from tableverse_factory.geometry.math.camera import PosedCamera
 from tableverse_factory.geometry.math.transforms import compose_poses, normalize_quaternion, transform_points
@@ -110,19 +110,11 @@ def _measure_clearance(side: Vector3, target: Vector3, arm: Points) -> float:
 
 def load_scene_camera(meta: dict[str, Any], width: int, height: int) -> PosedCamera | None:
     """Load the photograph's camera, cropped centrally to this size; None where a scene has none."""
-    camera, pose = meta.get("camera"), meta.get("camera_to_table")
-    if camera is None or pose is None:
+    eye = read_meta_camera(meta)
+    if eye is None:
         return None
-    try:
-        fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-        wide, high = int(camera["width"]), int(camera["height"])
-        position, quaternion = (np.array(pose[key], dtype=np.float64) for key in ("position", "quaternion_wxyz"))
-        share = max(width / wide, height / high)
-        left, top = (wide * share - width) / 2, (high * share - height) / 2
-        cx, cy = (cx + 0.5) * share - 0.5 - left, (cy + 0.5) * share - 0.5 - top
-        shown = Camera(fx * share, fy * share, cx, cy, width, height)
-        if position.shape != (3,) or not np.isfinite([*position, fx, fy, cx, cy]).all() or min(wide, high, fx, fy) <= 0:
-            raise ValueError("numbers that make no camera")
-        return PosedCamera(shown, Pose(position, normalize_quaternion(quaternion)))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-        raise InputError(f"meta.json: its camera makes no sense: {str(error)[:200]}", "bad_meta") from error
+    own = eye.camera
+    share = max(width / own.width, height / own.height)
+    left, top = (own.width * share - width) / 2, (own.height * share - height) / 2
+    cx, cy = (own.cx + 0.5) * share - 0.5 - left, (own.cy + 0.5) * share - 0.5 - top
+    return PosedCamera(Camera(own.fx * share, own.fy * share, cx, cy, width, height), eye.camera_to_table)

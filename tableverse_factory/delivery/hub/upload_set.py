@@ -1,5 +1,6 @@
 """Files of a dataset that an upload takes, and reasons to refuse it."""
 
+import shlex
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -106,7 +107,8 @@ def find_refusals(contents: UploadSet, unfinished: bool) -> list[str]:
     profile = _choose_profile(contents.verdicts)
     forbidden = {verdict: count for verdict, count in contents.verdicts.items() if verdict not in PROFILES[profile]}
     option = " --unfinished" if missing and unfinished else ""
-    export = f"tableverse export {contents.out} {contents.out}-public --profile {profile}{option}"
+    out, public = shlex.quote(str(contents.out)), shlex.quote(f"{contents.out}-public")
+    export = f"tableverse export {out} {public} --profile {profile}{option}"
     if forbidden:
         counts = ", ".join(f"{count} {verdict.value}" for verdict, count in forbidden.items())
         total = sum(forbidden.values())

@@ -89,21 +89,40 @@ def _collect_parts(scene: trimesh.Scene) -> list[MaterialPart]:
 
 
 def check_mesh(mesh: TriangleMesh, name: str) -> TriangleMesh:
-    """Return the mesh if it is usable; else raise a `GeometryError`."""
-    if problem := _find_problem(mesh):
+    """Return the mesh, without vertices of no face, if it is usable; else raise a `GeometryError`."""
+    problem = _find_broken_faces(mesh)
+    if not problem:
+        mesh = _drop_loose_vertices(mesh)
+        problem = _find_bad_size(mesh)
+    if problem:
         raise GeometryError(f"mesh {name!r} {problem}")
     return mesh
 
 
-def _find_problem(mesh: TriangleMesh) -> str:
+def _find_broken_faces(mesh: TriangleMesh) -> str:
     if len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         return "has no triangles"
     if len(mesh.faces) > MAX_FACES:
         return f"has {len(mesh.faces)} triangles; at most {MAX_FACES} are taken"
-    if not np.isfinite(mesh.vertices).all():
-        return "holds vertices that are NaN or infinite"
     if int(mesh.faces.min()) < 0 or int(mesh.faces.max()) >= len(mesh.vertices):
         return "has faces that point to missing vertices"
+    return ""
+
+
+def _drop_loose_vertices(mesh: TriangleMesh) -> TriangleMesh:
+    """Drop the vertices of no face: boxes and lowest points are measured over all vertices."""
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[mesh.faces] = True
+    if used.all():
+        return mesh
+    faces = (np.cumsum(used, dtype=np.int32) - 1)[mesh.faces]
+    colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
+    return replace(mesh, vertices=mesh.vertices[used], faces=faces, vertex_colors=colors)
+
+
+def _find_bad_size(mesh: TriangleMesh) -> str:
+    if not np.isfinite(mesh.vertices).all():
+        return "holds vertices that are NaN or infinite"
     farthest = float(np.abs(mesh.vertices).max())
     if farthest > MAX_COORDINATE_M:
         return f"reaches {farthest:g} m from its origin; at most {MAX_COORDINATE_M:g} make sense"

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.geometry import Vector3
+from tableverse_factory.core.text import to_singular
 
 MIN_MASS_KG = 0.002
 MAX_MASS_KG = 30.0
@@ -88,7 +89,7 @@ LEXICON: tuple[tuple[frozenset[str], Material], ...] = tuple(
 def guess_material(label: str) -> Material:
     """Guess the material from the words of a label (untrusted text); `DEFAULT_MATERIAL` where none is known."""
     words = set(re.findall(r"[a-z]+", label.lower()[:500]))
-    words |= {word[:-1] for word in words if word.endswith("s")}
+    words |= {to_singular(word) for word in words} | ({"glass"} if "glasses" in words else set())
     return next((material for keywords, material in LEXICON if words & keywords), DEFAULT_MATERIAL)
 
 

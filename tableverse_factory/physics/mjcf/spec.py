@@ -31,7 +31,8 @@ TORSIONAL_FRICTION = ROLLING_FRICTION = 0.01
 TABLE_FRICTION = 0.8
 TABLE_ROLLING_FRICTION = 1e-4  # a contact takes the larger of two frictions: the object decides how it rolls
 # Time constant [s] and impedance of a contact: at no depth, deep, and the depth between them [m]. MuJoCo is stable down
-# to two steps. Objects sink in by 0.08 mm at most, light ones under heavy ones, and by 0.4 mm at MuJoCo's defaults.
+# to two steps. Things of a table sink in by less than 0.1 mm, and by 0.4 mm at MuJoCo's defaults. The depth grows with
+# the load over the lighter mass: 0.1 mm for 500 times the mass, 0.6 mm for 15,000 times (30 kg on 2 g).
 CONTACT_TIME_S = 0.004
 IMPEDANCE = (0.99, 0.999, 0.0002)
 REST_OPTIONS = {

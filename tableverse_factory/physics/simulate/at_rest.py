@@ -96,7 +96,7 @@ def simulate_to_rest(
     speeds = deque([_compute_speeds(velocity)], maxlen=samples)
     moving = deque([np.ones(len(bodies), dtype=bool)], maxlen=samples)
     held_since, resting, lost = data.time, False, False
-    while data.time < max_time_s and not (resting or lost or _list_warnings(data)):
+    while data.time < max_time_s and not (resting or lost or list_warnings(data)):
         mujoco.mj_step(model, data, nstep=STEPS_PER_SAMPLE)
         before, velocity = velocity, data.qvel[dofs]
         speeds.append(_compute_speeds(velocity))
@@ -107,7 +107,7 @@ def simulate_to_rest(
         resting = data.time - held_since >= HOLD_S
         lost = bool((data.xipos[bodies, 2] < lost_below_m).any())
     poses = read_body_poses(model, data, bodies)
-    return Rest(resting, float(data.time), poses, np.max(speeds, axis=0), np.any(moving, axis=0), _list_warnings(data))
+    return Rest(resting, float(data.time), poses, np.max(speeds, axis=0), np.any(moving, axis=0), list_warnings(data))
 
 
 def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
@@ -135,7 +135,7 @@ def measure_drift(model: mujoco.MjModel, duration_s: float) -> Drift:
     end = read_body_poses(model, data, bodies)
     angles = [rotation_angle(a.quaternion_wxyz, b.quaternion_wxyz) for a, b in zip(start, end, strict=True)]
     moved = data.xipos[bodies] - start_centers
-    return Drift(np.linalg.norm(moved, axis=1), -moved[:, 2], np.array(angles), end, _list_warnings(data))
+    return Drift(np.linalg.norm(moved, axis=1), -moved[:, 2], np.array(angles), end, list_warnings(data))
 
 
 def read_body_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int]) -> tuple[Pose, ...]:
@@ -186,12 +186,13 @@ def _compute_speeds(velocity: Float64[np.ndarray, "n 6"]) -> Float64[np.ndarray,
 
 def _settle_gently(model: mujoco.MjModel, data: mujoco.MjData, duration_s: float) -> None:
     decay = float(np.exp(-GENTLE_RATE * model.opt.timestep))
-    while data.time < duration_s and not _list_warnings(data):
+    while data.time < duration_s and not list_warnings(data):
         mujoco.mj_step(model, data)
         data.qvel *= decay
 
 
-def _list_warnings(data: mujoco.MjData) -> tuple[str, ...]:
+def list_warnings(data: mujoco.MjData) -> tuple[str, ...]:
+    """List the names of MuJoCo's warnings that invalidate a simulation."""
     if not data.warning.number.any():
         return ()
     return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)

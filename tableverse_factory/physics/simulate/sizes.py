@@ -9,6 +9,7 @@ from tableverse_factory.physics.simulate.at_rest import make_quiet_data
 
 MARGIN = 2  # things that are pushed together touch more often than at rest
 _STEP = 32  # sizes are multiples of it
+_ROWS = 512  # geoms that are compared with all others at a time: memory for all at once grows with their square
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +43,12 @@ def count_near_pairs(model: mujoco.MjModel, data: mujoco.MjData) -> int:
     center = data.geom_xpos[solid] + np.einsum("nij,nj->ni", turn, middle)
     reach = np.einsum("nij,nj->ni", np.abs(turn), half) + model.geom_margin[solid, None]
     body = model.body_weldid[model.geom_bodyid[solid]]
-    near = (np.abs(center[:, None] - center[None]) <= reach[:, None] + reach[None]).all(axis=2)
-    return int(np.triu(near & (body[:, None] != body[None]), 1).sum())
+    count = 0
+    for start in range(0, len(solid), _ROWS):
+        own = np.s_[start : start + _ROWS]
+        near = (np.abs(center[own, None] - center[None]) <= reach[own, None] + reach[None]).all(axis=2)
+        count += int((near & (body[own, None] != body[None])).sum())
+    return count // 2
 
 
 def _round_up(count: int) -> int:

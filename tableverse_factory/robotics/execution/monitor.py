@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from schemas.geometry import Vector3
-from tableverse_factory.physics.simulate.at_rest import UNSTABLE
+from tableverse_factory.physics.simulate.at_rest import list_warnings
 from tableverse_factory.robotics.robots.station import Station
 
 
@@ -83,7 +83,7 @@ class ExecutionMonitor:
             moved_m=moved,
             heights_m=centers[:, 2],
             arm_error_rad=float(np.abs(data.qpos[self._station.joint_qpos] - command[:-1]).max()),
-            warnings=_list_warnings(data),
+            warnings=list_warnings(data),
         )
 
     def _list_touching_fingers(self, data: mujoco.MjData) -> int:
@@ -91,12 +91,6 @@ class ExecutionMonitor:
         fingers = self._finger_of[pairs]  # 0 where a geom is none of a finger
         mine = self._bodies[pairs[:, ::-1]] == self._body
         return int(np.bitwise_or.reduce(fingers[mine], initial=0))
-
-
-def _list_warnings(data: mujoco.MjData) -> tuple[str, ...]:
-    if not data.warning.number.any():
-        return ()
-    return tuple(kind.name.removeprefix("mjWARN_").lower() for kind in UNSTABLE if data.warning[kind].number)
 
 
 def _label_finger_geoms(station: Station) -> Int32[np.ndarray, " g"]:

@@ -32,7 +32,7 @@ def _pick(record: object, *names: str) -> dict[str, Any]:
 def build_scene_row(scene: CuratedScene, certificate: Certificate, sizes: SimulationSizes) -> dict[str, Any]:
     """Build the columns of scenes/ that the scene itself knows; source, status and offsets are the executor's."""
     shifts = [shift for _, shift in certificate.displacement_m] or [0.0]
-    placed = scene.settled.rectified.placed
+    placed, holds = scene.settled.rectified.placed, certificate.at_rest and not certificate.colliding
     return {
         "scene_id": scene.scene_id,
         **describe_metric(placed.evidence),
@@ -41,10 +41,10 @@ def build_scene_row(scene: CuratedScene, certificate: Certificate, sizes: Simula
         "judge": scene.judge,
         "mesh_licences": sorted({item.mesh_licence for item in placed.objects if item.mesh_licence}) or None,
         "n_objects": len(scene.settled.poses),
-        "usable": scene.assessment.usable and certificate.at_rest and not certificate.colliding,
+        "usable": scene.assessment.usable and holds,
         "quality_score": scene.assessment.quality_score,
         **_describe_detector(placed.detection),
-        **_describe_judge(scene.assessment),
+        **_describe_judge(scene.assessment, holds),
         **_pick(certificate, *_CERTIFICATE_COLUMNS),
         "displacement_median_m": float(np.median(shifts)),
         "displacement_max_m": max(shifts),
@@ -63,7 +63,7 @@ def _describe_detector(record: DetectionRecord | None) -> dict[str, Any]:
     return {"detector_model": model, "detector_prompt_sha256": prompt, "detector_remarks": remarks}
 
 
-def _describe_judge(verdict: Assessment) -> dict[str, Any]:
+def _describe_judge(verdict: Assessment, holds: bool) -> dict[str, Any]:
     origin, agreement = verdict.origin, verdict.agreement
     columns: dict[str, Any] = {
         "answered_usable": verdict.answered_usable,
@@ -74,7 +74,8 @@ def _describe_judge(verdict: Assessment) -> dict[str, Any]:
         columns |= {"judge_model": origin.model, "judge_prompt_sha256": origin.prompt_sha256}
     if agreement is not None:
         columns |= {
-            **_pick(agreement, "rules_usable", "rules_score", "rules_tasks"),
+            **_pick(agreement, "rules_score", "rules_tasks"),
+            "rules_usable": agreement.rules_usable and holds,
             "rules_names_share": agreement.names_share,
             "rules_mass_ratio": agreement.mass_ratio,
             "rules_shared_tasks": agreement.shared_tasks,

@@ -9,11 +9,11 @@ from schemas.geometry import Pose, TriangleMesh
 from schemas.known_length import KnownLength, parse_known_length
 from schemas.layout import LayoutObject
 from schemas.manifest import ImageRow, SceneKind
-from schemas.objects import PlacedObject, PlacedObjects, Table
+from schemas.objects import LARGEST_M, SMALLEST_M, PlacedObject, PlacedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import AnswerInvalidError, InputError
-from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
@@ -114,8 +114,13 @@ def _place_entry(entry: LayoutObject, mesh: TriangleMesh) -> PlacedObject:
 
 
 def _fit_table(objects: tuple[PlacedObject, ...]) -> Table:
-    """Fit an axis-aligned table-top under all objects, `TABLE_MARGIN_M` larger on each side."""
-    boxes = [aabb(place_mesh(o.mesh, o.pose, o.scale).vertices) for o in objects]
+    """Fit an axis-aligned table-top under all objects of plausible size, `TABLE_MARGIN_M` larger on each side.
+
+    Rectification leaves the others out; a mesh in millimetres would make a table of a hundred metres.
+    """
+    sizes = [o.scale * float(aabb_size(o.mesh.vertices).max()) for o in objects]
+    plausible = [o for o, size in zip(objects, sizes, strict=True) if SMALLEST_M <= size <= LARGEST_M]
+    boxes = [aabb(place_mesh(o.mesh, o.pose, o.scale).vertices) for o in plausible or objects]
     low = np.min([box[0] for box in boxes], axis=0)[:2]
     high = np.max([box[1] for box in boxes], axis=0)[:2]
     return Table((low + high) / 2, (high - low) / 2 + TABLE_MARGIN_M, 0.0, TABLE_COLOR, 0.0)

@@ -7,18 +7,18 @@ from jaxtyping import Bool
 from scipy.spatial import cKDTree
 
 from schemas.config import Config, PerceiveConfig
-from schemas.geometry import Colors, IdImage, Mask, Points
+from schemas.geometry import TABLE_ID, Colors, IdImage, Mask, Points
 from schemas.identity import make_object_id
 from schemas.objects import PerceivedObject, PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.explanation import measure_explanation
 from tableverse_factory.stages.perceive.picture.detector import find_table_top
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
-from tableverse_factory.stages.perceive.scale.known_length import find_scaled_table, scale_by_object
+from tableverse_factory.stages.perceive.scale.known_length import find_scaled_table, scale_by_height
 from tableverse_factory.stages.perceive.table import (
     compute_camera_to_table,
     fit_table_rectangle,
@@ -53,7 +53,7 @@ def perceive(
         ids = segment_boxes(view, found, config)
         candidates = tuple(replace(candidate, instance=k) for k, candidate in enumerate(candidates, start=1))
         view = refit_table_to_mask(view, ids == TABLE_ID, rng)
-    scaled = scale_by_object(view, candidates, ids)
+    scaled = scale_by_height(view, item, candidates, ids)
     if isinstance(scaled, Dropped):
         return scaled
     view = scaled

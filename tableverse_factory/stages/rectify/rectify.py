@@ -8,7 +8,7 @@ import numpy as np
 
 from schemas.config import Config, RectifyConfig
 from schemas.geometry import ConvexPieces
-from schemas.objects import PlacedObject, PlacedObjects
+from schemas.objects import LARGEST_M, SMALLEST_M, PlacedObject, PlacedObjects
 from schemas.outcome import Done, Dropped, Outcome
 from schemas.scene import RectifiedLayout
 from tableverse_factory.core.errors import GeometryError
@@ -16,13 +16,13 @@ from tableverse_factory.geometry.collision.penetration import measure_piece_pene
 from tableverse_factory.geometry.convex.decompose import decompose
 from tableverse_factory.geometry.math.aabb import aabb_size
 from tableverse_factory.models.services import Services
+from tableverse_factory.physics.bodies.prior_mass import make_prior_body
 from tableverse_factory.stages.rectify.composites import assemble_composites
 from tableverse_factory.stages.rectify.joint import rectify_jointly
 from tableverse_factory.stages.rectify.lccr import RectificationResult, rectify_lccr
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, make_rigid_part
 
 MAX_REASON_CHARS = 300
-SMALLEST_M, LARGEST_M = 0.001, 5.0  # sides of plausible objects
 
 METHODS: dict[str, Callable[[Sequence[RigidPart], RectifyConfig], RectificationResult]] = {
     "lccr": rectify_lccr,
@@ -35,14 +35,18 @@ def rectify(
 ) -> Outcome[RectifiedLayout]:
     """Fill the containers of a layout, then move its objects apart until none touch, on pieces and on meshes.
 
-    Objects with irreparable meshes, and contents that do not fit, are left out with the reason.
+    Objects with meshes that cannot be repaired or simulated, and contents that do not fit, are left out with a reason.
     """
     decomposed: dict[str, ConvexPieces] = {}
     refused: dict[str, str] = {}
     for placed in item.objects:
         try:
             _check_size(placed)
-            decomposed[placed.object_id] = placed.pieces or decompose(placed.mesh, config.rectify, services.cache_dir)
+            pieces_of_mesh = placed.pieces or decompose(placed.mesh, config.rectify, services.cache_dir)
+            make_prior_body(
+                placed, pieces_of_mesh, placed.pose
+            )  # refuses what is too thin to simulate, as settle would
+            decomposed[placed.object_id] = pieces_of_mesh
         except GeometryError as error:
             refused[placed.object_id] = str(error)[:MAX_REASON_CHARS]
     if not decomposed:

@@ -9,6 +9,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.apart import require_apart
 from tableverse_factory.core.storage.files import write_atomic
 from tableverse_factory.dataset.dataset import Dataset
+from tableverse_factory.viz.destination import find_local_folder
 from tableverse_factory.viz.funnel import FunnelStep, compute_funnel
 from tableverse_factory.viz.overview.dataset_statistics import Statistics, compute_statistics
 from tableverse_factory.viz.overview.figure import draw_overview
@@ -18,7 +19,8 @@ def write_statistics(dataset: Dataset, dest: Path) -> tuple[Path, ...]:
     """Write the statistics of the committed shards into a folder apart from the dataset; return the files' paths."""
     if dest.exists() and not dest.is_dir():
         raise InputError(f"{dest}: a file; give a folder")
-    require_apart(dest, Path(dataset.path), may_hold=True)
+    if (folder := find_local_folder(dataset.path)) is not None:
+        require_apart(dest, folder, may_hold=True)
     statistics, steps, content = _compute_all(dataset)
     files = {
         "statistics.json": (json.dumps(content, indent=1, sort_keys=True, allow_nan=False) + "\n").encode(),

@@ -39,6 +39,15 @@ def test_a_box_comes_through_every_format(suffix):
     assert mesh.faces.dtype == np.int32
 
 
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_vertices_of_no_face_are_dropped_before_anything_is_measured(suffix):
+    loose = trimesh.Trimesh([*BOX.vertices, [0, 0, -5e6]], BOX.faces, vertex_colors=np.arange(36).reshape(9, 4))
+    mesh = read_mesh(loose.export(file_type=suffix), f"box.{suffix}")
+    assert len(mesh.vertices) == 8
+    assert np.abs(mesh.vertices).max() == pytest.approx(0.15)
+    assert compute_signed_volume(mesh) == pytest.approx(0.006, rel=1e-5)
+
+
 def test_glb_is_turned_from_y_up():
     mesh = read_mesh(FILES["glb"], "box.glb")
     low, high = aabb(mesh.vertices)

@@ -55,6 +55,14 @@ def test_matter_comes_before_kind_and_plurals_count() -> None:
     assert guess_material('"/><x a=').name == guess_material("nothing known").name
 
 
+@pytest.mark.parametrize(
+    ("many", "one"),
+    [("wine glasses", "wine glass"), ("dishes", "dish"), ("knives", "knife"), ("strawberries", "strawberry")],
+)
+def test_several_are_of_the_same_matter_as_one(many: str, one: str) -> None:
+    assert guess_material(many) == guess_material(one) != guess_material("nothing known")
+
+
 def test_a_word_inside_a_word_is_not_that_word() -> None:
     assert guess_material("candle") != guess_material("can")
     assert guess_material("cupboard") != guess_material("cup")

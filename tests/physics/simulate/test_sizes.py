@@ -26,6 +26,13 @@ def test_near_pairs_are_those_whose_boxes_overlap(places, pairs):
     assert count_near_pairs(model, data) == pairs
 
 
+def test_a_scene_of_many_geoms_is_counted_in_blocks():
+    model = boxes(*(f"{k % 30} {k // 30} 0.0999" for k in range(600)))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert count_near_pairs(model, data) == sum(k % 30 < 6 and k // 30 < 6 for k in range(600)), "those on the table"
+
+
 def test_sizes_hold_twice_what_the_first_state_needs():
     model = boxes(*(f"{k} 0 0.0999" for k in range(5)))
     data = mujoco.MjData(model)

@@ -238,6 +238,14 @@ def test_a_layout_comes_through_with_its_poses_and_a_table_around_it(tmp_path):
     assert (np.abs(vertices - found.table.center_xy) < found.table.half_size_xy - 0.1).all()
 
 
+def test_a_mesh_in_millimetres_makes_no_table_of_a_hundred_metres(tmp_path):
+    path = write_layout(tmp_path / "a.json")
+    layout = json.loads(path.read_text())
+    layout["objects"].append({**layout["objects"][0], "id": "obj_001", "scale": 1000.0})
+    path.write_text(json.dumps(layout))
+    assert (laid_out(path).value.table.half_size_xy < 1.0).all()
+
+
 @pytest.mark.parametrize("mesh", ["mug.obj", "./mug.obj", "../meshes/mug.obj", "deep/../mug.obj"])
 def test_meshes_may_lie_beside_the_layout_or_beside_its_folder(tmp_path, mesh):
     path = write_layout(tmp_path / "l" / "a.json", mesh=mesh)

@@ -92,6 +92,15 @@ def test_what_is_no_thing_on_a_table_is_left_out(size: float, tmp_path: Path) ->
     assert f"{size:.3g} m" in layout.placed.left_out[0][1]
 
 
+@pytest.mark.parametrize("thickness", [1e-6, 1e-5])
+def test_what_is_too_thin_to_simulate_does_not_cost_the_scene(thickness: float, tmp_path: Path) -> None:
+    foil = placed("foil", box(0.1, 0.1, thickness), (0.3, 0, 0))
+    layout = done(run(scene(foil, placed("good", ball(0.05), (0, 0, 0.05))), tmp_path))
+    assert [name for name, _ in layout.placed.left_out] == ["foil"]
+    assert "thick" in layout.placed.left_out[0][1]
+    assert [item.object_id for item in layout.placed.objects] == ["good"]
+
+
 def test_a_scene_without_a_usable_mesh_is_dropped(tmp_path: Path) -> None:
     outcome = run(scene(placed("a", NAN, (0, 0, 0)), placed("b", LINE, (0, 0, 0))), tmp_path)
     assert isinstance(outcome, Dropped)

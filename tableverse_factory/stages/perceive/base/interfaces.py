@@ -11,7 +11,6 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.table_view import TableView
 
 PixelBox = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax [px]
-TABLE_ID = -1  # value of table-top pixels in an image of ids
 
 
 @dataclass(frozen=True, slots=True)

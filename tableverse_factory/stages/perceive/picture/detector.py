@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 
 from schemas.config import Config
-from schemas.geometry import IdImage, Mask
+from schemas.geometry import TABLE_ID, IdImage, Mask
 from schemas.observation import Observation
 from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
 from tableverse_factory.models.picture.predict import (
@@ -18,7 +18,7 @@ from tableverse_factory.models.picture.predict import (
     predict_window,
 )
 from tableverse_factory.models.services import Services
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.object_filter import (
     keep_objects,
     renumber_regions,

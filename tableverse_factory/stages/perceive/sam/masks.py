@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from schemas.geometry import Frozen, Picture
+from schemas.geometry import TABLE_ID, Frozen, Picture
 from tableverse_factory.models.local.device import Tensor, import_torch
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID
 
 REACH = 0.25  # maximum distance of contents from their container's mask, in shorter sides of its box
 MIN_FILL = 0.1  # share of its box that a container's mask must fill to be used; a tray seen edge-on fills a fifth

@@ -46,7 +46,7 @@ class ScaleFactor:
 def find_scaled_table(
     item: Observation, rng: np.random.Generator, table_top: Mask | None = None
 ) -> TableView | Dropped:
-    """Find the table in the scale of the known length; the height of an object waits for `scale_by_object`.
+    """Find the table in the scale of the known length; heights over the table wait for `scale_by_height`.
 
     The table lies among the pixels `table_top`, None for all. The scene is dropped for `known_length_unmeasured`,
     `scale_implausible` or `scale_contradicts_sensor`.
@@ -64,32 +64,50 @@ def _find_scaled_table(item: Observation, rng: np.random.Generator, table_top: M
     elif isinstance(known, KnownSheet):
         item = _scale(item, compute_factor(item, known.size_m[0], measure_sheet(item, known)))
     view = find_table(item, rng, table_top)
-    if isinstance(view, Dropped) or not isinstance(known, KnownCameraHeight):
+    if isinstance(view, Dropped) or not isinstance(known, KnownCameraHeight) or item.scale_source == "sensor":
         return view
-    factor = compute_factor(item, known.length_m, measure_camera_height(view, known))
-    return view if factor is None else find_table(_scale(item, factor), rng, table_top)
+    value = known.length_m / measure_camera_height(view, known).length_m  # of this plane; detectors may find another
+    if not SMALLEST <= value <= LARGEST:
+        return view
+    return find_table(replace(item, depth=item.depth * np.float32(value)), rng, table_top)
 
 
-def scale_by_object(view: TableView, candidates: tuple[Candidate, ...], ids: IdImage) -> TableView | Dropped:
-    """Scale a view by the known height of one of its objects, if there is one; dropped as in `find_scaled_table`."""
+def scale_by_height(
+    view: TableView, item: Observation, candidates: tuple[Candidate, ...], ids: IdImage
+) -> TableView | Dropped:
+    """Scale a view by the known height of one of its objects, or of the camera, over the table that was found at last.
+
+    `item` is the observation as it came: the factor is of its depth. Dropped as in `find_scaled_table`.
+    """
     known = view.observation.known_length
-    if not isinstance(known, KnownHeight):
-        return view
     try:
-        measured = measure_object_height(view, known, _find_object(known, candidates, ids, view.valid))
-        factor = compute_factor(view.observation, known.length_m, measured)
+        if isinstance(known, KnownCameraHeight):
+            measured, own = measure_camera_height(view, known), _compare_depth(item, view.observation)
+            measured = replace(measured, length_m=measured.length_m * own)
+        elif isinstance(known, KnownHeight):
+            measured, own = measure_object_height(view, known, _find_object(known, candidates, ids, view.valid)), 1.0
+        else:
+            return view
+        factor = compute_factor(item, known.length_m, measured)
     except InputError as error:
         return Dropped(error.reason, str(error))
     if factor is None:
         return view
+    value = factor.value * own
     return replace(
         view,
-        observation=_scale(view.observation, factor),
-        points_camera=view.points_camera * factor.value,
-        plane=Plane(view.plane.normal, view.plane.offset * factor.value),
-        outline_xy=view.outline_xy * factor.value,
-        heights=view.heights * factor.value,
+        observation=_scale(item, factor),
+        points_camera=view.points_camera * value,
+        plane=Plane(view.plane.normal, view.plane.offset * value),
+        outline_xy=view.outline_xy * value,
+        heights=view.heights * value,
     )
+
+
+def _compare_depth(item: Observation, scaled: Observation) -> float:
+    """Compare the depth of an observation with that of the same one in another scale, as a ratio."""
+    at = np.unravel_index(int(np.argmax(scaled.depth)), scaled.depth.shape)
+    return float(item.depth[at]) / float(scaled.depth[at])
 
 
 def compute_factor(item: Observation, known_m: float, measured: MeasuredLength) -> ScaleFactor | None:

@@ -9,6 +9,8 @@ import re
 import unicodedata
 from dataclasses import dataclass, replace
 
+from tableverse_factory.core.text import to_singular
+
 _CUT = re.compile(r"[(\[{,;:/|]")
 _WORD = re.compile(r"[^\W\d_]+")
 _MAX_CHARS = 200
@@ -19,11 +21,6 @@ def split_words(words: str) -> frozenset[str]:
     return frozenset(words.split())
 
 
-_IRREGULAR_PLURALS = (
-    "people:person men:man women:woman children:child feet:foot gentlemen:gentleman knives:knife loaves:loaf "
-    "halves:half shelves:shelf leaves:leaf mice:mouse glasses:glasses scissors:scissors"
-)
-_IRREGULAR = dict(pair.split(":") for pair in _IRREGULAR_PLURALS.split())
 _ENDS_PHRASE = split_words(
     "with in on at near by from for to under over behind beside inside holding wearing containing full filled that"
 )
@@ -194,20 +191,10 @@ def parse_label(label: str, ends: frozenset[str] = _ENDS_PHRASE) -> LabelPhrase:
     """Parse a label up to the first of the words that end it; its words become lower case and singular."""
     text = unicodedata.normalize("NFKC", label[:_MAX_CHARS]).casefold().replace("'s", "").replace("’s", "")
     cut = _CUT.split(text.lstrip(" ([{,;:/|"))[0]
-    words = [_to_singular(word) for word in _WORD.findall(cut)]
+    words = [to_singular(word) for word in _WORD.findall(cut)]
     words = words[: next((k for k, word in enumerate(words) if k > 0 and word in ends), None)]
     of = words.index("of") if "of" in words[1:] else len(words)
     noun, after = words[:of], words[of + 1 :]
     while len(noun) > 1 and noun[-1] in _TRAILING:
         noun.pop()
     return LabelPhrase(noun[-1], tuple(noun[:-1]), tuple(after)) if noun else LabelPhrase("object", (), ())
-
-
-def _to_singular(word: str) -> str:
-    if word in _IRREGULAR:
-        return _IRREGULAR[word]
-    if len(word) > 4 and word.endswith("ies"):
-        return f"{word[:-3]}y"
-    if len(word) > 4 and word.endswith(("ches", "shes", "xes", "sses", "oes")):
-        return word[:-2]
-    return word[:-1] if len(word) > 3 and word.endswith("s") and not word.endswith(("ss", "us", "is")) else word

@@ -6,13 +6,12 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 from skimage.color import rgb2lab
 
-from schemas.geometry import Camera, DepthImage, IdImage, Mask, Picture, Points, Pose
+from schemas.geometry import TABLE_ID, Camera, DepthImage, IdImage, Mask, Picture, Points, Pose
 from tableverse_factory.geometry.math.camera import backproject, project
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 
 Planes = Float64[np.ndarray, "3 h w"]
 
-TABLE_ID = -1
 THINNED_PX = 2.0
 THINNED_STEP_M = 0.006
 LOST_HEIGHT_M = 0.01

@@ -113,6 +113,13 @@ def test_a_known_length_brings_metres_back(name, factor):
 
 
 @pytest.mark.heavy
+@pytest.mark.parametrize("factor", [0.7, 1.0, 3.0])
+def test_the_camera_stands_as_high_as_is_known_over_the_table_found_at_last(factor):
+    found = perceived(estimated(factor, KNOWN["the camera's height"])).value
+    assert found.camera_to_table.position[2] == pytest.approx(0.6, rel=1e-5)
+
+
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", typical(KNOWN))
 def test_what_is_known_of_bent_depth_is_as_sure_as_it_says(name):
     """Over smooth bends of 1.2 %, the error stays within three of the stated deviations.
