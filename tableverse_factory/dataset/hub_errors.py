@@ -7,14 +7,14 @@ from tableverse_factory.core.errors import StoreError
 from tableverse_factory.core.retry import parse_retry_after
 from tableverse_factory.core.text import redact_secrets
 
-_GO_ON = "Run the same command again: what was done stays"
+_GO_ON = "What was done stays: run the same command again"
 
 _CHANGED = 412
 _PASSING = frozenset({409, 429, 500, 502, 503, 504})
 _BY_STATUS = {
     401: "the Hub does not know the token: set HF_TOKEN, or log in with `hf auth login`",
     402: "the account's storage is used up",
-    403: "the token may not do this; uploads need write access to this owner: huggingface.co/settings/tokens",
+    403: "the token may not do this: an upload needs write access to this owner (huggingface.co/settings/tokens)",
     404: "there is no such dataset, or the token may not see it",
     409: "another process is changing the dataset just now",
     _CHANGED: "another process changed the dataset",

@@ -259,7 +259,7 @@ def test_a_hub_that_is_busy_is_asked_again(hub, dataset, run, fault):
     ("fault", "said"),
     [
         (failing(401, 99, "POST /api/repos/create"), "the Hub does not know the token: set HF_TOKEN, or log in"),
-        (failing(403, 99, "POST /api/repos/create"), "the token may not do this: it needs write access"),
+        (failing(403, 99, "POST /api/repos/create"), "the token may not do this: an upload needs write access"),
         (failing(403, 99, "PUT /storage"), "the token may not do this"),
         (failing(404, 99, "/preupload/"), "there is no such dataset"),
         (failing(413, 99, "/commit/main"), "a file or a commit too large"),

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from schemas.config import Config
-from schemas.geometry import IdImage
+from schemas.geometry import TABLE_ID, IdImage
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.outcome import Done, Dropped, Outcome
@@ -20,7 +20,7 @@ from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.picture.detector import (
     detect_in_picture,

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from schemas.config import Config
+from schemas.geometry import TABLE_ID
 from tableverse_factory.core.errors import ModelAccessError
 from tableverse_factory.models.local.device import Device, import_torch
 from tableverse_factory.models.local.model_daemon import close_connections
 from tableverse_factory.models.local.pixels import compute_pixel_values, upload_image
-from tableverse_factory.stages.perceive.base.interfaces import TABLE_ID, Candidate, DetectionResult
+from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
 from tableverse_factory.stages.perceive.perceive import segment_boxes
 from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, compute_id_image, group_by_depth
 from tableverse_factory.stages.perceive.sam.model import load_sam
