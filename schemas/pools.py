@@ -6,6 +6,9 @@ from pydantic import Field, model_validator
 
 from schemas.config import Section
 
+RAY_NAMES = ("CPU", "GPU", "memory", "object_store_memory")  # resources that Ray takes by keywords of their own
+STEPS = 10_000  # of a resource that Ray tells apart
+
 Amount = Annotated[float, Field(ge=0.0, le=1e6, allow_inf_nan=False)]
 ResourceName = Annotated[str, Field(max_length=100, pattern=r"^[A-Za-z0-9_.:/-]+$")]
 
@@ -32,6 +35,11 @@ class PoolSpec(Section):
     def _check_bounds(self) -> "PoolSpec":
         if self.gpus > 1 and self.gpus != int(self.gpus):
             raise ValueError(f"gpus {self.gpus:g}: give a fraction of one GPU, or a whole number of them")
+        if taken := sorted({*RAY_NAMES} & {*self.resources}):
+            raise ValueError(f"resources {', '.join(taken)}: give cpus, gpus or memory_mb")
+        for name, amount in {"cpus": self.cpus, "gpus": self.gpus, **self.resources}.items():
+            if abs(amount * STEPS - round(amount * STEPS)) > 1e-6 * max(1.0, amount * STEPS):
+                raise ValueError(f"{name} {amount:g}: Ray counts in steps of {1 / STEPS:g}")
         if self.max is not None and self.min > self.max:
             raise ValueError(f"min {self.min} is more than max {self.max}")
         if not (self.cpus or self.gpus or self.memory_mb or any(self.resources.values())):

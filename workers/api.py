@@ -14,6 +14,7 @@ from tableverse_factory.core.config import load_config
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.pools_file import load_pools
 from tableverse_factory.core.storage.files import StoragePath, parse_path
+from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.model_costs import MODEL_ROLE_BY_STAGE
 from tableverse_factory.dataset.shard_plan import parse_shards
 from tableverse_factory.rebuild import config_from_run
@@ -27,6 +28,7 @@ from workers.run import PIPELINE, WITH_TRAJECTORIES, BuildRequest, BuildSummary,
 
 ADDED_STAGES = "+trajectories"  # value of `--stages`: stages that are added to the usual ones
 TRAJECTORIES = "trajectories"
+EXECUTORS = ("local", "ray")
 
 
 def build(
@@ -61,7 +63,7 @@ def build(
         config: YAML file with the keys that differ from the defaults.
         overrides: Keys of the configuration and their values, e.g. `{"run.seed": 7}` or `["run.seed=7"]`.
         executor: `local` for one process, `ray` for as many workers as there are CPUs.
-        workers: Calls in flight on Ray; None for one per CPU.
+        workers: CPUs that the actors of the build hold together on Ray; None for all.
         address: `HOST:PORT` of a running Ray cluster, or `auto`; None for Ray on this machine.
         pools: YAML file with the resources of each pool of actors.
         stages: `+trajectories` to end with trajectories proven in simulation.
@@ -89,6 +91,7 @@ def build(
         >>> state = summary.read_state()
         >>> state.done, state.dropped, state.failed
     """
+    _check_arguments(executor, workers, limit, max_usd, max_calls)
     place = parse_path(os.fspath(out))
     pipeline = WITH_TRAJECTORIES if manifest is None else _choose_pipeline(stages, from_stage)
     if executor == "ray" and address not in (None, "auto"):
@@ -121,6 +124,22 @@ def build(
     )
     with open_display(display) as shown:
         return run_build(request, shown, signals)
+
+
+def _check_arguments(
+    executor: str, workers: int | None, limit: int | None, max_usd: float | None, max_calls: int | None
+) -> None:
+    """Refuse what the options of the command would refuse."""
+    if executor not in EXECUTORS:
+        raise ConfigError(f"executor {sanitize_line(repr(executor), 80)}: give {' or '.join(EXECUTORS)}")
+    for name, value, least in (
+        ("workers", workers, 1),
+        ("limit", limit, 1),
+        ("max_usd", max_usd, 0),
+        ("max_calls", max_calls, 0),
+    ):
+        if value is not None and value < least:
+            raise ConfigError(f"{name} {value}: give {least} or more, or None for no bound")
 
 
 def _format_overrides(overrides: Mapping[str, object] | Sequence[str]) -> list[str]:

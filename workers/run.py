@@ -56,7 +56,7 @@ class BuildRequest:
     config: Config
     cache_dir: Path
     executor: Literal["local", "ray"] = "local"
-    workers: int | None = None  # calls in flight with `ray`; None for one per CPU
+    workers: int | None = None  # CPUs that actors hold together with `ray`; None for all
     address: str | None = None  # a running Ray cluster; None for one on this machine that ends with the build
     pools: Pools = field(default_factory=Pools)  # resources of the actors of each pool, with `ray`
     from_stage: str | None = None  # section of the first stage to compute again; None to resume

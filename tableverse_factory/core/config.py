@@ -26,6 +26,9 @@ RUNTIME_SECTIONS = frozenset({"asking"})  # Sections that may change between run
 _OVERRIDE_PREFIX = "--set or override: "  # Start of messages about overrides
 
 
+_TAG_ERRORS = (ValueError, KeyError, IndexError, AttributeError)  # of `!!bool maybe`, `!!int ''`, `!!timestamp x`
+
+
 class _StrictLoader(yaml.SafeLoader):
     """Safe YAML without aliases, which can blow up, and without repeated keys."""
 
@@ -153,7 +156,7 @@ def load_yaml(path: Path) -> dict[str, Any]:
         tree = yaml.load(data, _StrictLoader)  # noqa: S506 a SafeLoader with less
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, *_TAG_ERRORS) as error:
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:300]}") from None
     if tree is None:
         return {}
@@ -171,7 +174,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
         )
     try:
         return key, yaml.load(value, _StrictLoader)  # noqa: S506 a SafeLoader with less
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, RecursionError, *_TAG_ERRORS) as error:
         raise ConfigError(
             f"{_OVERRIDE_PREFIX}{key}: {_shorten_repr(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
         ) from None

@@ -15,7 +15,7 @@ def parse_host_port(address: str) -> tuple[str, int]:
         raise BuildError(
             f"{source} {redact_uri(address)}: give auto, or HOST:PORT of the head node (the port is 6379 by default)"
         )
-    return host, int(port)
+    return host.removeprefix("[").removesuffix("]"), int(port)  # brackets are those of IPv6
 
 
 def reject_secrets(address: str, source: str, expected: str) -> None:

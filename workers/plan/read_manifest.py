@@ -63,6 +63,9 @@ def _read_batches(path: StoragePath) -> Iterator[pa.RecordBatch]:
         if missing:
             has = ", ".join(there)[:300]
             raise InputError(f"{path} lacks the columns {', '.join(missing)}: it has {has}; {_manifest_hint()}")
+        twice = sorted({name for name in MANIFEST.names if there.count(name) > 1})
+        if twice:
+            raise InputError(f"{path} has several columns {', '.join(twice)}: give one of each; {_manifest_hint()}")
         yield from file.iter_batches(BATCH_ROWS, columns=[name for name in MANIFEST.names if name in there])
 
 

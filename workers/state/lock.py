@@ -3,6 +3,7 @@
 import fcntl
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -45,10 +46,13 @@ class FileLock:
     def __exit__(self, *_: object) -> None:
         """Remove the folder of the work if it is empty; the file goes before the lock does."""
         folder = self._path.parent
-        if folder.is_dir() and [path.name for path in folder.iterdir()] == [self._path.name]:
-            self._path.unlink()
-            folder.rmdir()
-        os.close(self._descriptor)
+        try:
+            if folder.is_dir() and [path.name for path in folder.iterdir()] == [self._path.name]:
+                self._path.unlink()
+                with suppress(OSError):  # another command begins in it just now
+                    folder.rmdir()
+        finally:
+            os.close(self._descriptor)
 
     def check(self) -> None:
         """Do nothing: a kernel lock cannot be lost."""
@@ -56,7 +60,10 @@ class FileLock:
     def _acquire(self) -> bool:
         """Lock the file; False if its last holder removed it meanwhile, so that a new one must be created."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        except FileNotFoundError:  # its last holder removed the folder since
+            return False
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             same = self._path.exists() and os.path.samestat(os.fstat(descriptor), self._path.stat())

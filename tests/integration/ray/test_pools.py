@@ -70,6 +70,8 @@ def test_a_file_of_pools(tmp_path):
         "physics: {cpu: 1}": r"physics\.cpu: .*; did you mean cpus\? ",
         "physics: {cpus: -1}": "physics.cpus",
         "physics: {gpus: 1.5}": "a whole number",
+        "physics: {cpus: 0.00001}": "steps of 0.0001",
+        "physics: {resources: {GPU: 1}}": "give cpus, gpus or memory_mb",
         "physics: {min: 3, max: 2}": "min 3 is more than max 2",
         "physics: {cpus: 0}": "must hold something",
     }.items():

@@ -139,3 +139,6 @@ def test_only_columns_of_a_row_are_read_and_damage_is_said(tmp_path):
     write(path, pa.table({"scene_id": ["a"], "other": [1]}))
     with pytest.raises(InputError, match="lacks the columns kind, uri: it has scene_id, other"):
         read_manifest(path)
+    write(path, pa.table([["a"], ["image"], ["b"], ["c"]], names=["scene_id", "kind", "uri", "uri"]))
+    with pytest.raises(InputError, match="has several columns uri: give one of each"):
+        read_manifest(path)
