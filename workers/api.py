@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from schemas.config import Config, RemoteModelSection, StageSection
 from tableverse_factory.core.cache_dir import get_cache_dir
@@ -24,11 +24,10 @@ from workers.driver.signals import StopSignals
 from workers.executors.ray_address import parse_host_port
 from workers.progress.notebook import open_display
 from workers.progress.tally import Display
-from workers.run import PIPELINE, WITH_TRAJECTORIES, BuildRequest, BuildSummary, run_build
+from workers.run import PIPELINE, WITH_TRAJECTORIES, BuildRequest, BuildSummary, ExecutorName, run_build
 
 ADDED_STAGES = "+trajectories"  # value of `--stages`: stages that are added to the usual ones
 TRAJECTORIES = "trajectories"
-EXECUTORS = ("local", "ray")
 
 
 def build(
@@ -37,7 +36,7 @@ def build(
     *,
     config: str | os.PathLike[str] | None = None,
     overrides: Mapping[str, object] | Sequence[str] = (),
-    executor: Literal["local", "ray"] = "local",
+    executor: ExecutorName = "local",
     workers: int | None = None,
     address: str | None = None,
     pools: str | os.PathLike[str] | None = None,
@@ -130,8 +129,8 @@ def _check_arguments(
     executor: str, workers: int | None, limit: int | None, max_usd: float | None, max_calls: int | None
 ) -> None:
     """Refuse what the options of the command would refuse."""
-    if executor not in EXECUTORS:
-        raise ConfigError(f"executor {sanitize_line(repr(executor), 80)}: give {' or '.join(EXECUTORS)}")
+    if executor not in (names := get_args(ExecutorName)):
+        raise ConfigError(f"executor {sanitize_line(repr(executor), 80)}: give {' or '.join(names)}")
     for name, value, least in (
         ("workers", workers, 1),
         ("limit", limit, 1),

@@ -45,6 +45,7 @@ from workers.state.lock import LOCK, create_writer_lock
 
 PIPELINE = "tableverse_factory.pipeline:PIPELINES"
 WITH_TRAJECTORIES = "tableverse_factory.pipeline:WITH_TRAJECTORIES"
+ExecutorName = Literal["local", "ray"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,7 @@ class BuildRequest:
     out: StoragePath  # folder of the dataset
     config: Config
     cache_dir: Path
-    executor: Literal["local", "ray"] = "local"
+    executor: ExecutorName = "local"
     workers: int | None = None  # CPUs that actors hold together with `ray`; None for all
     address: str | None = None  # a running Ray cluster; None for one on this machine that ends with the build
     pools: Pools = field(default_factory=Pools)  # resources of the actors of each pool, with `ray`

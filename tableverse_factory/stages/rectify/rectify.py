@@ -42,19 +42,17 @@ def rectify(
     for placed in item.objects:
         try:
             _check_size(placed)
-            pieces_of_mesh = placed.pieces or decompose(placed.mesh, config.rectify, services.cache_dir)
-            make_prior_body(
-                placed, pieces_of_mesh, placed.pose
-            )  # refuses what is too thin to simulate, as settle would
-            decomposed[placed.object_id] = pieces_of_mesh
+            pieces = placed.pieces or decompose(placed.mesh, config.rectify, services.cache_dir)
+            make_prior_body(placed, pieces, placed.pose)  # settling refuses what is too thin, and the scene with it
+            decomposed[placed.object_id] = pieces
         except GeometryError as error:
             refused[placed.object_id] = str(error)[:MAX_REASON_CHARS]
     if not decomposed:
         return Dropped("no_usable_mesh", f"none of {len(item.objects)} meshes can be decomposed: {refused}")
     kept = _remove_objects(item, refused)
-    pieces = tuple(decomposed[placed.object_id] for placed in kept.objects)
-    depths = measure_piece_penetrations(pieces, [o.pose for o in kept.objects], [o.scale for o in kept.objects])
-    filled = assemble_composites(kept, pieces, config, rng)
+    all_pieces = tuple(decomposed[placed.object_id] for placed in kept.objects)
+    depths = measure_piece_penetrations(all_pieces, [o.pose for o in kept.objects], [o.scale for o in kept.objects])
+    filled = assemble_composites(kept, all_pieces, config, rng)
     parts = [
         make_rigid_part(replace(placed, pose=pose), its)
         for placed, pose, its in zip(filled.placed.objects, filled.poses, filled.pieces, strict=True)

@@ -79,21 +79,20 @@ def scale_by_height(
 
     `item` is the observation as it came: the factor is of its depth. Dropped as in `find_scaled_table`.
     """
-    known = view.observation.known_length
+    known, ratio = item.known_length, _compare_depth(item, view.observation)
     try:
         if isinstance(known, KnownCameraHeight):
-            measured, own = measure_camera_height(view, known), _compare_depth(item, view.observation)
-            measured = replace(measured, length_m=measured.length_m * own)
+            measured = measure_camera_height(view, known)
         elif isinstance(known, KnownHeight):
-            measured, own = measure_object_height(view, known, _find_object(known, candidates, ids, view.valid)), 1.0
+            measured = measure_object_height(view, known, _find_object(known, candidates, ids, view.valid))
         else:
             return view
-        factor = compute_factor(item, known.length_m, measured)
+        factor = compute_factor(item, known.length_m, replace(measured, length_m=measured.length_m * ratio))
     except InputError as error:
         return Dropped(error.reason, str(error))
     if factor is None:
         return view
-    value = factor.value * own
+    value = factor.value * ratio
     return replace(
         view,
         observation=_scale(item, factor),
