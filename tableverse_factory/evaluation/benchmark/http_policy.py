@@ -11,6 +11,7 @@ other. Any other status than 200 is a failure of the policy, with `{"error": "â€
 import http.client
 import json
 import secrets
+import socket
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -77,13 +78,10 @@ class HttpPolicy:
             except (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError) as error:
                 self._close()
                 if fresh:
-                    raise _connection_error(path, error) from None
+                    raise self._explain_loss(path, error) from None
             except ConnectionRefusedError as error:
                 self._close()
-                if path == "/reset":  # no episode has begun that could be lost
-                    problem = f"nothing answers at http://{self._host}:{self._port} any more: start the policy again"
-                    raise PolicyGoneError(f"{problem}, and the same command goes on", "bad_policy") from None
-                raise _connection_error(path, error) from None
+                raise self._explain_loss(path, error) from None
             except (OSError, http.client.HTTPException) as error:
                 self._close()
                 raise _connection_error(path, error) from None
@@ -91,6 +89,20 @@ class HttpPolicy:
                 self._close()
                 raise
         raise AssertionError("the second try is fresh")
+
+    def _explain_loss(self, path: str, error: OSError) -> Exception:
+        """Explain a lost connection: an ending server also resets those that it had not accepted yet."""
+        if path == "/reset" and not self._listens():  # no episode has begun that could be lost
+            problem = f"nothing answers at http://{self._host}:{self._port} any more: start the policy again"
+            return PolicyGoneError(f"{problem}, and the same command goes on", "bad_policy")
+        return _connection_error(path, error)
+
+    def _listens(self) -> bool:
+        try:
+            socket.create_connection((self._host, self._port), self._answer_s).close()
+        except OSError:
+            return False
+        return True
 
     def _close(self) -> None:
         if self._connection is not None:

@@ -18,7 +18,7 @@ from schemas.geometry import Pose
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.evaluation.benchmark.http_policy import MAX_ANSWER_BYTES, HttpPolicy
 from tableverse_factory.evaluation.benchmark.json_arrays import decode_array, decode_start, encode_array, encode_start
-from tableverse_factory.evaluation.benchmark.policy import EpisodeStart, PolicyError
+from tableverse_factory.evaluation.benchmark.policy import EpisodeStart, PolicyError, PolicyGoneError
 from tableverse_factory.evaluation.benchmark.policy_server import PolicyServer
 from tests.helpers.loopback import serving
 
@@ -200,6 +200,31 @@ def test_a_process_that_does_not_answer_is_given_up():
         with pytest.raises(PolicyError, match=r"no answer within 0\.1 s") as caught:
             policy.reset(start())
         assert caught.value.reason == "policy_timeout"
+
+
+def test_a_server_that_ends_before_it_accepts_an_episode_is_gone():
+    """Its backlog took the connection, which is reset with it: that is no failure in an episode."""
+    answers = [("200 OK", json.dumps({"pictures": [], "picture_size": [4, 6]})), ("500 Failed", "{}")]
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def answer_twice_and_end():
+            for status, body in answers:
+                connection, _ = listener.accept()
+                with connection:
+                    connection.recv(65536)
+                    head = f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+                    connection.sendall((head + body).encode())
+            time.sleep(0.3)
+            listener.close()
+
+        thread = threading.Thread(target=answer_twice_and_end)
+        thread.start()
+        policy = HttpPolicy(f"http://127.0.0.1:{listener.getsockname()[1]}")
+        with pytest.raises(PolicyError, match="status 500"):
+            policy.reset(start())
+        with pytest.raises(PolicyGoneError, match="start the policy again"):
+            policy.reset(start())
+        thread.join()
 
 
 def test_a_page_of_a_browser_cannot_send_messages(address):
