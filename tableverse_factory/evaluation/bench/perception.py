@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int32
 from scipy.optimize import linear_sum_assignment
 
 from schemas.config import Config
-from schemas.geometry import IdImage
+from schemas.geometry import DepthImage, IdImage
 from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
@@ -28,6 +28,7 @@ from tableverse_factory.stages.perceive.perceive import perceive
 TRUTH_NAMES = ("seg.png", MASKS_NAME)
 GOOD_IOU = 0.5
 TABLE_SHARE = 0.5
+UNLABELLED = -1  # in a truth: nobody has said what this pixel shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +169,18 @@ def remove_table(truth: IdImage, found: IdImage) -> IdImage:
     return np.where(truth == largest, 0, truth).astype(np.int32) if share >= TABLE_SHARE else truth
 
 
+def mark_unlabelled(truth: IdImage, depth: DepthImage) -> IdImage:
+    """Set to `UNLABELLED` what has no reading in `depth`, if the truth labels nothing there: it was made on the depth.
+
+    The sides of boxes beyond a sensor's range would else count as background.
+    """
+    unread = depth <= 0
+    return truth if (truth[unread] > 0).any() else np.where(unread, UNLABELLED, truth).astype(np.int32)
+
+
 def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reason: str = "") -> MaskScore:
-    """Compare two id images of the same shape; ids above 0 are objects."""
-    shared, true_sizes, found_sizes = _count_overlaps(truth, found)
+    """Compare two id images of the same shape; ids above 0 are objects. `UNLABELLED` pixels count for neither."""
+    shared, true_sizes, found_sizes = _count_overlaps(truth, np.where(truth == UNLABELLED, 0, found).astype(np.int32))
     union = true_sizes[:, None] + found_sizes[None] - shared
     ious = (shared / np.maximum(union, 1)).max(axis=1, initial=0.0)
     rows, columns = _assign_by_f(shared, true_sizes, found_sizes)
@@ -233,4 +243,4 @@ def _read_truth(capture: Path, seen: Observation, config: Config) -> IdImage:
     path = _find_file(capture, TRUTH_NAMES)
     if path is None:
         raise InputError(f"{capture.name} has no {' or '.join(TRUTH_NAMES)}")
-    return read_id_image(str(path), config.observe, seen.camera)
+    return mark_unlabelled(read_id_image(str(path), config.observe, seen.camera), seen.depth)

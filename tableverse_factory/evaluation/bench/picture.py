@@ -22,6 +22,7 @@ from tableverse_factory.evaluation.bench.perception import (
     TRUTH_NAMES,
     MaskScore,
     compare_masks,
+    mark_unlabelled,
     merge_scores,
     remove_table,
 )
@@ -226,7 +227,7 @@ def _read_objects(capture: Path, sensor: Observation, truth: PerceivedObjects | 
     by_depth = none if truth is None else truth.instance_ids
     for name in TRUTH_NAMES:
         if (capture / name).is_file():
-            ids = read_id_image(str(capture / name), config.observe, sensor.camera)
+            ids = mark_unlabelled(read_id_image(str(capture / name), config.observe, sensor.camera), sensor.depth)
             return remove_table(ids, by_depth) if name == TRUTH_NAMES[0] else ids
     return np.maximum(by_depth, 0)
 

@@ -12,12 +12,13 @@ from scipy.sparse.csgraph import connected_components
 
 from schemas.config import Config
 from schemas.geometry import IdImage, Mask
+from tableverse_factory.models.picture.predict import TABLE
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth, to_box
 from tableverse_factory.stages.perceive.ensemble.fused import detect_fused, upsample_map
-from tableverse_factory.stages.perceive.picture.detector import predict_view
+from tableverse_factory.stages.perceive.picture.detector import find_label, predict_view
 
 REACH_PX = 2  # a boundary this near is that of a border: the net sees every second or third pixel of a picture
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
@@ -46,7 +47,8 @@ def detect_with_both(view: TableView, config: Config, services: Services) -> Det
         own = [np.where(each[window] == group, part[window], 0) for each, part in zip(groups, ids, strict=True)]
         inside = ndimage.binary_dilation((own[0] > 0) | (own[1] > 0), iterations=REACH_PX)
         takes_second[group] = prefer_second(own, boundary[window], inside)
-    return replace(_merge_answers(answers, ids, groups, takes_second), shown=answers[1].shown)
+    merged = _merge_answers(answers, ids, groups, takes_second)
+    return replace(merged, shown=answers[1].shown, table_top=find_label(seen, TABLE, view.valid.shape))
 
 
 def _list_contained(answer: DetectionResult) -> list[tuple[int, int]]:

@@ -54,7 +54,7 @@ def find_standing(view: TableView, found: PicturePrediction) -> Mask:
     """
     shape = view.valid.shape
     if view.observation.bend:
-        return _find_label(found, OBJECT, shape)
+        return find_label(found, OBJECT, shape)
     other = upsample_ids((found.label[OTHER] > SURELY_OTHER).astype(np.int32), shape) > 0
     return view.raised & (view.observation.depth > 0) & ~other
 
@@ -63,12 +63,12 @@ def segment_boxes_in_picture(view: TableView, found: DetectionResult, config: Co
     """Assign the objects and the table-top that the net sees to the boxes of a detector."""
     seen = predict_observation(view.observation, config.perceive.segmenter_weights)
     ids = assign_regions_to_boxes(segment_prediction(seen, view.valid.shape), found)
-    return np.where((ids == 0) & _find_label(seen, TABLE, view.valid.shape), TABLE_ID, ids)
+    return np.where((ids == 0) & find_label(seen, TABLE, view.valid.shape), TABLE_ID, ids)
 
 
 def find_table_top(item: Observation, weights: str) -> Mask:
     """Find the pixels of the table-top. Shape (h, w)."""
-    return _find_label(predict_observation(item, weights), TABLE, item.depth.shape)
+    return find_label(predict_observation(item, weights), TABLE, item.depth.shape)
 
 
 def predict_view(view: TableView, weights: str) -> PicturePrediction:
@@ -90,5 +90,6 @@ def predict_observation(item: Observation, weights: str) -> PicturePrediction:
     return predict_picture(item.color, item.camera, None if item.bend else item.depth, weights)
 
 
-def _find_label(found: PicturePrediction, label: int, shape: tuple[int, int]) -> Mask:
+def find_label(found: PicturePrediction, label: int, shape: tuple[int, int]) -> Mask:
+    """Find the pixels of the picture, of `shape` (h, w), for which a label is the most probable."""
     return upsample_ids((found.label.argmax(axis=0) == label).astype(np.int32), shape) > 0

@@ -46,7 +46,7 @@ def detect_with_vlm(view: TableView, config: Config, services: Services) -> Dete
     if found.table_box is None:
         lost = [remark.detail for remark in record.remarks if remark.rule == "behind_person"]
         return Dropped(NO_TABLE, f"{config.perceive.model} sees no table-top" + (f": {lost[-1]}" if lost else ""))
-    return DetectionResult(found.candidates, found.table_box, record)
+    return DetectionResult(found.candidates, found.table_box, record=record)
 
 
 def request_detections(color: Picture, config: PerceiveConfig, services: Services) -> DetectionRecord:
