@@ -25,9 +25,9 @@ INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
 LEAST_PROBABILITY = 0.02  # and most certainty: so that no single pixel decides
 MIN_LEFT = 0.5  # share of an object of the second answer that the first must leave, else it is none
 COMMON_SHARE = 0.3  # of the smaller of two objects, one of each answer, from which they are of one group
-# Log-likelihood per pixel of border by which the answer of both must be better, as depth is measured; not where it has
-# more objects, as a sensor joins what touches and misses what is thin but sees no seams where there are none.
-FAVOUR = 0.35
+# Log-likelihood per pixel of border by which the answer of both must be better where they are two ways to part several
+# objects, as depth is measured; less where each has one object, and only its outline is in question.
+FAVOUR, OUTLINE_FAVOUR = 0.35, 0.1
 
 Probabilities = Float32[np.ndarray, "h w"]
 
@@ -92,15 +92,18 @@ def group_objects(
 
 
 def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
-    """Decide whether the second of two segmentations explains the boundaries so much better that it is taken.
+    """Decide whether the second of two segmentations is taken.
 
-    `boundary` is their probability at each pixel, of which those `inside` count. A second that has more objects need
-    only be better at all, see `FAVOUR`.
+    It is where it has more objects: a sensor joins what touches and misses what is thin, but sees no seams where there
+    are none. Else it must explain the boundaries so much better, see `FAVOUR`; `boundary` is their probability at each
+    pixel, of which those `inside` count.
     """
+    counts = [len(np.unique(each[each > 0])) for each in ids]
+    if counts[1] > counts[0]:
+        return True
     borders = [_find_borders(each) & inside for each in ids]
     first, second = (_score_borders(border, boundary, inside) for border in borders)
-    counts = [len(np.unique(each[each > 0])) for each in ids]
-    favour = 0.0 if counts[1] > counts[0] else FAVOUR
+    favour = OUTLINE_FAVOUR if counts == [1, 1] else FAVOUR
     return bool(second - first > favour * max(1, *(int(border.sum()) for border in borders)))
 
 
