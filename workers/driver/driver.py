@@ -130,7 +130,8 @@ class Driver:
             for position in range(scene.position, stop)
         )
         where = (scene.row, scene.shard, scene.position)
-        return Job(rank, StageChain(*where, calls, scene.input, allowance, scene.child_losses, scene.failure))
+        before = (scene.child_losses, scene.failure, scene.new_child)
+        return Job(rank, StageChain(*where, calls, scene.input, allowance, *before))
 
     def _get_pool(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
@@ -190,13 +191,14 @@ class Driver:
             self._requeue([scene])
             return
         first_position = scene.position
-        output = answer.report.output
+        output, scene.new_child = answer.report.output, False
         for report in answer.report.stages:
             stage = scene.stage
             if scene.position > first_position:
                 scene.input = str(output)
             if isinstance(report.outcome, Failed) and report.outcome.error_kind == _BUDGET_SPENT:
                 scene.tried[scene.position], scene.child_losses = report.attempts - 1, answer.report.losses
+                scene.new_child = answer.report.new_child
                 self.out_of_budget = self._budget.is_spent
                 self._waiting[scene.rank] = scene
                 return

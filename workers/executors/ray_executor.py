@@ -160,10 +160,11 @@ class RayExecutor:
     def _compute_deadline_s(self, jobs: tuple[Job, ...]) -> float:
         """Compute the deadline of a call [s]: twice that of its longest scene, with all attempts and new sandboxes.
 
+        Each stage may fail once more than it has attempts: in a used sandbox, where that does not count.
         Only scenes of negligible duration share a call; those of a failed call are called one by one.
         """
         longest = max(sum(call.deadline_s + START_TIMEOUT_S for call in job.chain.calls) for job in jobs)
-        return START_TIMEOUT_S + CALL_GRACE_S + 2 * self._attempts * longest
+        return START_TIMEOUT_S + CALL_GRACE_S + 2 * (self._attempts + 1) * longest
 
     def _on_call_finished(self, reference: Any) -> Event:
         try:
