@@ -26,7 +26,7 @@ from workers.executors.protocol import (
     WorkerLost,
     WorkerReady,
 )
-from workers.executors.ray_actor import StageActor
+from workers.executors.ray_actor import StageActor, WorkerError
 from workers.executors.ray_cluster import Node, check_workers, connect, describe_loss, list_alive_nodes, sum_capacity
 from workers.executors.schedule import PoolLimits, ScheduleLimits
 from workers.sandbox.child import load_pipelines
@@ -171,6 +171,8 @@ class RayExecutor:
             data: bytes = ray.get(reference)
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
+        except WorkerError as error:
+            return self._drop_worker(reference, str(getattr(error, "cause", error)), raised=True)
         except ray.exceptions.RayError as error:
             return self._drop_worker(reference, describe_loss(error))
         running, answer = self._running.pop(reference), decode(data)
@@ -179,11 +181,11 @@ class RayExecutor:
         results = zip(running.work, answer, strict=True)
         return CallFinished(running.worker, tuple(JobResult(job.rank, report) for job, report in results))
 
-    def _drop_worker(self, reference: Any, why: str) -> WorkerLost:
+    def _drop_worker(self, reference: Any, why: str, *, raised: bool = False) -> WorkerLost:
         """Drop a worker after killing it: otherwise it could share a CPU and a scene with its successor."""
         running = self._running.pop(reference)
         ray.kill(self._actors.pop(running.worker))
-        return WorkerLost(running.worker, running.work, why)
+        return WorkerLost(running.worker, running.work, why, raised)
 
 
 def _group_pools(pools: Pools, used: Collection[str]) -> dict[str, str]:
