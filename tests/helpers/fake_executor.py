@@ -42,7 +42,6 @@ def make_spec(
     stages: Sequence[Stage] = STAGES,
     config: Config | None = None,
     *,
-    keep: bool = True,
     added_only: bool = False,
 ) -> BuildSpec:
     return BuildSpec(
@@ -53,7 +52,6 @@ def make_spec(
         config=config or Config(),
         fingerprints={SceneKind.CAPTURE: {stage.name: "f" for stage in stages}},
         records_dir=folder / ".stages",
-        keep=keep,
         todo=range(len(rows)),
         added_only=added_only,
     )

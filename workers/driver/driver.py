@@ -167,8 +167,6 @@ class Driver:
             self._waiting |= {scene.rank: scene for scene in scenes}
             self._tally.before -= len(again)  # they were accounted for, in this run or before
             self._display.note(self._ledger.damaged[-1])
-        elif not self._spec.keep:
-            self._checkpoints.delete(call.shard)
 
     def _settle_answers(self, answers: Sequence[JobResult]) -> None:
         """Settle the spending of finished jobs."""

@@ -24,7 +24,6 @@ class BuildSpec:
     config: Config
     fingerprints: Mapping[SceneKind, Mapping[str, str]]  # of the stages of each kind of row (see `fingerprint_stages`)
     records_dir: StoragePath  # where the outputs of stages are kept
-    keep: bool  # whether they stay there when their shard is committed
     todo: Sequence[int]  # ranks of the scenes to work on, in the plan's order
     added_only: bool = False  # whether only stages that add to exported scenes may run: the pictures may be gone
 
