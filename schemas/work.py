@@ -44,6 +44,7 @@ class StageChain:
     allowance: Allowance = UNLIMITED  # of all of them together
     losses: int = 0  # how often a child was killed from outside before, in chains that the budget interrupted
     failure: Failed | Dropped | None = None  # of a stage that adds to finished scenes: its rows are written instead
+    new_child: bool = False  # the first stage failed in a used child before, in a chain that the budget interrupted
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class StageReport:
     """Report of a call."""
 
     outcome: Dropped | Failed | None  # None if the stage is done
-    attempts: int  # the item's own, 1 or more; losses of the infrastructure do not count
+    attempts: int  # the item's own, 1 or more; losses of the infrastructure and failures in used children do not count
     cpu_s: float  # of the last attempt [s]
     wall_s: float  # of the last attempt [s]
     trace: str = ""  # traceback of an error, for the log only: never part of the dataset
@@ -80,6 +81,7 @@ class StageChainReport:
     input_lost: bool = False  # nothing ran, because the checkpoint of the input is gone or damaged
     losses: int = 0  # how often a child was killed from outside, those of the chain before included
     counted: bool = True  # the reports hold all costs: those of a process that died are only in its cost log
+    new_child: bool = False  # the stage that ended the chain failed in a used child before
 
 
 @dataclass(frozen=True, slots=True)

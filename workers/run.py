@@ -111,7 +111,8 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
         plan = start_or_resume(
             request.out, rows, pipelines, request.config, recorded, request.from_stage, lock.check, base
         )
-        ledger = stack.enter_context(closing(Ledger(request.out, plan, lock.check, post_export_stages(pipelines))))
+        added = post_export_stages(pipelines)
+        ledger = stack.enter_context(closing(Ledger(request.out, plan, lock.check, added, request.keep)))
         for line in ledger.damaged:
             display.note(line)
         todo = ledger.todo()
@@ -194,7 +195,6 @@ def _make_spec(
             kind: compute_stage_fingerprints(pipelines, kind, request.config, recorded) for kind in pipelines
         },
         records_dir=request.out / CHECKPOINTS,
-        keep=request.keep,
         todo=todo,
         added_only=request.manifest is None,
     )

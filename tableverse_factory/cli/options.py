@@ -50,7 +50,12 @@ Jobs = Annotated[int | None, typer.Option(min=1, metavar="N", help="Processes; o
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON document, for scripts.")]
 Executor = Annotated[Literal["local", "ray"], typer.Option(help="One process, or Ray.")]
 Workers = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="CPUs that the actors of the build hold on Ray; all by default.")
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="CPUs that actors hold on Ray, and most actors of a pool that holds none; all by default.",
+    ),
 ]
 Address = Annotated[
     str | None, typer.Option(envvar="RAY_ADDRESS", metavar="HOST:PORT", help="A running Ray cluster, or auto.")

@@ -15,6 +15,8 @@ import typer
 from tableverse_factory.cli.build import build
 from tableverse_factory.core.errors import BuildError
 
+_FILE_OPTIONS = ("--config", "--pools")  # their files travel with the job, as the manifest does
+
 
 def submit(
     manifest: Annotated[
@@ -112,8 +114,16 @@ def _stage_files(command: Sequence[str], working_dir: Path | None) -> Iterator[t
         yield list(command), str(working_dir.absolute())
         return
     with TemporaryDirectory(prefix="tableverse-job-") as folder:
-        sent = [_stage_word(word, Path(folder)) if i != 3 else word for i, word in enumerate(command)]  # 3 is OUT
+        sent = [
+            _stage_word(word, Path(folder)) if _names_file(option, word) else word
+            for option, word in zip(["", *command], command, strict=False)
+        ]
         yield sent, folder if any(Path(folder).iterdir()) else None
+
+
+def _names_file(before: str, word: str) -> bool:
+    """Whether a word, which comes after `before`, names the manifest, or the value of `--config` or `--pools`."""
+    return before in ("build", *_FILE_OPTIONS) or word.startswith(tuple(f"{option}=" for option in _FILE_OPTIONS))
 
 
 def _stage_word(word: str, folder: Path) -> str:

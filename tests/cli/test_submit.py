@@ -89,6 +89,16 @@ def test_files_that_are_here_travel_and_others_stay_as_they_are(tmp_path, monkey
         pass
 
 
+def test_words_that_name_a_file_here_by_chance_stay_as_they_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("64", "build.prom", "rectify"):
+        (tmp_path / name).write_text("something else")
+    options = ["--workers", "64", "--limit", "64", "--metrics", str(tmp_path / "build.prom"), "--from", "rectify"]
+    command = build_command("s3://b/images.parquet", "s3://b/out", options)
+    with _stage_files(command, None) as (sent, folder):
+        assert (sent, folder) == (command, None)
+
+
 @pytest.mark.parametrize(
     ("options", "code", "says"),
     [

@@ -20,7 +20,7 @@ from workers.progress.tally import Tally
 from workers.state.checkpoint_store import CheckpointStore, name_checkpoint
 
 PART = ScenePart("0123.parts", 0, 10, 20)
-LOSE_WORKER, LOSE_INPUT = "lose worker", "lose input"
+LOSE_WORKER, LOSE_INPUT, RAISE_IN_WORKER = "lose worker", "lose input", "raise in worker"
 Action = Dropped | Failed | ModelCost | str
 """Outcome of a stage; a cost for one that is done; or a loss."""
 
@@ -42,7 +42,6 @@ def make_spec(
     stages: Sequence[Stage] = STAGES,
     config: Config | None = None,
     *,
-    keep: bool = True,
     added_only: bool = False,
 ) -> BuildSpec:
     return BuildSpec(
@@ -53,7 +52,6 @@ def make_spec(
         config=config or Config(),
         fingerprints={SceneKind.CAPTURE: {stage.name: "f" for stage in stages}},
         records_dir=folder / ".stages",
-        keep=keep,
         todo=range(len(rows)),
         added_only=added_only,
     )
@@ -118,8 +116,8 @@ class FakeExecutor:
         results = []
         for job in jobs:
             result = self._run(job)
-            if result is None:
-                self._events.append(WorkerLost(worker, jobs, "its node is gone"))
+            if isinstance(result, str):
+                self._events.append(self._lose(worker, jobs, result))
                 return
             results.append(result)
         self._events.append(CallFinished(worker, tuple(results)))
@@ -133,16 +131,19 @@ class FakeExecutor:
 
     def stage_shard(self, worker: int, call: CommitCall) -> None:
         if self._script["commit", call.shard]:
-            assert self._script["commit", call.shard].pop(0) == LOSE_WORKER
-            self._events.append(WorkerLost(worker, call, "its node is gone"))
+            self._events.append(self._lose(worker, call, self._script["commit", call.shard].pop(0)))
         else:
             self._events.append(ShardStaged(worker, call, StagedShard(call.token, 0, ())))
 
     def close(self) -> None:
         pass
 
-    def _run(self, job: Job) -> JobResult | None:
-        """Run the stages of a job; None if its worker is lost."""
+    def _lose(self, worker: int, work: tuple[Job, ...] | CommitCall, action: Action) -> WorkerLost:
+        raised = {LOSE_WORKER: False, RAISE_IN_WORKER: True}[action]
+        return WorkerLost(worker, work, "node n: OSError: no room" if raised else "its node is gone", raised)
+
+    def _run(self, job: Job) -> JobResult | str:
+        """Run the stages of a job; LOSE_WORKER or RAISE_IN_WORKER if that happens."""
         reports: list[StageReport] = []
         chain, output = job.chain, ""
         assert bool(chain.input) == bool(chain.position), "the input is a checkpoint or the row"
@@ -150,8 +151,8 @@ class FakeExecutor:
             key = (chain.row.scene_id, position)
             self.runs[key] += 1
             action = self._script[key].pop(0) if self._script[key] else None
-            if action == LOSE_WORKER:
-                return None
+            if action in (LOSE_WORKER, RAISE_IN_WORKER):
+                return action
             if action == LOSE_INPUT:
                 return JobResult(job.rank, StageChainReport(tuple(reports), output, input_lost=True))
             cost = action if isinstance(action, ModelCost) else ModelCost()

@@ -15,6 +15,7 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.stage import Stage
 
 MARKS = "TINY_LINE_MARKS"
+_HOARD: list[np.ndarray] = []  # what a scene leaves behind in its process
 
 
 def _mark(stage: str, scene_id: str) -> int:
@@ -39,7 +40,7 @@ def look(row, config, rng, services):
 def cut(item, config, rng, services):
     before = _mark("cut", item["scene_id"])
     name = item["name"]
-    if name == "segfault" or (name == "segfault_once" and before == 0):
+    if name == "segfault" or before < {"segfault_once": 1, "segfault_twice": 2}.get(name, 0):
         ctypes.string_at(0)
     if name == "chatter":
         sys.stderr.write("native chatter\n" * 20_000)
@@ -50,6 +51,11 @@ def cut(item, config, rng, services):
     if name == "hog":
         hold = [np.ones(8_000_000) for _ in range(1000)]
         return Done({"n": len(hold)})
+    if name == "hoard":
+        _HOARD.append(np.ones(37_500_000))
+    if name == "large":
+        hold = [np.ones(81_250_000)]
+        time.sleep(0.5)
     if name == "exit":
         os._exit(3)
     if name == "raise":

@@ -211,8 +211,8 @@ def test_a_signal_stops_within_three_seconds_and_the_same_command_goes_on(tmp_pa
 
 
 def test_retry_computes_the_failed_scene_alone_and_gives_the_bytes_of_a_lucky_build(tmp_path, monkeypatch):
-    manifest = write_manifest(tmp_path / "m.parquet", ["fine", "segfault_once", "fine", "empty", "fine", "fine"])
-    for name, cuts in (("lucky", b"x"), ("out", b"")):
+    manifest = write_manifest(tmp_path / "m.parquet", ["fine", "segfault_twice", "fine", "empty", "fine", "fine"])
+    for name, cuts in (("lucky", b"xx"), ("out", b"")):
         marks = tmp_path / f"marks_{name}"
         marks.mkdir()
         (marks / "scene_001.cut").write_bytes(cuts)

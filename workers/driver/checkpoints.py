@@ -42,10 +42,6 @@ class CheckpointIndex:
             scene.resume(self._find_readable(scene, indexes[scene.shard]))
             self._restore_costs(scene, indexes[scene.shard])
 
-    def delete(self, shard: int) -> None:
-        """Delete the checkpoints of a shard."""
-        self._store.delete(shard)
-
     def _restore_costs(self, scene: InFlightScene, index: Mapping[str, CheckpointRef]) -> None:
         """Restore the costs of finished stages and check that the scene may continue here."""
         for stage, name in zip(scene.stages[: scene.position], scene.records, strict=False):

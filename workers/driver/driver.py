@@ -29,6 +29,7 @@ from workers.state.ledger import Ledger
 
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10  # in a row, per call in flight: one machine that is lost takes many calls along
+MAX_ERRORS_PER_CALL = 3  # as above, of workers that raise: every call of a machine meets its full disk
 _BUDGET_SPENT = BudgetSpentError.__name__
 _WAIT_S = 0.2
 
@@ -50,7 +51,7 @@ class Driver:
         stages = [stage for kind in spec.kinds for stage in spec.pipelines[kind]]
         self._asking = {stage.name for stage in stages if calls_model(stage, spec.config)}
         self._workers = WorkerManager(executor, sorted({executor.pool_of(stage.pool) for stage in stages}))
-        self._losses_in_a_row = 0
+        self._losses_in_a_row: Counter[bool] = Counter()  # since the last result, by whether the worker raised
         self.out_of_budget = False  # whether a scene waits for a budget that is spent
 
     def run(self, check: Callable[[], None]) -> None:
@@ -130,7 +131,8 @@ class Driver:
             for position in range(scene.position, stop)
         )
         where = (scene.row, scene.shard, scene.position)
-        return Job(rank, StageChain(*where, calls, scene.input, allowance, scene.child_losses, scene.failure))
+        before = (scene.child_losses, scene.failure, scene.new_child)
+        return Job(rank, StageChain(*where, calls, scene.input, allowance, *before))
 
     def _get_pool(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
@@ -138,21 +140,21 @@ class Driver:
     def _on_event(self, event: Event) -> None:
         self._workers.on_event(event)
         match event:
-            case WorkerLost(work=CommitCall() as call, why=why):
-                self._count_loss(why)
+            case WorkerLost(work=CommitCall() as call):
+                self._count_loss(event)
                 self._commits_in_flight -= 1
                 self._outcomes.commits.append(self._ledger.retry(call))
-            case WorkerLost(work=tuple(jobs), why=why):
-                self._count_loss(why)
+            case WorkerLost(work=tuple(jobs), raised=raised):
+                self._count_loss(event)
                 ranks = [job.rank for job in jobs]
                 self._settle_from_log(ranks)
-                self._requeue([self._running.pop(rank) for rank in ranks])
+                self._requeue([self._running.pop(rank) for rank in ranks], counts=not raised)
             case ShardStaged(call=call, staged=staged):
-                self._losses_in_a_row = 0
+                self._losses_in_a_row.clear()
                 self._commits_in_flight -= 1
                 self._publish(call, staged)
             case CallFinished(answers=answers):
-                self._losses_in_a_row = 0
+                self._losses_in_a_row.clear()
                 self._settle_answers(answers)
                 for answer in answers:
                     self._advance(self._running.pop(answer.rank), answer)
@@ -165,8 +167,6 @@ class Driver:
             self._waiting |= {scene.rank: scene for scene in scenes}
             self._tally.before -= len(again)  # they were accounted for, in this run or before
             self._display.note(self._ledger.damaged[-1])
-        elif not self._spec.keep:
-            self._checkpoints.delete(call.shard)
 
     def _settle_answers(self, answers: Sequence[JobResult]) -> None:
         """Settle the spending of finished jobs."""
@@ -187,16 +187,17 @@ class Driver:
 
     def _advance(self, scene: InFlightScene, answer: JobResult) -> None:
         if answer.report.input_lost:
-            self._requeue([scene])
+            self._requeue([scene], counts=True)
             return
         first_position = scene.position
-        output = answer.report.output
+        output, scene.new_child = answer.report.output, False
         for report in answer.report.stages:
             stage = scene.stage
             if scene.position > first_position:
                 scene.input = str(output)
             if isinstance(report.outcome, Failed) and report.outcome.error_kind == _BUDGET_SPENT:
                 scene.tried[scene.position], scene.child_losses = report.attempts - 1, answer.report.losses
+                scene.new_child = answer.report.new_child
                 self.out_of_budget = self._budget.is_spent
                 self._waiting[scene.rank] = scene
                 return
@@ -218,22 +219,25 @@ class Driver:
         scene.input = str(output)
         self._waiting[scene.rank] = scene
 
-    def _count_loss(self, why: str) -> None:
+    def _count_loss(self, lost: WorkerLost) -> None:
         """Count a lost worker; raise if only losses came since the last result."""
         self._tally.losses += 1
-        self._losses_in_a_row += 1
-        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * self._workers.max_calls_in_flight:
+        self._losses_in_a_row[lost.raised] += 1
+        in_a_row = self._losses_in_a_row[lost.raised]
+        most = MAX_ERRORS_PER_CALL if lost.raised else MAX_LOSSES_PER_CALL
+        if in_a_row >= most * self._workers.max_calls_in_flight:
+            what = "workers raised errors" if lost.raised else "workers were lost"
             raise BuildError(
-                f"{self._losses_in_a_row} workers were lost in a row, the last one with: {why}. Finished scenes are "
+                f"{in_a_row} {what} in a row, the last one with: {lost.why}. Finished scenes are "
                 "kept: see to the cluster, then run the same command to go on"
             )
 
-    def _requeue(self, scenes: Sequence[InFlightScene]) -> None:
-        """Requeue scenes whose worker or input is lost; one that loses its worker too often fails."""
+    def _requeue(self, scenes: Sequence[InFlightScene], *, counts: bool) -> None:
+        """Requeue scenes whose worker or input is lost; one that loses them too often fails, if that counts."""
         requeued = []
         for scene in scenes:
-            scene.losses += 1
-            if scene.losses < MAX_LOSSES_PER_SCENE or not self._outcomes.record_lost(scene):
+            scene.losses += counts
+            if not counts or scene.losses < MAX_LOSSES_PER_SCENE or not self._outcomes.record_lost(scene):
                 requeued.append(scene)
         self._checkpoints.resume(requeued)
         self._waiting |= {scene.rank: scene for scene in requeued}

@@ -24,7 +24,6 @@ class BuildSpec:
     config: Config
     fingerprints: Mapping[SceneKind, Mapping[str, str]]  # of the stages of each kind of row (see `fingerprint_stages`)
     records_dir: StoragePath  # where the outputs of stages are kept
-    keep: bool  # whether they stay there when their shard is committed
     todo: Sequence[int]  # ranks of the scenes to work on, in the plan's order
     added_only: bool = False  # whether only stages that add to exported scenes may run: the pictures may be gone
 
@@ -44,6 +43,7 @@ class InFlightScene:
     losses: int = 0  # how often its worker was lost
     tried: Counter[int] = field(default_factory=Counter)  # failed attempts by position, in calls the budget interrupted
     child_losses: int = 0  # how often a child was killed from outside in such calls
+    new_child: bool = False  # whether its next stage failed in a used child in such a call
     timings: list[StageTiming] = field(default_factory=list)
     costs: dict[str, ModelCost] = field(default_factory=dict)  # costs of the model calls of its stages
     failure: Failed | Dropped | None = None  # of its stage, whose rows of failure are to be written

@@ -1,4 +1,4 @@
-"""Check that the pools fit into the cluster: an actor that fits on no node would wait for ever, silently."""
+"""Actors that a cluster holds, and whether the pools fit: one that fits on no node would wait for ever, silently."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,13 +6,25 @@ from collections.abc import Mapping, Sequence
 from schemas.pools import PoolSpec
 from tableverse_factory.core.errors import BuildError
 from workers.executors.ray_cluster import Node
+from workers.executors.schedule import PoolLimits
 
 _OPTION_BY_RESOURCE = {"CPU": "cpus", "GPU": "gpus", "memory": "memory_mb"}
 _ROUNDING = 1e-9
 
 
-def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: Mapping[str, float]) -> None:
-    """Refuse pools that the cluster could never hold.
+def compute_pool_limits(spec: PoolSpec, nodes: Sequence[Node], workers: int | None) -> PoolLimits:
+    """Compute the limits of a pool; with `workers`, at most as many actors that hold no CPU: no sum bounds these."""
+    needs = spec.needs()
+    room = sum(count_actors(node.resources, needs) for node in nodes)
+    bounds = (spec.max, workers if spec.cpus == 0.0 else None)
+    most = min([room, *(bound for bound in bounds if bound is not None)])
+    return PoolLimits(needs, spec.min, most, recycle_after=spec.recycle_after)
+
+
+def check_pools(
+    specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: Mapping[str, float], workers: int | None = None
+) -> None:
+    """Refuse pools that the cluster, or the part of it that `workers` names, could never hold.
 
     Each pool must fit with one actor, and with its `min` of actors, on single nodes (future ones of an autoscaler do
     not count); all of these together must not exceed the capacity. If the sum fits but not all actors at once, the
@@ -27,6 +39,11 @@ def check_pools(specs: Mapping[str, PoolSpec], nodes: Sequence[Node], capacity: 
             raise BuildError(
                 f"pool {name} wants at least {spec.min} actors with {_format_amounts(needs)} each and the cluster has "
                 f"room for {room}: set min of {name} to {room} in --pools, or start more nodes"
+            )
+        if workers is not None and spec.cpus == 0.0 and workers < spec.min:
+            raise BuildError(
+                f"pool {name} wants at least {spec.min} actors and --workers is {workers}: set min of {name} to "
+                f"{workers} in --pools, or give --workers {spec.min}"
             )
     _check_together(specs, capacity)
 

@@ -54,6 +54,7 @@ class WorkerLost:
     worker: int
     work: tuple[Job, ...] | CommitCall  # of its call; no jobs if it never started
     why: str  # description of the loss
+    raised: bool = False  # whether it raised an error of its own: then no scene can have ended it
 
 
 Event = WorkerReady | CallFinished | ShardStaged | WorkerLost

@@ -1,14 +1,23 @@
 """Ray actor that runs any stages of any pipeline, in its own sandbox."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import ray
 import ray.util
 
 from schemas.codec import decode, encode
 from schemas.work import SandboxSetup, StageChain
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import parse_path
 from workers.executors.preflight import NodeExpectation, find_local_problem
+from workers.executors.ray_cluster import describe_loss
 from workers.sandbox.parent import Sandbox
 from workers.state.commit import stage_shard
+
+
+class WorkerError(Exception):
+    """Error outside the sandbox, as on a machine without room in its temporary folder: no scene caused it."""
 
 
 class StageActor:
@@ -27,9 +36,22 @@ class StageActor:
 
     def run(self, chains: bytes) -> bytes:
         """Run encoded chains; returns their encoded reports."""
-        decoded: tuple[StageChain, ...] = decode(chains)
-        return encode(tuple(self._sandbox.run(chain) for chain in decoded))
+        with _name_node():
+            decoded: tuple[StageChain, ...] = decode(chains)
+            return encode(tuple(self._sandbox.run(chain) for chain in decoded))
 
     def stage_shard(self, call: bytes) -> bytes:
         """Assemble a shard for its commit; takes an encoded `CommitCall`, returns an encoded `StagedShard`."""
-        return encode(stage_shard(self._out, decode(call)))
+        with _name_node():
+            return encode(stage_shard(self._out, decode(call)))
+
+
+@contextmanager
+def _name_node() -> Iterator[None]:
+    """Name this node in every error that does not stop the build."""
+    try:
+        yield
+    except BuildError:
+        raise
+    except Exception as error:
+        raise WorkerError(f"node {ray.util.get_node_ip_address()}: {describe_loss(error)}") from error

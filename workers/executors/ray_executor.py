@@ -15,7 +15,7 @@ from schemas.pools import Pools, PoolSpec
 from schemas.work import CommitCall, SandboxSetup
 from tableverse_factory.core.errors import BuildError, StoreError
 from tableverse_factory.core.storage.files import StoragePath
-from workers.executors.pool_capacity import check_pools, count_actors
+from workers.executors.pool_capacity import check_pools, compute_pool_limits
 from workers.executors.preflight import check_nodes, make_expectation
 from workers.executors.protocol import (
     CallFinished,
@@ -26,9 +26,9 @@ from workers.executors.protocol import (
     WorkerLost,
     WorkerReady,
 )
-from workers.executors.ray_actor import StageActor
-from workers.executors.ray_cluster import Node, check_workers, connect, describe_loss, list_alive_nodes, sum_capacity
-from workers.executors.schedule import PoolLimits, ScheduleLimits
+from workers.executors.ray_actor import StageActor, WorkerError
+from workers.executors.ray_cluster import check_workers, connect, describe_loss, list_alive_nodes, sum_capacity
+from workers.executors.schedule import ScheduleLimits
 from workers.sandbox.child import load_pipelines
 from workers.sandbox.parent import START_TIMEOUT_S
 
@@ -68,7 +68,7 @@ class RayExecutor:
             self._specs, self._cluster = specs, cluster
             check_workers(cluster.workers, list_alive_nodes())
             self._limits = self._refresh_limits()
-            check_pools(specs, list_alive_nodes(), self._limits.capacity)
+            check_pools(specs, list_alive_nodes(), self._limits.capacity, cluster.workers)
             self._expected = None
             if cluster.address is not None:
                 nodes = list_alive_nodes()
@@ -153,23 +153,26 @@ class RayExecutor:
     def _refresh_limits(self) -> ScheduleLimits:
         """Compute the limits with the present nodes."""
         self._refreshed_at = time.monotonic()
-        nodes = list_alive_nodes()
-        pools = {name: _compute_pool_limits(spec, nodes) for name, spec in self._specs.items()}
-        return ScheduleLimits(pools, sum_capacity(nodes, self._cluster.workers))
+        nodes, workers = list_alive_nodes(), self._cluster.workers
+        pools = {name: compute_pool_limits(spec, nodes, workers) for name, spec in self._specs.items()}
+        return ScheduleLimits(pools, sum_capacity(nodes, workers))
 
     def _compute_deadline_s(self, jobs: tuple[Job, ...]) -> float:
         """Compute the deadline of a call [s]: twice that of its longest scene, with all attempts and new sandboxes.
 
+        Each stage may fail once more than it has attempts: in a used sandbox, where that does not count.
         Only scenes of negligible duration share a call; those of a failed call are called one by one.
         """
         longest = max(sum(call.deadline_s + START_TIMEOUT_S for call in job.chain.calls) for job in jobs)
-        return START_TIMEOUT_S + CALL_GRACE_S + 2 * self._attempts * longest
+        return START_TIMEOUT_S + CALL_GRACE_S + 2 * (self._attempts + 1) * longest
 
     def _on_call_finished(self, reference: Any) -> Event:
         try:
             data: bytes = ray.get(reference)
         except BuildError as error:
             raise BuildError(str(getattr(error, "cause", error))) from None
+        except WorkerError as error:
+            return self._drop_worker(reference, str(getattr(error, "cause", error)), raised=True)
         except ray.exceptions.RayError as error:
             return self._drop_worker(reference, describe_loss(error))
         running, answer = self._running.pop(reference), decode(data)
@@ -178,11 +181,11 @@ class RayExecutor:
         results = zip(running.work, answer, strict=True)
         return CallFinished(running.worker, tuple(JobResult(job.rank, report) for job, report in results))
 
-    def _drop_worker(self, reference: Any, why: str) -> WorkerLost:
+    def _drop_worker(self, reference: Any, why: str, *, raised: bool = False) -> WorkerLost:
         """Drop a worker after killing it: otherwise it could share a CPU and a scene with its successor."""
         running = self._running.pop(reference)
         ray.kill(self._actors.pop(running.worker))
-        return WorkerLost(running.worker, running.work, why)
+        return WorkerLost(running.worker, running.work, why, raised)
 
 
 def _group_pools(pools: Pools, used: Collection[str]) -> dict[str, str]:
@@ -191,12 +194,6 @@ def _group_pools(pools: Pools, used: Collection[str]) -> dict[str, str]:
     for name in (name for name in Pools.model_fields if name in used):
         groups.setdefault(getattr(pools, name).model_dump_json(), []).append(name)
     return {name: "+".join(members) for members in groups.values() for name in members}
-
-
-def _compute_pool_limits(spec: PoolSpec, nodes: Sequence[Node]) -> PoolLimits:
-    needs = spec.needs()
-    room = sum(count_actors(node.resources, needs) for node in nodes)
-    return PoolLimits(needs, spec.min, min(room, spec.max or room), recycle_after=spec.recycle_after)
 
 
 def _make_actor_class(spec: PoolSpec) -> Any:

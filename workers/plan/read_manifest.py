@@ -85,7 +85,8 @@ def _parse_batch(batch: pa.RecordBatch, first: int) -> pa.RecordBatch:
     if not len(doubtful):
         return texts
     given = pa.RecordBatch.from_pydict({name: columns.get(name, batch[name]) for name in found})
-    records = given.take(pa.array(doubtful)).to_pylist()
+    values = ([_to_python(value) for value in column] for column in given.take(pa.array(doubtful)))
+    records = (dict(zip(found, record, strict=True)) for record in zip(*values, strict=True))
     rows = [_parse_row(record, first + place) for record, place in zip(records, doubtful.tolist(), strict=True)]
     return _replace_rows(texts, doubtful, [row.model_dump(mode="json") for row in rows])
 
@@ -98,6 +99,16 @@ def _as_text(column: pa.Array) -> pa.Array | None:
     text = column.cast(pa.string())
     text.validate(full=True)
     return text
+
+
+def _to_python(value: pa.Scalar) -> Any:
+    """Return a value as Python's; as its type, which is no text either, if Python's own types cannot hold it."""
+    if value.is_valid and "[ns" in str(value.type):  # nanoseconds become pandas' types where that is installed
+        return value.type
+    try:
+        return value.as_py()
+    except (ValueError, OverflowError):  # a year after 9999, or an unknown time zone
+        return value.type
 
 
 def _replace_rows(

@@ -44,13 +44,16 @@ class Sandbox:
         """Run a chain of stages on one scene until one of them is not done.
 
         A stage that crashes, hangs or takes too much memory is repeated in a new child as often as the setup allows,
-        from the checkpoint of the stage before it. `watch` is called every few milliseconds; an exception of it ends
-        the call and the child.
+        and once more if that happened first in a used one, from the checkpoint of the stage before it. `watch` is
+        called every few milliseconds; an exception of it ends the call and the child.
         """
         run = ChainRun(chain, self._setup.attempts)
-        while (report := run.add_result(self._run_once(run.rest, watch))) is None:
-            pass
-        return report
+        while True:
+            if run.needs_new_child:
+                self.close()
+            report = run.add_result(self._run_once(run.rest, watch))
+            if report is not None:
+                return report
 
     def close(self) -> None:
         """Kill the child at once."""
@@ -95,6 +98,7 @@ class _Child:
         self._channel = Channel(own_end)
         self._usage = psutil.Process(self._process.pid)
         self._cpu_s = 0.0
+        self._is_new = True
         try:
             self._wait_until_ready(watch)
         except BaseException:
@@ -104,7 +108,8 @@ class _Child:
     def call(self, chain: StageChain, watch: Callable[[], None]) -> ChildResult:
         """Run a chain, or as much of it as the child survives."""
         self._errors.truncate(0)
-        result = ChildResult()
+        result = ChildResult(new_child=self._is_new)
+        self._is_new = False
         started = time.monotonic()
         try:
             self._channel.send(encode(chain))

@@ -1,4 +1,10 @@
-"""Progress of a chain of stages over several child processes."""
+"""Progress of a chain of stages over several child processes.
+
+A crash, a hang or too much memory is the scene's own only in a new child that began with this stage. A used one still
+holds what earlier stages left in it, and which these were depends on the executor, on the number of workers and on
+interruptions: stages of other scenes, or those before it in its chain, which a resumed build begins behind them. A
+failure in a used child is therefore repeated in a new one and does not count as an attempt.
+"""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -17,6 +23,7 @@ class ChildResult:
     outputs: list[ScenePart | str] = field(default_factory=list)  # of those that are done (see `StageDone`)
     killed: bool = False  # whether the child was killed from outside
     input_lost: bool = False  # whether the checkpoint that is the input was missing
+    new_child: bool = False  # whether the child had run nothing before
 
 
 class ChainRun:
@@ -28,19 +35,28 @@ class ChainRun:
         self._outputs: list[ScenePart | str] = []
         self._tries = Counter({number: call.tried for number, call in enumerate(chain.calls)})
         self._losses = chain.losses
+        self._failed_in_used = {0} if chain.new_child else set()  # stages
         self._counted = True
         self.rest = chain
+
+    @property
+    def needs_new_child(self) -> bool:
+        """Whether the rest has to run in a new child, because its first stage failed in a used one."""
+        return len(self._done) in self._failed_in_used
 
     def add_result(self, result: ChildResult) -> StageChainReport | None:
         """Add the result of a child; returns the whole report once there is nothing left to try."""
         self._outputs += result.outputs
-        for report in result.reports:
-            self._tries[len(self._done)] += 1
-            report = replace(report, attempts=self._tries[len(self._done)])
+        for number, report in enumerate(result.reports):
+            report = replace(report, attempts=self._tries[len(self._done)] + 1)
             if report.outcome is None:
                 self._done.append(report)
-            elif not may_retry(report) or report.attempts >= self._attempts:
+            elif not may_retry(report):
                 return self._make_report(report)
+            elif self._counts(result.new_child and number == 0):
+                self._tries[len(self._done)] += 1
+                if report.attempts >= self._attempts:
+                    return self._make_report(report)
         if len(self._done) == len(self._chain.calls):
             return self._make_report()
         if result.killed:
@@ -56,9 +72,19 @@ class ChainRun:
         self._advance()
         return None
 
+    def _counts(self, is_first: bool) -> bool:
+        """Whether a failure of the next stage counts; `is_first` if its child had run nothing before."""
+        if is_first or self.needs_new_child:  # once is enough, also where its input is lost again and again
+            return True
+        self._failed_in_used.add(len(self._done))
+        return False
+
     def _make_report(self, *last: StageReport) -> StageChainReport:
         output, counted = self._outputs[-1] if self._outputs else "", self._counted and not any(map(may_retry, last))
-        return StageChainReport((*self._done, *last), output, losses=self._losses, counted=counted)
+        reports = (*self._done, *last)
+        return StageChainReport(
+            reports, output, losses=self._losses, counted=counted, new_child=bool(last) and self.needs_new_child
+        )
 
     def _advance(self) -> None:
         """Set the rest of the chain to begin behind the last finished stage, whose checkpoint is the input."""

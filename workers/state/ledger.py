@@ -10,6 +10,7 @@ from tableverse_factory.dataset.journals import WORK, find_journals, journal_pat
 from tableverse_factory.dataset.parts import find_parts, parts_folder
 from tableverse_factory.dataset.shard_plan import Plan
 from tableverse_factory.dataset.shards import committed_shards
+from workers.state.checkpoint_store import CHECKPOINTS, CheckpointStore
 from workers.state.commit import discard_staged, publish_ready, publish_shard, stage_shard
 from workers.state.journal import Journal, open_journal
 
@@ -26,13 +27,15 @@ class Ledger:
         plan: Plan,
         guard: Callable[[], None] = lambda: None,
         post_export: Collection[str] = (),
+        keep: bool = True,
     ) -> None:
         """Repair what a kill left, and commit shards that were complete.
 
         `guard` is called before anything is written and raises if this process is no longer the writer; `post_export`
-        names the stages that add to exported scenes.
+        names the stages that add to exported scenes; `keep` says whether the checkpoints of a shard outlive its commit.
         """
         self._out, self._plan, self._guard, self._post_export = out, plan, guard, tuple(post_export)
+        self._keep = keep
         self.bytes_committed = 0  # of the shards that were written here
         self.damaged: list[str] = []  # a message for each journal or part that cannot be read
         self._members = plan.members()
@@ -82,8 +85,7 @@ class Ledger:
         if staged.damaged:
             return self._reopen(call.shard, staged.damaged)
         publish_shard(self._out, call.shard, staged, self._guard)
-        self._journals.pop(call.shard).remove()
-        remove_folder(parts_folder(self._out, call.shard))
+        self._remove_work(call.shard, self._journals.pop(call.shard))
         del self._missing[call.shard]
         self.bytes_committed += staged.size
         return []
@@ -106,6 +108,13 @@ class Ledger:
             journal.close()
         self._journals.clear()
 
+    def _remove_work(self, shard: int, journal: Journal) -> None:
+        """Remove what a committed shard needs no more."""
+        if not self._keep:  # before the journal, by which a restart finds them
+            CheckpointStore(self._out / CHECKPOINTS).delete(shard)
+        journal.remove()
+        remove_folder(parts_folder(self._out, shard))
+
     def _make_call(self, shard: int) -> CommitCall:
         self._journals[shard].flush()
         return CommitCall(shard, tuple(self._list_members(shard)), self._post_export, secrets.token_hex(8))
@@ -122,8 +131,7 @@ class Ledger:
                 "disk: scenes whose results stood there are computed again"
             )
         if committed and not state.reopened:  # a kill came between the commit and this
-            open_journal(path).remove()
-            remove_folder(parts_folder(self._out, shard))
+            self._remove_work(shard, open_journal(path))
             return
         self._missing[shard] = {*(state.reopened if committed else self._list_members(shard))} - set(state.results)
         if not self._missing[shard]:

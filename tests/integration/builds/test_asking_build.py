@@ -145,15 +145,15 @@ def test_calls_never_exceed_their_budget_and_a_larger_one_goes_on(server, asking
 
 
 @pytest.mark.parametrize(
-    ("death", "calls"), [("SIGSEGV", 2), pytest.param("SIGKILL", MAX_KILLS, marks=pytest.mark.slow)]
+    ("death", "calls"), [("SIGSEGV", 3), pytest.param("SIGKILL", MAX_KILLS, marks=pytest.mark.slow)]
 )
 def test_a_question_that_kills_its_process_costs_no_more_with_a_budget_than_without(asking, death, calls):
-    request = replace(
-        asking("out", death, limits=SpendingLimits(calls=30)), pipeline="tests.helpers.crashing_pipeline:PIPELINES"
-    )
-    assert run_build(request, Silent()).over_budget is None
-    assert sum_costs(request.out).calls == calls
-    assert read_build_state(request.out).failed == 1
+    pipeline = "tests.helpers.crashing_pipeline:PIPELINES"
+    for out, limits in (("out", SpendingLimits(calls=30)), ("free", NO_LIMITS)):
+        request = replace(asking(out, death, limits=limits), pipeline=pipeline)
+        assert run_build(request, Silent()).over_budget is None
+        assert sum_costs(request.out).calls == calls
+        assert read_build_state(request.out).failed == 1
 
 
 def test_money_is_counted_by_the_prices_and_the_command_line_says_how_to_go_on(server, asking, run, capsys):

@@ -211,7 +211,7 @@ def test_a_planner_that_crashes_or_hangs_costs_no_scene(tmp_path, marks):
     run_build(asked, Silent())
     rows = scenes(tmp_path / "out")
     assert [row["status"] for row in rows] == ["done"] * 5
-    assert [row["attempts"] for row in rows] == [1, 2, 2, 2, 1]
+    assert [row["attempts"] for row in rows] == [1, 2, 2, 1, 1]
     assert [row["n_trajectories"] for row in rows] == [2] * 5
     assert [row["n_successes"] for row in rows] == [1, 0, 0, 1, 0]
     dataset = open_dataset(tmp_path / "out")

@@ -1,5 +1,6 @@
 """Real Ray, real kill -9: the same bytes as one process gives, whoever dies on the way."""
 
+import os
 import random
 import signal
 import time
@@ -23,12 +24,22 @@ from tests.helpers.builds import (
     wait_until,
     write_manifest,
 )
+from tests.helpers.paths import ROOT
 from tests.helpers.processes import command_of, is_alive
 from workers.progress.build_state import read_build_state
 from workers.run import run_build
 
 NAMES = ["fine", "empty", "fine", "segfault", "fine", "raise", "fell", "fine", "fine", "sad", *["slow_0.2"] * 6]
 RUN = {"deadline_s": 60.0}
+FULL_FOLDER = """
+import sys, tempfile
+
+def refuse(*_, **__):
+    raise OSError(28, "No space left on device")
+
+if any("default_worker.py" in word for word in sys.orig_argv):
+    tempfile.TemporaryFile = refuse
+"""
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +113,22 @@ def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, t
     assert process.returncode == 143
     process.stderr.close()
     wait_until(lambda: not any(is_alive(worker) for worker in workers), 30.0)
+
+
+def test_actors_that_only_raise_stop_the_build_and_cost_no_scene(whole, tmp_path, monkeypatch):
+    """No actor can start its sandbox, as where the temporary folder is full."""
+    manifest, expected = whole
+    (tmp_path / "sitecustomize.py").write_text(FULL_FOLDER)
+    with monkeypatch.context() as patched:
+        patched.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
+        code, errors = finish(start(manifest, tmp_path / "out", "ray", 2, **RUN))
+    assert code == 1
+    assert "6 workers raised errors in a row, the last one with: node " in " ".join(errors.split())
+    assert "No space left on device" in errors
+    assert not _accounted(tmp_path / "out")
+    code, errors = finish(start(manifest, tmp_path / "out", "ray", 2, **RUN))
+    assert code == 0, errors
+    assert digests(tmp_path / "out") == expected
 
 
 @pytest.mark.slow  # tests/workers/executors/test_ray_cluster.py refuses them without Ray

@@ -5,7 +5,7 @@ import pytest
 from schemas.config import Config, CurateConfig
 from schemas.outcome import Dropped, Failed, ModelCost
 from tableverse_factory.core.errors import BuildError
-from tests.helpers.fake_executor import LOSE_INPUT, LOSE_WORKER, STAGES, FakeBuild, make_rows
+from tests.helpers.fake_executor import LOSE_INPUT, LOSE_WORKER, RAISE_IN_WORKER, STAGES, FakeBuild, make_rows
 from workers.driver.budget import SpendingLimits
 from workers.driver.driver import MAX_LOSSES_PER_CALL, MAX_LOSSES_PER_SCENE
 from workers.driver.signals import StoppedError
@@ -77,6 +77,22 @@ def test_losses_without_any_result_stop_the_build(tmp_path):
     script = {(f"s{i}", 0): [LOSE_WORKER] * 99 for i in range(MAX_LOSSES_PER_CALL)}
     with pytest.raises(BuildError, match=r"10 workers were lost in a row, the last one with: its node is gone"):
         FakeBuild(tmp_path, make_rows(MAX_LOSSES_PER_CALL), script).run()
+
+
+def test_a_worker_that_raises_costs_its_scene_nothing(tmp_path):
+    errors = MAX_LOSSES_PER_SCENE + 1
+    build = FakeBuild(tmp_path, make_rows(1), {("s0", 2): [RAISE_IN_WORKER] * errors}, workers=errors)
+    result = build.run()["s0"]
+    assert (result.status, result.attempts) == ("done", 1)
+    assert build.executor.runs["s0", 2] == errors + 1
+
+
+@pytest.mark.parametrize("place", [("s0", 0), ("commit", 0)])
+def test_workers_that_only_raise_stop_the_build_with_what_they_raised(tmp_path, place):
+    build = FakeBuild(tmp_path, make_rows(2), {place: [RAISE_IN_WORKER] * 99})
+    with pytest.raises(BuildError, match=r"3 workers raised errors in a row, the last one with: node n: OSError: no r"):
+        build.run()
+    assert not any(result.status == "failed" for result in build.ledger.results.values())
 
 
 def test_a_lost_input_is_computed_again(tmp_path):

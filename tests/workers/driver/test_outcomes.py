@@ -24,8 +24,8 @@ PART = ScenePart("0123.parts", 0, 10, 20)
 class Recorder:
     """A recorder with its ledger, tally and display."""
 
-    def __init__(self, folder, stages=STAGES, n=3, keep=True):
-        self.spec = make_spec(folder, make_rows(n), stages, keep=keep)
+    def __init__(self, folder, stages=STAGES, n=3):
+        self.spec = make_spec(folder, make_rows(n), stages)
         self.ledger, self.display = FakeLedger(n), Silent()
         self.tally = Tally(("manifest", *(stage.name for stage in stages)), n, 0, 1)
         self.checkpoints = CheckpointIndex(self.spec)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from schemas.pools import PoolSpec
 from tableverse_factory.core.errors import BuildError
-from workers.executors.pool_capacity import check_pools, count_actors
+from workers.executors.pool_capacity import check_pools, compute_pool_limits, count_actors
 from workers.executors.ray_cluster import Node
 
 LAPTOP = Node("a", "10.0.0.1", {"CPU": 2.0, "memory": 8e9})
@@ -69,6 +69,19 @@ def test_a_build_that_may_not_use_the_whole_cluster_is_held_to_its_part():
     check_pools(specs, [LAPTOP], {"CPU": 1.5})
     with pytest.raises(BuildError, match=r"want 1\.5 CPUs .* may use 1 CPU: .* more --workers"):
         check_pools(specs, [LAPTOP], {"CPU": 1.0})
+
+
+def test_actors_that_hold_no_cpu_are_no_more_than_the_workers_that_were_asked_for():
+    without = PoolSpec(cpus=0, memory_mb=100, min=3)
+    assert compute_pool_limits(without, [LAPTOP, GPU_NODE], None).max_workers == 400
+    assert compute_pool_limits(without, [LAPTOP, GPU_NODE], 4).max_workers == 4
+    assert compute_pool_limits(without.model_copy(update={"max": 3}), [LAPTOP], 4).max_workers == 3
+    assert compute_pool_limits(PoolSpec(cpus=0.5), [LAPTOP], 2).max_workers == 4, "of these the CPUs count"
+    check_pools({"p": without}, [LAPTOP], LAPTOP.resources, workers=3)
+    with pytest.raises(
+        BuildError, match=r"p wants at least 3 actors and --workers is 2: set min of p to 2 .* --workers 3"
+    ):
+        check_pools({"p": without}, [LAPTOP], LAPTOP.resources, workers=2)
 
 
 @given(gpus=st.integers(0, 16), need=st.sampled_from([0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 2.0]))

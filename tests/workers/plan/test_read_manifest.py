@@ -105,6 +105,29 @@ def test_columns_that_hold_no_text_are_judged_row_by_row(tmp_path, name):
         assert len({row.scene_id for row in rows}) == 2
 
 
+@pytest.mark.parametrize("name", ["scene_id", "kind", "uri", "name"])
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (pa.timestamp("ns"), 1_700_000_000_123_456_789),
+        (pa.timestamp("us"), 2**62),
+        (pa.timestamp("us", "Nowhere/City"), 0),
+        (pa.time64("ns"), 1),
+        (pa.date32(), 2**30),
+        (pa.list_(pa.timestamp("ns")), [1]),
+    ],
+    ids=str,
+)
+def test_times_that_python_cannot_hold_are_no_text_and_elsewhere_nobody_minds(tmp_path, name, kind, value):
+    good = {"scene_id": ["a", "b"], "kind": ["image", "image"], "uri": ["/x", "/y"]}
+    times = pa.array([value, None], kind)
+    rows = read_manifest(write(tmp_path / "m.parquet", pa.table({**good, "taken_at": times})))
+    assert [row.rejected for row in rows] == ["", ""]
+    rows = read_manifest(write(tmp_path / "m.parquet", pa.table({**good, name: times})))
+    assert [row.rejected for row in rows] == ["invalid_manifest_row", "" if name == "name" else "invalid_manifest_row"]
+    assert rows[0].rejected_detail.startswith(f"row 0: {name}: ")
+
+
 def test_ids_of_rejected_rows_stay_what_they_were(tmp_path):
     """They are in the datasets that were built: another id would be another scene."""
     records = [GOOD, {**GOOD, "scene_id": "a/b"}, GOOD, {**GOOD, "kind": "photo", "uri": None}]

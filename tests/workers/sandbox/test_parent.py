@@ -116,9 +116,47 @@ def test_messages_are_one_line_without_addresses_and_folders(sandbox):
 
 def test_a_crash_that_passes_is_done_at_the_second_attempt(sandbox, tmp_path, monkeypatch):
     monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
-    report, _ = _run_one(sandbox, 1, "segfault_once", input=_look_at(sandbox, "segfault_once"))
+    place = _look_at(sandbox, "segfault_once")
+    sandbox.close()
+    report, _ = _run_one(sandbox, 1, "segfault_once", input=place)
     assert report.outcome is None
     assert report.attempts == 2
+
+
+def test_memory_that_other_scenes_left_behind_is_no_attempt_of_a_scene(tmp_path):
+    sandbox = Sandbox(_setup(tmp_path, attempts=1, memory_mb=1000))
+    assert _run_line(sandbox, "hoard")[0].outcome is None
+    (child,) = _children()
+    report, part = _run_line(sandbox, "large")
+    assert not child.is_running(), "the scene is too large for this child"
+    sandbox.close()
+    assert (report.outcome, report.attempts) == (None, 1)
+    assert isinstance(part, ScenePart)
+
+
+@pytest.mark.parametrize("attempts", [1, 2])
+@pytest.mark.parametrize("name", ["exit", "hang", "hog"])
+def test_a_failure_is_the_same_whatever_its_child_ran_before_and_costs_one_run_more(
+    tmp_path, monkeypatch, name, attempts
+):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
+    sandbox = Sandbox(_setup(tmp_path, attempts=attempts))
+    place = _look_at(sandbox, name)
+
+    def run(positions: Sequence[int], place: str) -> tuple[Failed, int, int]:
+        (marks / "a.cut").unlink(missing_ok=True)
+        report = sandbox.run(_chain(name, positions, 1.5, input=place)).stages[-1]
+        return report.outcome, report.attempts, (marks / "a.cut").stat().st_size
+
+    in_used = run(range(1, 4), place)
+    resumed = run(range(1, 4), place)  # the child of the failure is gone
+    whole = run(range(4), "")
+    sandbox.close()
+    assert in_used[:2] == resumed[:2] == whole[:2]
+    assert [runs for *_, runs in (resumed, in_used, whole)] == [attempts, attempts + 1, attempts + 1]
+    assert resumed[1] == attempts
 
 
 def test_a_child_killed_from_outside_costs_no_attempt(sandbox):
@@ -216,7 +254,7 @@ def test_a_crash_in_the_middle_repeats_that_stage_alone(sandbox, tmp_path, monke
     marks.mkdir()
     monkeypatch.setenv("TINY_LINE_MARKS", str(marks))
     report = sandbox.run(_chain("segfault_once", range(4)))
-    assert [stage.attempts for stage in report.stages] == [1, 2, 1, 1]
+    assert [stage.attempts for stage in report.stages] == [1, 1, 1, 1], "its child had run a stage before"
     assert {path.name: path.stat().st_size for path in marks.iterdir()} == {
         "a.look": 1,
         "a.cut": 2,
