@@ -18,7 +18,13 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.untrusted import parse_json
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.evaluation.bench.perception import TRUTH_NAMES, match_ids, remove_table
+from tableverse_factory.evaluation.bench.perception import (
+    TRUTH_NAMES,
+    UNLABELLED,
+    mark_unlabelled,
+    match_ids,
+    remove_table,
+)
 from tableverse_factory.evaluation.bench.twin_relations import compare_twin_relations
 from tableverse_factory.evaluation.bench.twin_views import TwinView, decode_masks, render_twin, write_side_by_side
 from tableverse_factory.geometry.math.camera import backproject
@@ -121,7 +127,8 @@ def compare_files(
         things, shown = masks, np.where((masks == 0) & (capture.depth == 0), 0, view.ids)
     else:
         things = remove_table(truth, np.where(_find_table_pixels(capture, view), -1, masks))
-        shown = _match_things(things, view)
+        is_labelled = mark_unlabelled(truth, capture.depth) != UNLABELLED
+        shown = np.where(is_labelled, _match_things(things, view), 0)
     compared = tuple(_compare_things(capture, view, things, shown))
     score = TwinScore(
         row.name,
