@@ -16,6 +16,7 @@ from tableverse_factory.evaluation.bench.perception import (
     bench_masks,
     compare_masks,
     compare_pairs,
+    mark_unlabelled,
     merge_scores,
     read_true_pairs,
     remove_table,
@@ -65,6 +66,16 @@ def test_what_the_truth_does_not_know_costs_no_precision():
     score = compare_masks("a", ids([1, 1, 0, 0]), ids([1, 1, 0, 9]), 0.1)
     assert score.overlap_f == 1.0
     assert score.found == 2
+
+
+def test_pixels_that_a_truth_drawn_on_the_depth_cannot_label_count_for_neither_side():
+    truth, found = ids([1, 1, 0, 0, 0]), ids([4, 4, 4, 0, 5])
+    unread = np.array([[0.7, 0.7, 0.0, 0.7, 0.7]])
+    score = compare_masks("a", mark_unlabelled(truth, unread), found, 0.1)
+    assert (score.mean_iou, score.overlap_f) == (1.0, 1.0)
+    assert score.found == 2, "the other object lies where the truth says that there is none"
+    drawn_on_colour = np.array([[0.7, 0.0, 0.0, 0.7, 0.7]])
+    assert compare_masks("a", mark_unlabelled(truth, drawn_on_colour), found, 0.1).mean_iou == pytest.approx(2 / 3)
 
 
 def test_finding_nothing_scores_nothing():

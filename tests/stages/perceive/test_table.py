@@ -241,6 +241,17 @@ def test_a_box_of_the_table_finds_a_low_one_over_a_larger_floor_and_a_wrong_box_
         )
 
 
+def test_the_table_that_the_net_sees_is_taken_where_depth_alone_takes_its_floor(tmp_path):
+    camera = camera_above(0.7, 0.8, 45.0)
+    observation, _ = look(THINGS, camera, noise_m=0.001, table_half=(0.35, 0.25), floor_z=-0.15)
+    by_depth = find_table(observation, np.random.default_rng(0))
+    assert -by_depth.plane.offset == pytest.approx(0.85, abs=0.01)
+    outcome = perceive(observation, Config(), np.random.default_rng(0), Services(tmp_path))
+    assert isinstance(outcome, Done)
+    assert outcome.value.camera_to_table.position[2] == pytest.approx(0.7, abs=0.005)
+    assert len(outcome.value.objects) == len(THINGS), "the table-top is none"
+
+
 @pytest.mark.shared
 def test_the_table_of_real_captures_does_not_depend_on_the_seed(shared_dir):
     heights = {

@@ -25,8 +25,9 @@ INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
 LEAST_PROBABILITY = 0.02  # and most certainty: so that no single pixel decides
 MIN_LEFT = 0.5  # share of an object of the second answer that the first must leave, else it is none
 COMMON_SHARE = 0.3  # of the smaller of two objects, one of each answer, from which they are of one group
-# Log-likelihood per pixel of border by which the answer of both must be better where they are two ways to part several
-# objects, as depth is measured; less where each has one object, and only its outline is in question.
+# Log-likelihood per pixel of border by which the answer of both must be better, as depth is measured; less where each
+# has one object, and only its outline is in question. One of more objects may be worse by as much: a sensor joins what
+# touches and misses what is thin, but sees no seams where there are none.
 FAVOUR, OUTLINE_FAVOUR = 0.35, 0.1
 
 Probabilities = Float32[np.ndarray, "h w"]
@@ -92,18 +93,14 @@ def group_objects(
 
 
 def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
-    """Decide whether the second of two segmentations is taken.
+    """Decide whether the second of two segmentations explains the boundaries so much better that it is taken.
 
-    It is where it has more objects: a sensor joins what touches and misses what is thin, but sees no seams where there
-    are none. Else it must explain the boundaries so much better, see `FAVOUR`; `boundary` is their probability at each
-    pixel, of which those `inside` count.
+    `boundary` is their probability at each pixel, of which those `inside` count; `FAVOUR` says how much better.
     """
-    counts = [len(np.unique(each[each > 0])) for each in ids]
-    if counts[1] > counts[0]:
-        return True
     borders = [_find_borders(each) & inside for each in ids]
     first, second = (_score_borders(border, boundary, inside) for border in borders)
-    favour = OUTLINE_FAVOUR if counts == [1, 1] else FAVOUR
+    counts = [len(np.unique(each[each > 0])) for each in ids]
+    favour = OUTLINE_FAVOUR if counts == [1, 1] else math.copysign(FAVOUR, counts[0] - counts[1])
     return bool(second - first > favour * max(1, *(int(border.sum()) for border in borders)))
 
 
