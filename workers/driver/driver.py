@@ -30,6 +30,7 @@ from workers.state.ledger import Ledger
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10  # in a row, per call in flight: one machine that is lost takes many calls along
 MAX_ERRORS_PER_CALL = 3  # as above, of workers that raise: every call of a machine meets its full disk
+MAX_ERRORS_PER_SCENE = 20  # more than such a machine causes beside sound ones: this scene makes its workers raise
 _BUDGET_SPENT = BudgetSpentError.__name__
 _WAIT_S = 0.2
 
@@ -51,7 +52,8 @@ class Driver:
         stages = [stage for kind in spec.kinds for stage in spec.pipelines[kind]]
         self._asking = {stage.name for stage in stages if calls_model(stage, spec.config)}
         self._workers = WorkerManager(executor, sorted({executor.pool_of(stage.pool) for stage in stages}))
-        self._losses_in_a_row: Counter[bool] = Counter()  # since the last result, by whether the worker raised
+        self._losses_in_a_row = self._errors_in_a_row = 0  # of workers that died and that raised, since the last result
+        self._older: set[int] = set()  # scenes that have run since before the errors in a row began
         self.out_of_budget = False  # whether a scene waits for a budget that is spent
 
     def run(self, check: Callable[[], None]) -> None:
@@ -104,7 +106,7 @@ class Driver:
                     continue
                 room -= 1
             left = len(scene.stages) - scene.position
-            ready.append(ReadyScene(rank, self._get_pool(scene.stage), left, alone=scene.losses > 0))
+            ready.append(ReadyScene(rank, self._get_pool(scene.stage), left, alone=scene.losses + scene.errors > 0))
         return ready
 
     def _calls_model(self, scene: InFlightScene) -> bool:
@@ -130,9 +132,18 @@ class Driver:
             )
             for position in range(scene.position, stop)
         )
-        where = (scene.row, scene.shard, scene.position)
-        before = (scene.child_losses, scene.failure, scene.new_child)
-        return Job(rank, StageChain(*where, calls, scene.input, allowance, *before))
+        chain = StageChain(
+            scene.row,
+            scene.shard,
+            scene.position,
+            calls,
+            scene.input,
+            allowance,
+            losses=scene.child_losses,
+            failure=scene.failure,
+            new_child=scene.new_child,
+        )
+        return Job(rank, chain)
 
     def _get_pool(self, stage: Stage) -> str:
         return self._executor.pool_of(stage.pool)
@@ -148,13 +159,13 @@ class Driver:
                 self._count_loss(event)
                 ranks = [job.rank for job in jobs]
                 self._settle_from_log(ranks)
-                self._requeue([self._running.pop(rank) for rank in ranks], counts=not raised)
+                self._requeue([self._running.pop(rank) for rank in ranks], raised=raised)
             case ShardStaged(call=call, staged=staged):
-                self._losses_in_a_row.clear()
+                self._losses_in_a_row = self._errors_in_a_row = 0
                 self._commits_in_flight -= 1
                 self._publish(call, staged)
             case CallFinished(answers=answers):
-                self._losses_in_a_row.clear()
+                self._losses_in_a_row = self._errors_in_a_row = 0
                 self._settle_answers(answers)
                 for answer in answers:
                     self._advance(self._running.pop(answer.rank), answer)
@@ -187,7 +198,7 @@ class Driver:
 
     def _advance(self, scene: InFlightScene, answer: JobResult) -> None:
         if answer.report.input_lost:
-            self._requeue([scene], counts=True)
+            self._requeue([scene])
             return
         first_position = scene.position
         output, scene.new_child = answer.report.output, False
@@ -220,24 +231,38 @@ class Driver:
         self._waiting[scene.rank] = scene
 
     def _count_loss(self, lost: WorkerLost) -> None:
-        """Count a lost worker; raise if only losses came since the last result."""
-        self._tally.losses += 1
-        self._losses_in_a_row[lost.raised] += 1
-        in_a_row = self._losses_in_a_row[lost.raised]
-        most = MAX_ERRORS_PER_CALL if lost.raised else MAX_LOSSES_PER_CALL
-        if in_a_row >= most * self._workers.max_calls_in_flight:
-            what = "workers raised errors" if lost.raised else "workers were lost"
-            raise BuildError(
-                f"{in_a_row} {what} in a row, the last one with: {lost.why}. Finished scenes are "
-                "kept: see to the cluster, then run the same command to go on"
-            )
+        """Count a lost worker; raise if only losses came since the last result.
 
-    def _requeue(self, scenes: Sequence[InFlightScene], *, counts: bool) -> None:
-        """Requeue scenes whose worker or input is lost; one that loses them too often fails, if that counts."""
+        A machine whose workers raise at once is given all that is to do: what others have begun before is awaited.
+        """
+        self._tally.losses += 1
+        ended = {job.rank for job in lost.work} if isinstance(lost.work, tuple) else set()
+        if lost.raised:
+            self._older = (self._older if self._errors_in_a_row else set(self._running)) - ended
+            self._errors_in_a_row += 1
+        else:
+            self._older -= ended
+            self._losses_in_a_row += 1
+        calls = self._workers.max_calls_in_flight
+        if self._losses_in_a_row >= MAX_LOSSES_PER_CALL * calls:
+            what = f"{self._losses_in_a_row} workers were lost"
+        elif self._errors_in_a_row >= MAX_ERRORS_PER_CALL * calls and not self._older:
+            what = f"{self._errors_in_a_row} workers raised errors"
+        else:
+            return
+        raise BuildError(
+            f"{what} in a row, the last one with: {lost.why}. Finished scenes are kept: see to the cluster, then run the "
+            "same command to go on"
+        )
+
+    def _requeue(self, scenes: Sequence[InFlightScene], *, raised: bool = False) -> None:
+        """Requeue scenes whose worker or input is lost, or whose worker `raised`; one that does so too often fails."""
         requeued = []
         for scene in scenes:
-            scene.losses += counts
-            if not counts or scene.losses < MAX_LOSSES_PER_SCENE or not self._outcomes.record_lost(scene):
+            scene.errors += raised
+            scene.losses += not raised
+            fails = scene.losses >= MAX_LOSSES_PER_SCENE or scene.errors >= MAX_ERRORS_PER_SCENE
+            if not (fails and self._outcomes.record_lost(scene)):
                 requeued.append(scene)
         self._checkpoints.resume(requeued)
         self._waiting |= {scene.rank: scene for scene in requeued}

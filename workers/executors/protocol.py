@@ -54,7 +54,7 @@ class WorkerLost:
     worker: int
     work: tuple[Job, ...] | CommitCall  # of its call; no jobs if it never started
     why: str  # description of the loss
-    raised: bool = False  # whether it raised an error of its own: then no scene can have ended it
+    raised: bool = False  # whether it raised an error of its own, most likely of its machine
 
 
 Event = WorkerReady | CallFinished | ShardStaged | WorkerLost

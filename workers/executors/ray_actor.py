@@ -17,7 +17,7 @@ from workers.state.commit import stage_shard
 
 
 class WorkerError(Exception):
-    """Error outside the sandbox, as on a machine without room in its temporary folder: no scene caused it."""
+    """Error outside the sandbox, as on a machine without room in its temporary folder."""
 
 
 class StageActor:
@@ -36,19 +36,19 @@ class StageActor:
 
     def run(self, chains: bytes) -> bytes:
         """Run encoded chains; returns their encoded reports."""
-        with _name_node():
+        with _wrap_errors():
             decoded: tuple[StageChain, ...] = decode(chains)
             return encode(tuple(self._sandbox.run(chain) for chain in decoded))
 
     def stage_shard(self, call: bytes) -> bytes:
         """Assemble a shard for its commit; takes an encoded `CommitCall`, returns an encoded `StagedShard`."""
-        with _name_node():
+        with _wrap_errors():
             return encode(stage_shard(self._out, decode(call)))
 
 
 @contextmanager
-def _name_node() -> Iterator[None]:
-    """Name this node in every error that does not stop the build."""
+def _wrap_errors() -> Iterator[None]:
+    """Raise what does not stop the build as a `WorkerError` that names this node."""
     try:
         yield
     except BuildError:

@@ -103,12 +103,23 @@ def _as_text(column: pa.Array) -> pa.Array | None:
 
 def _to_python(value: pa.Scalar) -> Any:
     """Return a value as Python's; as its type, which is no text either, if Python's own types cannot hold it."""
-    if value.is_valid and "[ns" in str(value.type):  # nanoseconds become pandas' types where that is installed
-        return value.type
+    kind = value.type
     try:
+        if value.is_valid and "[ns" in str(kind):  # nanoseconds become pandas' types where that is installed
+            value = value.cast(_to_microseconds(kind))
         return value.as_py()
-    except (ValueError, OverflowError):  # a year after 9999, or an unknown time zone
-        return value.type
+    except (ValueError, OverflowError):  # parts of a microsecond, a year after 9999, an unknown time zone
+        return kind
+
+
+def _to_microseconds(kind: pa.DataType) -> pa.DataType:
+    if pa.types.is_timestamp(kind):
+        return pa.timestamp("us", kind.tz)
+    if pa.types.is_time64(kind):
+        return pa.time64("us")
+    if pa.types.is_duration(kind):
+        return pa.duration("us")
+    raise ValueError(f"{kind} holds nanoseconds within")
 
 
 def _replace_rows(

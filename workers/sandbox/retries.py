@@ -3,7 +3,8 @@
 A crash, a hang or too much memory is the scene's own only in a new child that began with this stage. A used one still
 holds what earlier stages left in it, and which these were depends on the executor, on the number of workers and on
 interruptions: stages of other scenes, or those before it in its chain, which a resumed build begins behind them. A
-failure in a used child is therefore repeated in a new one and does not count as an attempt.
+failure in a used child is therefore repeated in a new one and does not count as an attempt; once is enough, also where
+the input was lost meanwhile and the stage before runs again in that child.
 """
 
 from collections import Counter
@@ -53,10 +54,12 @@ class ChainRun:
                 self._done.append(report)
             elif not may_retry(report):
                 return self._make_report(report)
-            elif self._counts(result.new_child and number == 0):
+            elif (result.new_child and number == 0) or self.needs_new_child:
                 self._tries[len(self._done)] += 1
                 if report.attempts >= self._attempts:
                     return self._make_report(report)
+            else:
+                self._failed_in_used.add(len(self._done))
         if len(self._done) == len(self._chain.calls):
             return self._make_report()
         if result.killed:
@@ -71,13 +74,6 @@ class ChainRun:
             self._outputs.pop()
         self._advance()
         return None
-
-    def _counts(self, is_first: bool) -> bool:
-        """Whether a failure of the next stage counts; `is_first` if its child had run nothing before."""
-        if is_first or self.needs_new_child:  # once is enough, also where its input is lost again and again
-            return True
-        self._failed_in_used.add(len(self._done))
-        return False
 
     def _make_report(self, *last: StageReport) -> StageChainReport:
         output, counted = self._outputs[-1] if self._outputs else "", self._counted and not any(map(may_retry, last))

@@ -28,7 +28,8 @@ from tableverse_factory.stages.perceive.perceive import perceive
 TRUTH_NAMES = ("seg.png", MASKS_NAME)
 GOOD_IOU = 0.5
 TABLE_SHARE = 0.5
-UNLABELLED = -1  # in a truth: nobody has said what this pixel shows
+UNLABELLED = -2  # in a truth: nobody has said what this pixel shows
+MOST_LABELLED = 1e-3  # share of the pixels without a reading that a truth drawn on the depth labels, by smoothed outlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +119,7 @@ def score_capture(capture: Path, config: Config) -> MaskScore:
     else:
         found, pairs_found, reason = np.zeros_like(truth), {}, getattr(outcome, "reason", str(outcome))
         kept = remove_table(truth, np.full_like(truth, -1)) if is_seg else truth
+    found = remove_unlabelled(kept, found)
     score = compare_masks(capture.name, kept, found, seconds, reason)
     pairs = read_true_pairs(capture)
     return score if pairs is None else replace(score, containment=compare_pairs(kept, found, pairs, pairs_found))
@@ -170,17 +172,25 @@ def remove_table(truth: IdImage, found: IdImage) -> IdImage:
 
 
 def mark_unlabelled(truth: IdImage, depth: DepthImage) -> IdImage:
-    """Set to `UNLABELLED` what has no reading in `depth`, if the truth labels nothing there: it was made on the depth.
+    """Mark the pixels without a reading in `depth` as `UNLABELLED` in a truth that labels nothing there.
 
-    The sides of boxes beyond a sensor's range would else count as background.
+    Such a truth was drawn on the depth: the sides of boxes beyond a sensor's range would else count as background.
     """
     unread = depth <= 0
-    return truth if (truth[unread] > 0).any() else np.where(unread, UNLABELLED, truth).astype(np.int32)
+    labels = int((truth[unread] > 0).sum())
+    if labels > MOST_LABELLED * int(unread.sum()):
+        return truth
+    return np.where(unread, UNLABELLED, truth).astype(np.int32)
+
+
+def remove_unlabelled(truth: IdImage, found: IdImage) -> IdImage:
+    """Set what was found to background where the truth is `UNLABELLED`."""
+    return np.where(truth == UNLABELLED, 0, found).astype(np.int32)
 
 
 def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reason: str = "") -> MaskScore:
-    """Compare two id images of the same shape; ids above 0 are objects. `UNLABELLED` pixels count for neither."""
-    shared, true_sizes, found_sizes = _count_overlaps(truth, np.where(truth == UNLABELLED, 0, found).astype(np.int32))
+    """Compare two id images of the same shape; ids above 0 are objects."""
+    shared, true_sizes, found_sizes = _count_overlaps(truth, found)
     union = true_sizes[:, None] + found_sizes[None] - shared
     ious = (shared / np.maximum(union, 1)).max(axis=1, initial=0.0)
     rows, columns = _assign_by_f(shared, true_sizes, found_sizes)

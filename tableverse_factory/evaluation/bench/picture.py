@@ -25,6 +25,7 @@ from tableverse_factory.evaluation.bench.perception import (
     mark_unlabelled,
     merge_scores,
     remove_table,
+    remove_unlabelled,
 )
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
@@ -123,7 +124,7 @@ def score_picture(capture: Path, config: Config, with_focal: bool = False) -> Pi
     masks = None
     if any((capture / name).is_file() for name in TRUTH_NAMES):
         own = resize_nearest(found.instance_ids, ids.shape) if found else np.zeros_like(ids)
-        masks = compare_masks(capture.name, ids, own, cpu_s, reason)
+        masks = compare_masks(capture.name, ids, remove_unlabelled(ids, own), cpu_s, reason)
     nothing = float("nan")
     if found is None or truth is None:
         return PictureScore(capture.name, nothing, nothing, nothing, nothing, nothing, cpu_s, masks, reason)

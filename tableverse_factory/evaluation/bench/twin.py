@@ -20,10 +20,10 @@ from tableverse_factory.core.storage.untrusted import parse_json
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
 from tableverse_factory.evaluation.bench.perception import (
     TRUTH_NAMES,
-    UNLABELLED,
     mark_unlabelled,
     match_ids,
     remove_table,
+    remove_unlabelled,
 )
 from tableverse_factory.evaluation.bench.twin_relations import compare_twin_relations
 from tableverse_factory.evaluation.bench.twin_views import TwinView, decode_masks, render_twin, write_side_by_side
@@ -127,8 +127,7 @@ def compare_files(
         things, shown = masks, np.where((masks == 0) & (capture.depth == 0), 0, view.ids)
     else:
         things = remove_table(truth, np.where(_find_table_pixels(capture, view), -1, masks))
-        is_labelled = mark_unlabelled(truth, capture.depth) != UNLABELLED
-        shown = np.where(is_labelled, _match_things(things, view), 0)
+        shown = _match_things(things, remove_unlabelled(mark_unlabelled(truth, capture.depth), view.ids), view)
     compared = tuple(_compare_things(capture, view, things, shown))
     score = TwinScore(
         row.name,
@@ -215,14 +214,14 @@ def _find_table_pixels(capture: Capture, view: TwinView) -> Mask:
     return (capture.depth > 0) & (np.abs(heights) <= TABLE_NOISE_M)
 
 
-def _match_things(truth: IdImage, view: TwinView) -> IdImage:
-    """Give the objects of the twin the ids of the true things that they match; the others get ids of their own."""
-    matched = match_ids(truth, view.ids)
+def _match_things(truth: IdImage, ids: IdImage, view: TwinView) -> IdImage:
+    """Give the objects of the twin, `ids`, those of the true things that they match; the others get ids of their own."""
+    matched = match_ids(truth, ids)
     above = int(max(truth.max(), view.ids.max(initial=0), *view.names, *matched.values(), 0)) + 1
     number = np.arange(above) + above
     number[0] = 0
     number[list(matched)] = list(matched.values())
-    return number[view.ids].astype(np.int32)
+    return number[ids].astype(np.int32)
 
 
 def _compare_things(capture: Capture, view: TwinView, things: IdImage, shown: IdImage) -> Iterator[TwinThing]:

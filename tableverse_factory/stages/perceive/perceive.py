@@ -22,7 +22,7 @@ from tableverse_factory.stages.perceive.scale.known_length import find_scaled_ta
 from tableverse_factory.stages.perceive.table import (
     compute_camera_to_table,
     fit_table_rectangle,
-    raise_table,
+    misses_table,
     refit_table_to_box,
     refit_table_to_mask,
 )
@@ -49,12 +49,11 @@ def perceive(
         return found
     if found.table_box is not None:
         view = refit_table_to_box(view, found.table_box, rng)
-    if found.table_top is not None:
-        raised = raise_table(view, found.table_top, rng)
-        if raised is not view:
-            view, found = raised, DETECTORS[name](raised, config, services)
-            if isinstance(found, Dropped):
-                return found
+    if found.table_top is not None and misses_table(view, found.table_top):
+        seen_view = refit_table_to_mask(view, found.table_top, rng)
+        again = DETECTORS[name](seen_view, config, services)
+        if isinstance(again, DetectionResult) and again.candidates:
+            view, found = seen_view, again
     candidates, ids = found.candidates, found.ids
     if ids is None:
         ids = segment_boxes(view, found, config)

@@ -112,27 +112,26 @@ def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generat
 
 
 def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
-    """Refit the table to a higher plane in the box in which a detector sees the table, as `raise_table` does."""
+    """Refit the table to a higher plane that fills more of the box in which a detector sees the table.
+
+    Unchanged where the found table fills enough of the box (objects hide the rest), or no higher plane fills more of
+    it: a floor may be taken for a table, never the reverse.
+    """
     x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
     inside = np.zeros(view.valid.shape, dtype=bool)
-    inside[y0:y1, x0:x1] = True
-    return raise_table(view, inside, rng)
-
-
-def raise_table(view: TableView, seen: Mask, rng: np.random.Generator) -> TableView:
-    """Refit the table to a higher plane that fills more of where a detector has `seen` the table.
-
-    Unchanged where the found table fills enough of it (objects may hide the rest), or no higher plane fills more of it:
-    a floor may be taken for a table, never the reverse.
-    """
-    inside = seen & view.valid
-    share = _measure_table_share(view, inside)
-    if share >= MIN_SEEN_SHARE or int(inside.sum()) < MIN_TABLE_TOP_PIXELS:
+    inside[y0:y1, x0:x1] = view.valid[y0:y1, x0:x1]
+    if not misses_table(view, inside):
         return view
     found = find_table(view.observation, rng, inside)
     if isinstance(found, Dropped) or found.plane.offset <= view.plane.offset:
         return view
-    return found if _measure_table_share(found, inside) > share else view
+    return found if _measure_table_share(found, inside) > _measure_table_share(view, inside) else view
+
+
+def misses_table(view: TableView, seen: Mask) -> bool:
+    """Whether the found table misses most of where a detector has `seen` it, of which enough was measured."""
+    inside = seen & view.valid
+    return int(inside.sum()) >= MIN_TABLE_TOP_PIXELS and _measure_table_share(view, inside) < MIN_SEEN_SHARE
 
 
 def _measure_table_share(view: TableView, inside: Mask) -> float:

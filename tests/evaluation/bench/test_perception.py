@@ -20,6 +20,7 @@ from tableverse_factory.evaluation.bench.perception import (
     merge_scores,
     read_true_pairs,
     remove_table,
+    remove_unlabelled,
 )
 from tests.helpers.tabletop_views import Bowl, Box, camera_above, look
 
@@ -70,12 +71,28 @@ def test_what_the_truth_does_not_know_costs_no_precision():
 
 def test_pixels_that_a_truth_drawn_on_the_depth_cannot_label_count_for_neither_side():
     truth, found = ids([1, 1, 0, 0, 0]), ids([4, 4, 4, 0, 5])
-    unread = np.array([[0.7, 0.7, 0.0, 0.7, 0.7]])
-    score = compare_masks("a", mark_unlabelled(truth, unread), found, 0.1)
+    marked = mark_unlabelled(truth, np.array([[0.7, 0.7, 0.0, 0.7, 0.7]]))
+    kept = remove_unlabelled(marked, found)
+    score = compare_masks("a", marked, kept, 0.1)
     assert (score.mean_iou, score.overlap_f) == (1.0, 1.0)
     assert score.found == 2, "the other object lies where the truth says that there is none"
-    drawn_on_colour = np.array([[0.7, 0.0, 0.0, 0.7, 0.7]])
-    assert compare_masks("a", mark_unlabelled(truth, drawn_on_colour), found, 0.1).mean_iou == pytest.approx(2 / 3)
+    drawn_on_color = mark_unlabelled(truth, np.array([[0.7, 0.0, 0.0, 0.7, 0.7]]))
+    assert compare_masks("a", drawn_on_color, remove_unlabelled(drawn_on_color, found), 0.1).mean_iou == 2 / 3
+
+
+def test_objects_are_matched_by_labelled_pixels_alone(tmp_path):
+    """A box whose sides lie beyond the sensor's range is larger than its truth, and its twin is still its match."""
+    capture = tmp_path / "boxes"
+    write_look(capture, [Box(-0.12, 0.05, (0.1, 0.06, 0.15)), Box(0.15, -0.05, (0.08, 0.08, 0.08))], {})
+    depth = np.array(Image.open(capture / "depth.png"))
+    masks = np.array(Image.open(capture / "masks.png"))
+    left = (masks == 1) & (np.arange(masks.shape[1]) < np.flatnonzero((masks == 1).any(axis=0)).mean())
+    depth[left], masks[left] = 0, 0
+    Image.fromarray(depth).save(capture / "depth.png")
+    Image.fromarray(masks).save(capture / "masks.png")
+    whole = next(iter(bench_masks(tmp_path, Config())))
+    assert whole.mean_iou > 0.9
+    assert whole.found == whole.truth == 2
 
 
 def test_finding_nothing_scores_nothing():

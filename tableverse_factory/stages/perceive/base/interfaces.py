@@ -31,7 +31,7 @@ class DetectionResult(Frozen):
 
     candidates: tuple[Candidate, ...]  # every object once, containers before their contents, without the table
     table_box: PixelBox | None = None
-    table_top: Mask | None = None  # where the table is seen; objects are detected again if that is not on the plane
+    table_top: Mask | None = None  # where the table is seen; where the plane found misses it, both are found again
     record: DetectionRecord | None = None  # origin of the answer; None where no model was asked
     ids: IdImage | None = None  # the instance at each pixel; None for boxes only, for a BoxSegmenter
     shown: Mask | None = None  # what objects must explain; None: wherever the depth rises over the table

@@ -72,6 +72,25 @@ def test_a_seam_that_is_half_seen_parts_but_joins_nothing() -> None:
     assert not prefer_second([halves, ONE], boundary, EVERYWHERE)
 
 
+def test_an_answer_of_more_objects_may_explain_the_boundaries_less_well() -> None:
+    halves = np.where((ONE > 0) & (np.arange(SHAPE[1]) >= 60), 2, ONE).astype(np.int32)
+    boundary = draw_boundary()
+    boundary[20:60, 58:62] = 0.3  # a seam that is improbable, but not impossible
+    assert prefer_second([ONE, halves], boundary, EVERYWHERE)
+    boundary[20:60, 58:62] = 0.02
+    assert not prefer_second([ONE, halves], boundary, EVERYWHERE)
+
+
+def test_an_outline_is_taken_from_both_sooner_than_a_way_to_part_objects() -> None:
+    """Where each has one object a small gain decides; where they part several, it does not."""
+    boundary = draw_boundary()
+    narrow = np.where(np.arange(SHAPE[1]) < 92, ONE, 0).astype(np.int32)
+    boundary[18:62, 86:98] = 0.35
+    assert prefer_second([narrow, ONE], boundary, EVERYWHERE)
+    halves, wider = (np.where((each > 0) & (np.arange(SHAPE[1]) >= 60), 2, each) for each in (narrow, ONE))
+    assert not prefer_second([halves, wider], boundary, EVERYWHERE)
+
+
 def test_objects_that_overlap_are_one_group_and_neighbours_are_not() -> None:
     first = np.array([[1, 1, 1, 2, 2, 2, 2, 0, 3, 0]], dtype=np.int32)
     second = np.array([[1, 1, 1, 1, 3, 3, 2, 2, 0, 4]], dtype=np.int32)  # a quarter of 1 is too little
