@@ -179,10 +179,11 @@ class FakeBuild:
         limits: SpendingLimits = NO_LIMITS,
         config: Config | None = None,
         workers: int = 1,
+        executor: type[FakeExecutor] = FakeExecutor,
     ) -> None:
         self.spec = make_spec(folder, rows, config=config)
         self.ledger = FakeLedger(len(rows))
-        self.executor = FakeExecutor(folder, script, workers)
+        self.executor = executor(folder, script, workers)
         self.budget: Budget = resume_budget(limits, {})
         self.tally = Tally(("manifest", *(stage.name for stage in STAGES)), len(rows), 0, 1)
         self.display = Silent()

@@ -30,7 +30,6 @@ from workers.state.ledger import Ledger
 MAX_LOSSES_PER_SCENE = 5
 MAX_LOSSES_PER_CALL = 10  # in a row, per call in flight: one machine that is lost takes many calls along
 MAX_ERRORS_PER_CALL = 3  # as above, of workers that raise: every call of a machine meets its full disk
-MAX_ERRORS_PER_SCENE = 20  # more than such a machine causes beside sound ones: this scene makes its workers raise
 _BUDGET_SPENT = BudgetSpentError.__name__
 _WAIT_S = 0.2
 
@@ -106,7 +105,7 @@ class Driver:
                     continue
                 room -= 1
             left = len(scene.stages) - scene.position
-            ready.append(ReadyScene(rank, self._get_pool(scene.stage), left, alone=scene.losses + scene.errors > 0))
+            ready.append(ReadyScene(rank, self._get_pool(scene.stage), left, alone=scene.losses > 0))
         return ready
 
     def _calls_model(self, scene: InFlightScene) -> bool:
@@ -159,7 +158,7 @@ class Driver:
                 self._count_loss(event)
                 ranks = [job.rank for job in jobs]
                 self._settle_from_log(ranks)
-                self._requeue([self._running.pop(rank) for rank in ranks], raised=raised)
+                self._requeue([self._running.pop(rank) for rank in ranks], counts=not raised)
             case ShardStaged(call=call, staged=staged):
                 self._losses_in_a_row = self._errors_in_a_row = 0
                 self._commits_in_flight -= 1
@@ -255,14 +254,12 @@ class Driver:
             "same command to go on"
         )
 
-    def _requeue(self, scenes: Sequence[InFlightScene], *, raised: bool = False) -> None:
-        """Requeue scenes whose worker or input is lost, or whose worker `raised`; one that does so too often fails."""
+    def _requeue(self, scenes: Sequence[InFlightScene], *, counts: bool = True) -> None:
+        """Requeue scenes whose worker or input is lost; one that loses them too often fails, if that counts."""
         requeued = []
         for scene in scenes:
-            scene.errors += raised
-            scene.losses += not raised
-            fails = scene.losses >= MAX_LOSSES_PER_SCENE or scene.errors >= MAX_ERRORS_PER_SCENE
-            if not (fails and self._outcomes.record_lost(scene)):
+            scene.losses += counts
+            if not counts or scene.losses < MAX_LOSSES_PER_SCENE or not self._outcomes.record_lost(scene):
                 requeued.append(scene)
         self._checkpoints.resume(requeued)
         self._waiting |= {scene.rank: scene for scene in requeued}

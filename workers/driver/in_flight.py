@@ -41,7 +41,6 @@ class InFlightScene:
     position: int = 0  # its next stage, or the first of those that run
     attempts: int = 0  # most attempts that any stage needed
     losses: int = 0  # how often its worker was lost
-    errors: int = 0  # how often its worker raised
     tried: Counter[int] = field(default_factory=Counter)  # failed attempts by position, in calls the budget interrupted
     child_losses: int = 0  # how often a child was killed from outside in such calls
     new_child: bool = False  # whether its next stage failed in a used child in such a call

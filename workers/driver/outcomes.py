@@ -58,9 +58,8 @@ class OutcomeRecorder:
         return self._record_loss(scene, outcome)
 
     def record_lost(self, scene: InFlightScene) -> bool:
-        """Record a scene whose worker was lost, or raised, too often as failed; False if it goes on."""
-        raised = f" and raised an error {scene.errors} times" if scene.errors else ""
-        return self._record_loss(scene, Failed("lost", f"its worker was lost {scene.losses} times{raised}"))
+        """Record a scene whose worker was lost too often as failed; False if it goes on."""
+        return self._record_loss(scene, Failed("lost", f"its worker was lost {scene.losses} times"))
 
     def record_rejected(self, rank: int, row: ImageRow) -> None:
         """Record a rejected row of the manifest as dropped."""

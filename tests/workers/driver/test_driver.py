@@ -1,14 +1,25 @@
 """The driver's decisions, on an executor in memory: no process, no Ray."""
 
+from typing import Any
+
 import pytest
 
 from schemas.config import Config, CurateConfig
 from schemas.outcome import Dropped, Failed, ModelCost
 from tableverse_factory.core.errors import BuildError
-from tests.helpers.fake_executor import LOSE_INPUT, LOSE_WORKER, RAISE_IN_WORKER, STAGES, FakeBuild, make_rows
+from tests.helpers.fake_executor import (
+    LOSE_INPUT,
+    LOSE_WORKER,
+    RAISE_IN_WORKER,
+    STAGES,
+    FakeBuild,
+    FakeExecutor,
+    make_rows,
+)
 from workers.driver.budget import SpendingLimits
 from workers.driver.driver import MAX_LOSSES_PER_CALL, MAX_LOSSES_PER_SCENE
 from workers.driver.signals import StoppedError
+from workers.executors.protocol import Event, Job, WorkerLost
 
 
 def stop_after(n: int):
@@ -93,6 +104,32 @@ def test_workers_that_only_raise_stop_the_build_with_what_they_raised(tmp_path, 
     with pytest.raises(BuildError, match=r"3 workers raised errors in a row, the last one with: node n: OSError: no r"):
         build.run()
     assert not any(result.status == "failed" for result in build.ledger.results.values())
+
+
+class OneSlowMachineAndOneFull(FakeExecutor):
+    """A worker whose calls take long, and others that raise at once, in whose place new ones start."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._late: list[tuple[Job, ...]] = []
+        self._waits = 0
+
+    def submit(self, worker: int, jobs: tuple[Job, ...]) -> None:
+        if worker > 1:
+            self._events.append(WorkerLost(worker, jobs, "node b: OSError: no room", raised=True))
+        else:
+            self._late.append(jobs)
+
+    def wait(self, timeout_s: float) -> list[Event]:
+        self._waits += 1
+        if self._late and self._waits % 50 == 0:
+            super().submit(1, self._late.pop())
+        return super().wait(timeout_s)
+
+
+def test_where_one_machine_raises_at_once_the_others_are_awaited(tmp_path):
+    build = FakeBuild(tmp_path, make_rows(3), workers=2, executor=OneSlowMachineAndOneFull)
+    assert {result.status for result in build.run().values()} == {"done"}
 
 
 def test_a_lost_input_is_computed_again(tmp_path):

@@ -85,7 +85,7 @@ def test_an_outline_is_taken_from_both_sooner_than_a_way_to_part_objects() -> No
     """Where each has one object a small gain decides; where they part several, it does not."""
     boundary = draw_boundary()
     narrow = np.where(np.arange(SHAPE[1]) < 92, ONE, 0).astype(np.int32)
-    boundary[18:62, 86:98] = 0.35
+    boundary[18:62, 86:98] = 0.5
     assert prefer_second([narrow, ONE], boundary, EVERYWHERE)
     halves, wider = (np.where((each > 0) & (np.arange(SHAPE[1]) >= 60), 2, each) for each in (narrow, ONE))
     assert not prefer_second([halves, wider], boundary, EVERYWHERE)
