@@ -250,8 +250,8 @@ class Driver:
         else:
             return
         raise BuildError(
-            f"{what} in a row, the last one with: {lost.why}. Finished scenes are kept: see to the cluster, then run the "
-            "same command to go on"
+            f"{what} in a row, the last one with: {lost.why}. Finished scenes are kept: see to the cluster, then run "
+            "the same command to go on"
         )
 
     def _requeue(self, scenes: Sequence[InFlightScene], *, counts: bool = True) -> None:

@@ -29,7 +29,7 @@ TRUTH_NAMES = ("seg.png", MASKS_NAME)
 GOOD_IOU = 0.5
 TABLE_SHARE = 0.5
 UNLABELLED = -2  # in a truth: nobody has said what this pixel shows
-MOST_LABELLED = 1e-3  # share of the pixels without a reading that a truth drawn on the depth labels, by smoothed outlines
+MOST_LABELLED = 1e-3  # share of the pixels without a reading that a truth drawn on the depth labels along outlines
 
 
 @dataclass(frozen=True, slots=True)

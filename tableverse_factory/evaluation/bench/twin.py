@@ -215,7 +215,7 @@ def _find_table_pixels(capture: Capture, view: TwinView) -> Mask:
 
 
 def _match_things(truth: IdImage, ids: IdImage, view: TwinView) -> IdImage:
-    """Give the objects of the twin, `ids`, those of the true things that they match; the others get ids of their own."""
+    """Give the twin's objects, `ids`, the ids of the true things that they match; the others get ids of their own."""
     matched = match_ids(truth, ids)
     above = int(max(truth.max(), view.ids.max(initial=0), *view.names, *matched.values(), 0)) + 1
     number = np.arange(above) + above
