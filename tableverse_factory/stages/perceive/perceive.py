@@ -19,13 +19,8 @@ from tableverse_factory.stages.perceive.explanation import measure_explanation
 from tableverse_factory.stages.perceive.picture.detector import find_table_top
 from tableverse_factory.stages.perceive.registry import BOX_SEGMENTERS, DETECTORS
 from tableverse_factory.stages.perceive.scale.known_length import find_scaled_table, scale_by_height
-from tableverse_factory.stages.perceive.table import (
-    compute_camera_to_table,
-    fit_table_rectangle,
-    misses_table,
-    refit_table_to_box,
-    refit_table_to_mask,
-)
+from tableverse_factory.stages.perceive.table import compute_camera_to_table, fit_table_rectangle
+from tableverse_factory.stages.perceive.table_refit import misses_table, refit_table_to_box, refit_table_to_mask
 
 MIN_POINTS = 100
 MAX_POINTS = 12_000

@@ -23,42 +23,42 @@ from tableverse_factory.geometry.math.planes import (
     refine_plane,
 )
 from tableverse_factory.geometry.math.transforms import pose_from_matrix, transform_points
-from tableverse_factory.stages.perceive.base.interfaces import PixelBox
 from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise, fill_depth_gaps
 from tableverse_factory.stages.perceive.table_warp import fit_warp
 
-SAMPLES = 9000
-MAX_PLANES = 6
-MIN_PLANE_SHARE = 0.02
-MIN_PLANE_AREA_M2 = 0.01
-MAX_DOWNWARD = 0.5
-MAX_SIDEWAYS = 0.7
-LOWEST_TABLE_OVER_FLOOR_M = 0.25
-MIN_RAISED_AREA_M2 = 0.08
-HIGH_OVER_FLOOR_M = 0.45
-MIN_HIGH_AREA_M2 = 0.04
-LEANING_COS = 0.985  # 10 degrees
-PARALLEL_COS = 0.996
-BENT_PARALLEL_COS = 0.98
+SAMPLES = 9000  # readings in which planes are searched
+MAX_PLANES = 6  # table, floor, shelf and the walls of a corner
+MIN_PLANE_SHARE, MIN_PLANE_AREA_M2 = 0.02, 0.01  # of the readings; of a table in a close-up
+
+# A plane whose normal points so far down or sideways in the picture is a wall, or the side of something.
+MAX_DOWNWARD, MAX_SIDEWAYS = 0.5, 0.7
+
+# A parallel plane over the best one is a table over its floor. Tops of boxes are lower or smaller; so high that no box
+# reaches it, a table may be smaller and lean by 10 degrees, as a school desk does.
+LOWEST_TABLE_OVER_FLOOR_M, MIN_RAISED_AREA_M2 = 0.25, 0.08
+HIGH_OVER_FLOOR_M, MIN_HIGH_AREA_M2 = 0.45, 0.04
+LEANING_COS = 0.985
+PARALLEL_COS, BENT_PARALLEL_COS = 0.996, 0.98  # 5 degrees; 11 where a depth model bends the planes
+MIN_SOLIDITY = 0.3  # share of its outline that a table fills; a ring of chair seats fills less
+SUPPORT_MIN_SHARE = 0.003  # of the readings that stand above a plane which carries something
+
+# Fit to a plane, and the shape of its surface, which sensors and models bend
 BENDS = 2.0  # tolerance of the fit to a plane, in bends of a depth model
 DEGREE, BENT_DEGREE = 2, 4
+WARP_BAND_M, MAX_WARP_M = 0.012, 0.01  # heights that the surface is fitted to; most that a sensor warps it
+
+# What counts as raised: heights of the lowest and the highest objects, and how far from the table-top they stand
 RAISED_BENDS = 0.75
-MIN_SOLIDITY = 0.3
-SUPPORT_MIN_SHARE = 0.003
-MIN_HEIGHT_M = 0.006
-MAX_HEIGHT_M = 0.8
-WARP_BAND_M = 0.012
-MAX_WARP_M = 0.01
+MIN_HEIGHT_M, MAX_HEIGHT_M = 0.006, 0.8
 SURROUNDINGS_M = 0.25
-MIN_WIDE_SHARE = 0.2
-MIN_TABLE_TOP_PIXELS = 2000
-MIN_SEEN_SHARE = 0.35
-CELL_M = 0.02
-GAP_M = 0.2
-COVERED_BELOW_M = 0.3
+
+MIN_WIDE_SHARE = 0.2  # of the readings in a plane that lie together: of an upright face's strips fewer do
+MIN_TABLE_TOP_PIXELS = 2000  # of a table-top that others see, for a plane through it
+
+# Patches of one table: cells along it, gaps of things and shadows between them, and what is too high to hide a part
+CELL_M, GAP_M, COVERED_BELOW_M = 0.02, 0.2, 0.3
 OUTLINE_SAMPLES = 20_000
-OUTLINE_MARGIN_M = 0.03
-RECTANGLE_MARGIN_M = 0.03
+OUTLINE_MARGIN_M = RECTANGLE_MARGIN_M = 0.03  # beyond the outline: readings on its edge; beyond footprints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,42 +100,6 @@ def find_table(
     return _build_view(
         observation, points, valid, valid if table_top is None else valid & table_top, chosen.plane, others
     )
-
-
-def refit_table_to_mask(view: TableView, table_top: Mask, rng: np.random.Generator) -> TableView:
-    """Refit the table to the pixels that a segmenter gives to the table-top, so that no larger floor is taken for it.
-
-    Unchanged where too few of them were measured, or they lie on no plane that a table can have.
-    """
-    found = find_table(view.observation, rng, table_top)
-    return view if isinstance(found, Dropped) else found
-
-
-def refit_table_to_box(view: TableView, box: PixelBox, rng: np.random.Generator) -> TableView:
-    """Refit the table to a higher plane that fills more of the box in which a detector sees the table.
-
-    Unchanged where the found table fills enough of the box (objects hide the rest), or no higher plane fills more of
-    it: a floor may be taken for a table, never the reverse.
-    """
-    x0, y0, x1, y1 = (max(round(edge), 0) for edge in box)
-    inside = np.zeros(view.valid.shape, dtype=bool)
-    inside[y0:y1, x0:x1] = view.valid[y0:y1, x0:x1]
-    if not misses_table(view, inside):
-        return view
-    found = find_table(view.observation, rng, inside)
-    if isinstance(found, Dropped) or found.plane.offset <= view.plane.offset:
-        return view
-    return found if _measure_table_share(found, inside) > _measure_table_share(view, inside) else view
-
-
-def misses_table(view: TableView, seen: Mask) -> bool:
-    """Whether the found table misses most of where a detector has `seen` it, of which enough was measured."""
-    inside = seen & view.valid
-    return int(inside.sum()) >= MIN_TABLE_TOP_PIXELS and _measure_table_share(view, inside) < MIN_SEEN_SHARE
-
-
-def _measure_table_share(view: TableView, inside: Mask) -> float:
-    return float(view.on_plane[inside].mean()) if inside.any() else 0.0
 
 
 def _sample_grid(valid: Mask) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,8 @@ from tableverse_factory.geometry.math.transforms import rotation_angle, rotation
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
-from tableverse_factory.stages.perceive.table import _remove_strips, find_table, refit_table_to_box
+from tableverse_factory.stages.perceive.table import _remove_strips, find_table
+from tableverse_factory.stages.perceive.table_refit import refit_table_to_box
 from tests.helpers.tabletop_views import CAMERA, GEOMETRIC, SMALL_CAMERA, Box, best_overlaps, camera_above
 from tests.helpers.tabletop_views import look as look_with
 

@@ -22,7 +22,8 @@ from tableverse_factory.stages.perceive.sam.masks import BoxQuestion, compute_id
 from tableverse_factory.stages.perceive.sam.model import load_sam
 from tableverse_factory.stages.perceive.sam.process import segment_in_daemon
 from tableverse_factory.stages.perceive.sam.segmenter import build_question
-from tableverse_factory.stages.perceive.table import find_table, refit_table_to_mask
+from tableverse_factory.stages.perceive.table import find_table
+from tableverse_factory.stages.perceive.table_refit import refit_table_to_mask
 from tests.helpers.loopback import serving
 from tests.helpers.sam_models import save_tiny
 from tests.helpers.tabletop_views import Box, camera_above, look
