@@ -38,10 +38,13 @@ def bench_perception(
     Example: `tableverse bench perception captures --detector geometric`
     """
     from tableverse_factory.core.config import load_config
+    from tableverse_factory.core.errors import InputError
     from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
 
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
     scores = list(bench_masks(folder, load_config(config, chosen)))
+    if all(score.unread for score in scores):
+        raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     rows = [*scores, merge_scores(scores)]
     if as_json:
         print_json([asdict(row) | _derive_scores(row) for row in rows])

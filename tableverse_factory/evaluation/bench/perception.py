@@ -63,8 +63,9 @@ class MaskScore:
     found_pixels: int  # of all objects found that overlap a true object
     true_pixels: int  # of all true objects
     cpu_s: float  # CPU time of `perceive` [s]
-    reason: str = ""  # why the scene was dropped, or empty
+    reason: str = ""  # why the scene was dropped, or the capture could not be read, or empty
     containment: Containment | None = None  # None without `truth.json`
+    unread: bool = False
 
     @property
     def mean_iou(self) -> float:
@@ -78,13 +79,13 @@ class MaskScore:
 
     @property
     def overlap_f(self) -> float:
-        """Harmonic mean of overlap precision and recall, as UOIS defines it."""
+        """Harmonic mean of overlap precision and recall, as in UOIS; objects found beside all true ones are free."""
         both = self.found_pixels + self.true_pixels
         return 2 * self.overlap / both if both else float("nan")
 
 
 def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
-    """Score every capture in `folder` that has a truth, in the order of their names.
+    """Score every capture in `folder` that has a truth, in the order of their names; what cannot be read says so.
 
     The truth is `seg.png` or `masks.png`, and `truth.json` for containment. The largest id of a `seg.png` may be the
     table: it is left out if most of it lies on the plane that was found.
@@ -93,7 +94,10 @@ def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
     if not names:
         raise InputError(f"{str(folder)!r} holds no capture with {' or '.join(TRUTH_NAMES)}")
     for name in names:
-        yield score_capture(folder / name, config)
+        try:
+            yield score_capture(folder / name, config)
+        except InputError as error:
+            yield MaskScore(name, 0, 0, (), 0, 0, 0, 0.0, str(error), unread=True)
 
 
 def score_capture(capture: Path, config: Config) -> MaskScore:
@@ -210,6 +214,7 @@ def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reaso
 
 def merge_scores(scores: list[MaskScore]) -> MaskScore:
     """Merge the scores of captures; means are over all true objects."""
+    scores = [score for score in scores if not score.unread]
     known = [(c.true, c.found, c.correct) for c in (score.containment for score in scores) if c is not None]
     return MaskScore(
         "all",
@@ -219,7 +224,7 @@ def merge_scores(scores: list[MaskScore]) -> MaskScore:
         sum(s.overlap for s in scores),
         sum(s.found_pixels for s in scores),
         sum(s.true_pixels for s in scores),
-        float(np.median([s.cpu_s for s in scores])),
+        float(np.median([s.cpu_s for s in scores])) if scores else 0.0,
         containment=Containment(*(sum(counts) for counts in zip(*known, strict=True))) if known else None,
     )
 

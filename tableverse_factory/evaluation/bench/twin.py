@@ -80,15 +80,18 @@ class TwinPair(Frozen):
 
 
 def find_captures(folder: Path, config: Config, dataset: str = "") -> list[ImageRow]:
-    """List the sound captures of a folder, sorted by name.
+    """List the captures of a folder, sorted by name; those that cannot be read are rejected rows.
 
     Raises:
-        InputError: `no_scenes`, if there are none, or none is in the dataset that is given.
+        InputError: `no_scenes`, if there are none that can be read, or none is in the dataset that is given.
     """
     rows = make_manifest([str(folder)], config.observe).rows
-    captures = sorted((r for r in rows if r.kind is SceneKind.CAPTURE and not r.rejected), key=lambda r: r.name)
+    captures = sorted((row for row in rows if row.kind is SceneKind.CAPTURE), key=lambda row: row.name)
     if not captures:
         raise InputError(f"{folder}: no captures; each is a folder with color.png, depth.png, camera.json", "no_scenes")
+    if all(row.rejected for row in captures):
+        first = f"{captures[0].name}: {captures[0].rejected}: {captures[0].rejected_detail}"
+        raise InputError(f"{folder}: none of {len(captures)} captures can be read; the first: {first}", "no_scenes")
     if dataset:
         known = set(open_dataset(dataset).scenes.to_table(columns=["scene_id"])["scene_id"].to_pylist())
         if known.isdisjoint(row.scene_id for row in captures):
@@ -97,8 +100,16 @@ def find_captures(folder: Path, config: Config, dataset: str = "") -> list[Image
 
 
 def measure_twin(row: ImageRow, config: Config, dataset: str, pictures: Path | None) -> TwinScore:
-    """Score one capture, of a dataset or computed (`dataset` empty); write `NAME.jpg` into the folder `pictures`."""
-    score, pair = compare_twin(row, config, open_dataset(dataset) if dataset else None)
+    """Score one capture, of a dataset or computed (`dataset` empty); write `NAME.jpg` into the folder `pictures`.
+
+    One that cannot be read has no things, and the reason.
+    """
+    if row.rejected:
+        return TwinScore(row.name, (), reason=f"{row.rejected}: {row.rejected_detail}")
+    try:
+        score, pair = compare_twin(row, config, open_dataset(dataset) if dataset else None)
+    except InputError as error:
+        return TwinScore(row.name, (), reason=str(error))
     if pictures is not None:
         file = pictures / f"{row.name}.jpg"
         write_side_by_side(file, pair.photograph, pair.twin, pair.things, pair.shown)

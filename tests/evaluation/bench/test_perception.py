@@ -120,6 +120,23 @@ def test_a_folder_without_truth_is_refused(tmp_path):
         list(bench_masks(tmp_path, Config()))
 
 
+def test_a_capture_that_cannot_be_read_costs_the_others_nothing(tmp_path):
+    for name, x in (("a", -0.12), ("b", 0.0), ("c", 0.12)):
+        write_look(tmp_path / name, [Box(x, 0.05, (0.1, 0.06, 0.15))], {})
+    Image.new("I;16", (8, 8)).save(tmp_path / "a" / "masks.png")
+    Image.new("I;16", Image.open(tmp_path / "b" / "depth.png").size).save(tmp_path / "b" / "depth.png")
+    scores = list(bench_masks(tmp_path, Config()))
+    assert [score.unread for score in scores] == [True, True, False]
+    assert "8 x 8" in scores[0].reason
+    assert "depth_all_zero" in scores[1].reason
+    assert merge_scores(scores).truth == 1
+    (tmp_path / "c" / "truth.json").unlink()
+    shown = CliRunner().invoke(app, ["bench", "twin", str(tmp_path), "--jobs", "1"])
+    assert shown.exit_code == 0, shown.output
+    assert "depth_all_zero" in shown.output
+    assert "1 of 3 captures have a scene" in shown.output
+
+
 def test_what_lies_in_what_is_counted_by_the_masks_and_not_by_the_numbers():
     truth, found = ids([1, 1, 1, 2, 3, 3]), ids([9, 9, 9, 4, 5, 5])
     true = {2: 1, 3: 1, 6: 1}  # the sixth thing is hidden
