@@ -43,7 +43,7 @@ class PoolSpec(Section):
         if self.max is not None and self.min > self.max:
             raise ValueError(f"min {self.min} is more than max {self.max}")
         if not (self.cpus or self.gpus or self.memory_mb or any(self.resources.values())):
-            raise ValueError("an actor must hold something that the cluster has a bounded number of, e.g. cpus: 0.1")
+            raise ValueError("an actor would hold nothing: give cpus, gpus, memory_mb or resources above 0")
         return self
 
     def needs(self) -> dict[str, float]:
