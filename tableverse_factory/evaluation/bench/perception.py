@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from scipy.optimize import linear_sum_assignment
 
-from schemas.config import Config
-from schemas.geometry import DepthImage, IdImage
+from schemas.config import Config, ObserveConfig
+from schemas.geometry import Camera, DepthImage, Frozen, IdImage
 from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
-from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
@@ -84,6 +83,18 @@ class MaskScore:
         return 2 * self.overlap / both if both else float("nan")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueMasks(Frozen):
+    """True masks of a capture: `UNLABELLED` where nobody has said what a pixel shows, and what may be the table."""
+
+    ids: IdImage
+    largest_may_be_table: bool
+
+    def remove_table(self, found: IdImage) -> IdImage:
+        """Return the ids without the table, if it may be among them, see the function of this name."""
+        return remove_table(self.ids, found) if self.largest_may_be_table else self.ids
+
+
 def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
     """Score every capture in `folder` that has a truth, in the order of their names; what cannot be read says so.
 
@@ -112,17 +123,18 @@ def score_capture(capture: Path, config: Config) -> MaskScore:
     )
     if not isinstance(seen, Done):
         raise InputError(f"{capture.name}: {seen}")
-    truth = _read_truth(capture, seen.value, config)
+    truth = read_true_masks(capture, config.observe, seen.value.camera, seen.value.depth)
+    if truth is None:
+        raise InputError(f"{capture.name} has no {' or '.join(TRUTH_NAMES)}")
     start = time.process_time()
     outcome = perceive(seen.value, config, make_rng(config.run.seed, scene_id, "perceive"), services)
     seconds = time.process_time() - start
-    is_seg = (capture / TRUTH_NAMES[0]).is_file()
     if isinstance(outcome, Done):
         found, pairs_found, reason = outcome.value.instance_ids, find_pairs(outcome.value), ""
-        kept = remove_table(truth, found) if is_seg else truth
+        kept = truth.remove_table(found)
     else:
-        found, pairs_found, reason = np.zeros_like(truth), {}, getattr(outcome, "reason", str(outcome))
-        kept = remove_table(truth, np.full_like(truth, -1)) if is_seg else truth
+        found, pairs_found, reason = np.zeros_like(truth.ids), {}, getattr(outcome, "reason", str(outcome))
+        kept = truth.remove_table(found - 1)
     found = remove_unlabelled(kept, found)
     score = compare_masks(capture.name, kept, found, seconds, reason)
     pairs = read_true_pairs(capture)
@@ -165,6 +177,14 @@ def match_ids(truth: IdImage, found: IdImage) -> dict[int, int]:
     return {int(found_ids[f]): int(true_ids[t]) for t, f in pairs if shared[t, f] > 0}
 
 
+def read_true_masks(capture: Path, bounds: ObserveConfig, camera: Camera, depth: DepthImage) -> TrueMasks | None:
+    """Read the true masks of a capture, whose `seg.png` may number the table; None if it has none."""
+    path = _find_file(capture, TRUTH_NAMES)
+    if path is None:
+        return None
+    return TrueMasks(mark_unlabelled(read_id_image(str(path), bounds, camera), depth), path.name == TRUTH_NAMES[0])
+
+
 def remove_table(truth: IdImage, found: IdImage) -> IdImage:
     """Set the largest id of the truth to background if most of its pixels were found to be table (-1)."""
     sizes = np.bincount(truth[truth > 0])
@@ -176,7 +196,7 @@ def remove_table(truth: IdImage, found: IdImage) -> IdImage:
 
 
 def mark_unlabelled(truth: IdImage, depth: DepthImage) -> IdImage:
-    """Mark the pixels without a reading in `depth` as `UNLABELLED` in a truth that labels nothing there.
+    """Mark the pixels without a reading in `depth` as `UNLABELLED` in a truth that labels next to nothing there.
 
     Such a truth was drawn on the depth: the sides of boxes beyond a sensor's range would else count as background.
     """
@@ -252,10 +272,3 @@ def _assign_by_f(
 
 def _find_file(capture: Path, names: Iterable[str]) -> Path | None:
     return next((capture / name for name in names if (capture / name).is_file()), None)
-
-
-def _read_truth(capture: Path, seen: Observation, config: Config) -> IdImage:
-    path = _find_file(capture, TRUTH_NAMES)
-    if path is None:
-        raise InputError(f"{capture.name} has no {' or '.join(TRUTH_NAMES)}")
-    return mark_unlabelled(read_id_image(str(path), config.observe, seen.camera), seen.depth)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.config import Config, ObserveConfig, PerceiveConfig
-from schemas.geometry import DepthImage, IdImage
+from schemas.geometry import DepthImage
 from schemas.identity import check_id
 from schemas.known_length import KnownDistance
 from schemas.manifest import ImageRow, SceneKind
@@ -19,17 +19,15 @@ from schemas.outcome import Done, Outcome
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.bench.perception import (
-    TRUTH_NAMES,
     MaskScore,
     compare_masks,
-    mark_unlabelled,
     merge_scores,
-    remove_table,
+    read_true_masks,
     remove_unlabelled,
 )
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
-from tableverse_factory.sources.capture import COLOR_NAMES, read_id_image
+from tableverse_factory.sources.capture import COLOR_NAMES
 from tableverse_factory.sources.image_file import read_image
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
@@ -118,11 +116,13 @@ def score_picture(capture: Path, config: Config, with_focal: bool = False) -> Pi
     start = time.process_time()
     outcome = _perceive_picture(color, config)
     cpu_s = time.process_time() - start
-    ids = _read_objects(capture, sensor, truth, config)
+    by_depth = np.zeros(sensor.depth.shape, dtype=np.int32) if truth is None else truth.instance_ids
+    true_masks = read_true_masks(capture, config.observe, sensor.camera, sensor.depth)
+    ids = np.maximum(by_depth, 0) if true_masks is None else true_masks.remove_table(by_depth)
     found = outcome.value if isinstance(outcome, Done) else None
     reason = "" if found else str(getattr(outcome, "reason", outcome))
     masks = None
-    if any((capture / name).is_file() for name in TRUTH_NAMES):
+    if true_masks is not None:
         own = resize_nearest(found.instance_ids, ids.shape) if found else np.zeros_like(ids)
         masks = compare_masks(capture.name, ids, remove_unlabelled(ids, own), cpu_s, reason)
     nothing = float("nan")
@@ -220,17 +220,6 @@ def _perceive_truth(capture: Path, config: Config) -> tuple[Observation, Perceiv
         raise InputError(f"{capture.name}: {seen}")
     outcome = perceive(seen.value, own, _seed(own), Services(Path()))
     return seen.value, outcome.value if isinstance(outcome, Done) else None
-
-
-def _read_objects(capture: Path, sensor: Observation, truth: PerceivedObjects | None, config: Config) -> IdImage:
-    """Read the true objects, or take those that the sensor's depth shows."""
-    none = np.zeros(sensor.depth.shape, dtype=np.int32)
-    by_depth = none if truth is None else truth.instance_ids
-    for name in TRUTH_NAMES:
-        if (capture / name).is_file():
-            ids = mark_unlabelled(read_id_image(str(capture / name), config.observe, sensor.camera), sensor.depth)
-            return remove_table(ids, by_depth) if name == TRUTH_NAMES[0] else ids
-    return np.maximum(by_depth, 0)
 
 
 def _observe(kind: SceneKind, path: Path, config: Config) -> Outcome[Observation]:

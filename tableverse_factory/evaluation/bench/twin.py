@@ -18,13 +18,7 @@ from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.untrusted import parse_json
 from tableverse_factory.dataset.dataset import Dataset, open_dataset
-from tableverse_factory.evaluation.bench.perception import (
-    TRUTH_NAMES,
-    mark_unlabelled,
-    match_ids,
-    remove_table,
-    remove_unlabelled,
-)
+from tableverse_factory.evaluation.bench.perception import match_ids, read_true_masks, remove_unlabelled
 from tableverse_factory.evaluation.bench.twin_relations import compare_twin_relations
 from tableverse_factory.evaluation.bench.twin_views import TwinView, decode_masks, render_twin, write_side_by_side
 from tableverse_factory.geometry.math.camera import backproject
@@ -33,7 +27,7 @@ from tableverse_factory.geometry.relations.preserved import PreservedRelations
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.render.silhouettes import compare_silhouettes
 from tableverse_factory.pipeline import PIPELINES
-from tableverse_factory.sources.capture import Capture, read_capture, read_id_image
+from tableverse_factory.sources.capture import Capture, read_capture
 from tableverse_factory.sources.manifest import make_manifest
 
 TABLE_NOISE_M = 0.01  # a reading this near the table plane is of the table
@@ -132,13 +126,13 @@ def compare_files(
     meta = parse_json(files["meta.json"], f"{row.name}: meta.json", "bad_meta")
     view = render_twin(files, meta, row.name)
     masks = decode_masks(files, view.eye.camera, config.observe)
-    truth = _read_true_ids(row, capture, config)
+    truth = read_true_masks(Path(row.uri), config.observe, capture.camera, capture.depth)
     if truth is None:
         # Where the sensor measured nothing, perception can give no pixel to a thing.
         things, shown = masks, np.where((masks == 0) & (capture.depth == 0), 0, view.ids)
     else:
-        things = remove_table(truth, np.where(_find_table_pixels(capture, view), -1, masks))
-        shown = _match_things(things, remove_unlabelled(mark_unlabelled(truth, capture.depth), view.ids), view)
+        things = truth.remove_table(np.where(_find_table_pixels(capture, view), -1, masks))
+        shown = _match_things(things, remove_unlabelled(things, view.ids), view)
     compared = tuple(_compare_things(capture, view, things, shown))
     score = TwinScore(
         row.name,
@@ -200,17 +194,11 @@ def _read_files(row: ImageRow, built: Dataset) -> tuple[Mapping[str, bytes] | No
     return built.scene(row.scene_id).files(), ""
 
 
-def _read_true_ids(row: ImageRow, capture: Capture, config: Config) -> IdImage | None:
-    """Read the true masks; None if the capture has none."""
-    path = next((path for name in TRUTH_NAMES if (path := Path(row.uri) / name).is_file()), None)
-    return None if path is None else read_id_image(str(path), config.observe, capture.camera)
-
-
 def _score_lost(row: ImageRow, capture: Capture, config: Config, reason: str) -> tuple[TwinScore, TwinPair]:
-    """Score a capture without a scene: each thing that is known is lost; the largest of a `seg.png` is the table."""
-    truth = _read_true_ids(row, capture, config)
+    """Score a capture without a scene: each thing that is known is lost."""
+    truth = read_true_masks(Path(row.uri), config.observe, capture.camera, capture.depth)
     nothing = np.zeros(capture.color.shape[:2], dtype=np.int32)
-    things = nothing if truth is None else remove_table(truth, nothing - 1)
+    things = nothing if truth is None else truth.remove_table(nothing - 1)
     lost = tuple(TwinThing() for _ in np.unique(things[things > 0]))
     blank = np.full_like(capture.color, 255)
     return TwinScore(row.name, lost, truth=truth is not None, reason=reason), TwinPair(

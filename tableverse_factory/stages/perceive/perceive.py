@@ -45,10 +45,10 @@ def perceive(
     if found.table_box is not None:
         view = refit_table_to_box(view, found.table_box, rng)
     if found.table_top is not None and misses_table(view, found.table_top):
-        seen_view = refit_table_to_mask(view, found.table_top, rng)
-        again = DETECTORS[name](seen_view, config, services)
+        refitted = refit_table_to_mask(view, found.table_top, rng)
+        again = found if refitted is view else DETECTORS[name](refitted, config, services)
         if isinstance(again, DetectionResult) and again.candidates:
-            view, found = seen_view, again
+            view, found = refitted, again
     candidates, ids = found.candidates, found.ids
     if ids is None:
         ids = segment_boxes(view, found, config)

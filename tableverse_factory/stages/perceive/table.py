@@ -39,7 +39,7 @@ LOWEST_TABLE_OVER_FLOOR_M, MIN_RAISED_AREA_M2 = 0.25, 0.08
 HIGH_OVER_FLOOR_M, MIN_HIGH_AREA_M2 = 0.45, 0.04
 LEANING_COS = 0.985
 PARALLEL_COS, BENT_PARALLEL_COS = 0.996, 0.98  # 5 degrees; 11 where a depth model bends the planes
-MIN_SOLIDITY = 0.3  # share of its outline that a table fills; a ring of chair seats fills less
+MIN_SOLIDITY = 0.3  # share of its outline that a table fills: a few patches far apart are none
 SUPPORT_MIN_SHARE = 0.003  # of the readings that stand above a plane which carries something
 
 # Fit to a plane, and the shape of its surface, which sensors and models bend
