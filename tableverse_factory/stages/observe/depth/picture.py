@@ -6,32 +6,47 @@ from dataclasses import replace
 import numpy as np
 
 from schemas.config import Config, ObserveConfig
+from schemas.geometry import Camera
 from schemas.manifest import ImageRow
 from tableverse_factory.core.errors import AnswerInvalidError
 from tableverse_factory.models.picture.predict import PicturePrediction, predict_picture
 from tableverse_factory.sources.capture import Capture
 from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, build_capture, create_centered_camera
-from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
+from tableverse_factory.stages.observe.depth.rgb_image import RgbImage, read_rgb_image
 
 SIGMA_FACTOR = 1.15  # 68 % of 28 photographs lie within so many deviations of the net, which knows renders alone
-FOCAL_SIGMA = 0.2  # of the logarithm of an assumed focal length, with which the scale grows
+FOCAL_SIGMA = 0.2  # of the logarithm of a focal length that no file tells, with which the scale grows
+# Only narrower ones: a picture without its EXIF was often cropped, and a crop never widens the field of view. The net's
+# logit for a table has its highest near the true field: of 28 photographs within 16 %, where 58 degrees miss by 24 %.
+NARROWER_FIELDS_DEG = (46.0, 34.0)
+UNSURE_PROBABILITY = 0.5  # from which a picture gets these looks, which cost as much as the first each
 
 
 def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
     """Estimate depth; the focal length comes from EXIF, `observe.focal_px` or the usual field of view.
 
+    Where it is a guess, and the net is unsure of the table, narrower fields of view are tried, and the one with which
+    it is surest is taken: a wrong field distorts what it sees.
+
     Raises:
         AnswerInvalidError: reasons `no_table`, `table_out_of_bounds`.
     """
     bounds, photo = config.observe, read_rgb_image(item.uri, config.observe)
-    camera = create_centered_camera(photo.get_focal_px(bounds.focal_px), photo.color.shape, photo.color.shape)
-    found = predict_picture(photo.color, camera, weights=bounds.depth_weights)
-    check_table(found, bounds)
-    capture = build_capture(
-        photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=photo.intrinsics_source), bounds
-    )
     spread = FOCAL_SIGMA if photo.exif_px is None and bounds.focal_px is None else 0.0
+    focal_px, source = photo.get_focal_px(bounds.focal_px), photo.intrinsics_source
+    camera, found = _predict(photo, focal_px, bounds)
+    if spread and UNSURE_PROBABILITY <= found.table_probability < bounds.min_table_probability:
+        tried = [_predict(photo, photo.get_field_px(field), bounds) for field in NARROWER_FIELDS_DEG]
+        camera, found = max(tried, key=lambda each: each[1].table_probability)
+        source = "model"
+    check_table(found, bounds)
+    capture = build_capture(photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=source), bounds)
     return replace(capture, camera=camera, scale_sigma=math.hypot(SIGMA_FACTOR * found.scale_sigma, spread))
+
+
+def _predict(photo: RgbImage, focal_px: float, bounds: ObserveConfig) -> tuple[Camera, PicturePrediction]:
+    camera = create_centered_camera(focal_px, photo.color.shape, photo.color.shape)
+    return camera, predict_picture(photo.color, camera, weights=bounds.depth_weights)
 
 
 def check_table(found: PicturePrediction, bounds: ObserveConfig) -> None:

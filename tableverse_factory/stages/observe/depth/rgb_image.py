@@ -36,7 +36,11 @@ class RgbImage(Frozen):
             return self.exif_px
         if configured is not None:
             return configured * self.scale
-        return max(self.color.shape[:2]) / (2.0 * math.tan(math.radians(USUAL_FIELD_DEG) / 2.0))
+        return self.get_field_px(USUAL_FIELD_DEG)
+
+    def get_field_px(self, field_deg: float) -> float:
+        """Return the focal length for `color` [px] with which its longer side spans an angle."""
+        return max(self.color.shape[:2]) / (2.0 * math.tan(math.radians(field_deg) / 2.0))
 
 
 def read_rgb_image(uri: str, bounds: ObserveConfig) -> RgbImage:

@@ -146,6 +146,19 @@ def test_the_focal_length_comes_from_exif_then_the_configuration(tmp_path: Path)
     assert told.value.camera.fx != pytest.approx(900.0, rel=0.01)
 
 
+@pytest.mark.shared
+@pytest.mark.heavy
+def test_a_picture_of_a_long_lens_is_seen_with_a_narrower_angle(shared_dir: Path) -> None:
+    """The capture has 1067 px; with the 577 px of the usual angle its table would be none."""
+    picture = shared_dir / "captures" / "ycbv_000003" / "color.png"
+    told = see(picture, focal_px=577.0)
+    assert 0.5 < read_probability(told) < 0.92
+    seen = see(picture)
+    assert isinstance(seen, Done), seen
+    assert seen.value.intrinsics_source == "model"
+    assert seen.value.camera.fx == pytest.approx(1067.0, rel=0.03)
+
+
 @pytest.mark.heavy
 def test_the_plane_has_bounds() -> None:
     """Beyond each of them the picture is dropped, and what is wrong is said in numbers."""
