@@ -20,7 +20,7 @@ MIN_PIECE_PX, MIN_OBJECT_PX = 20, 60
 EDGE = 0.5  # probability from which a boundary separates
 ACROSS_PX = 3  # surfaces are compared at this distance from the border of two pieces
 MIN_CONTACT = 0.3  # length of that border, in square roots of the smaller piece's area
-AGREED, LIKELY = 0.3, 0.6  # votes between two middles, as a share of those at the lesser one
+AGREED, LIKELY, SAME = 0.3, 0.6, 0.9  # votes between two middles, as a share of those at the lesser one
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
 PROBABLE = -0.8  # the same on a smooth surface; odds are even at -1.1: training weighs pairs of two objects threefold
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
@@ -69,7 +69,7 @@ def _find_objects(found: PicturePrediction) -> IdImage:
         continues = border.boundary < EDGE and border.bend < limit and border.affinity > -SURE
         if touches and (continues or border.affinity > SURE):
             wanted.append((border, -SURE))
-        elif touches and border.affinity > PROBABLE and border.bend < SMOOTH:
+        elif touches and border.affinity > PROBABLE and (border.bend < SMOOTH or agreement >= SAME):
             wanted.append((border, PROBABLE))
     group = _merge_pieces(wanted, borders, len(middle_of))
     touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}

@@ -6,29 +6,40 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 from PIL import Image
-from scipy.ndimage import binary_erosion
+from scipy import ndimage
 
 from schemas.geometry import Camera, Frozen, Mask, Picture, Points, Pose, TriangleMesh
 from schemas.objects import Evidence
 from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, transform_points
+from tableverse_factory.geometry.math.transforms import (
+    compose_poses,
+    identity_pose,
+    invert_pose,
+    transform_points,
+)
 from tableverse_factory.geometry.mesh.hulls import cross_rows
-from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
+from tableverse_factory.geometry.mesh.occluding_edges import find_behind_edges
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, pack_rays
 
 LEAST_FACING = 0.2  # least cosine between normal and line of sight; pixels of steeper faces are too stretched
 BORDER_PIXELS = 2  # width of the outline whose pixels mix the object with its background [px]
+EDGE_SHARE = 0.03  # of an object's size, by which a mesh fitted to estimated depth misses the edges in the picture
 SAME_SURFACE = 0.004  # share of the distance by which the first surface on the line to a visible point may be nearer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColorProjector(Frozen):
-    """The picture, relative to one object; `own` are the pixels that show it alone, its mesh is at `scale`."""
+    """The picture, relative to one object; `own` are the pixels that show it alone, its mesh is at `scale`.
+
+    Where a sensor measured the depth, the mesh meets its edges in the picture; else it `misses_edges` a little.
+    """
 
     color: Picture
     own: Mask
     camera: Camera
     object_to_camera: Pose
     scale: float
+    misses_edges: bool
 
     @property
     def texels_per_metre(self) -> float:
@@ -44,10 +55,13 @@ def load_projectors(evidence: Evidence, poses: list[Pose], scales: list[float]) 
     return [
         ColorProjector(
             color,
-            binary_erosion(ids == value, iterations=BORDER_PIXELS) if value > 0 else np.zeros(ids.shape, dtype=bool),
+            ndimage.binary_erosion(ids == value, iterations=BORDER_PIXELS)
+            if value > 0
+            else np.zeros(ids.shape, dtype=bool),
             evidence.camera,
             compose_poses(table_to_camera, pose),
             scale,
+            evidence.scale_source != "sensor",
         )
         for value, pose, scale in zip(evidence.object_pixels, poses, scales, strict=True)
     ]
@@ -62,6 +76,7 @@ class PhotographedMesh:
         a, b, c = (placed[mesh.faces[:, k]] for k in range(3))
         self._normals = cross_rows(b - a, c - a)
         self._scene = make_raycasting_scene(TriangleMesh(placed, mesh.faces))
+        self._own = _remove_edges(photograph, self._scene)
 
     def find_shown(
         self, points: Points, faces: np.ndarray
@@ -78,10 +93,10 @@ class PhotographedMesh:
         shown = np.flatnonzero(facing)
         pixels = project(at[shown], photograph.camera)
         nearest = np.rint(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64)
-        height, width = photograph.own.shape
+        height, width = self._own.shape
         inside = ((nearest >= 0) & (nearest < [width, height])).all(axis=1)
         u, v = np.clip(nearest, 0, [width - 1, height - 1]).T
-        inside &= photograph.own[v, u]
+        inside &= self._own[v, u]
         shown, pixels = shown[inside], pixels[inside]
         # A point is visible if no other part of the mesh is nearer on its line of sight.
         rays = pack_rays(np.zeros(3), at[shown])
@@ -96,6 +111,19 @@ class PhotographedMesh:
     def texels_per_metre(self) -> float:
         """Pixels per metre of the mesh's own length."""
         return self._photograph.texels_per_metre
+
+
+def _remove_edges(photograph: ColorProjector, scene: RaycastingScene) -> Mask:
+    """Remove the object's pixels just behind edges that its mesh misses: what is before them may show there."""
+    own = photograph.own.copy()
+    if not photograph.misses_edges or not own.any():
+        return own
+    (rows, columns), camera = ndimage.find_objects(own.astype(np.uint8))[0], photograph.camera
+    size = columns.stop - columns.start, rows.stop - rows.start
+    window = Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
+    reach = max(1, round(EDGE_SHARE * float(np.sqrt(own.sum()))))
+    own[rows, columns] &= ~find_behind_edges(scene, window, identity_pose(), reach)
+    return own
 
 
 def sample_bilinear(picture: Picture, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:

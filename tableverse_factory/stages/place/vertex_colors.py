@@ -5,13 +5,19 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Colors, Points, Pose, TriangleMesh
+from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
+from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.geometry.mesh.occluding_edges import find_behind_edges
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 NEIGHBOURS = 5
 SOURCES = 8000
 LEAF_SIZE = 64  # points in a leaf of the tree: in seven dimensions half the time of the default
 NORMAL_M = 0.03  # half the extra distance of a surface that faces the opposite way [m]
+EDGE_SHARE = 0.03  # of an object's size, by which a shape fitted to estimated depth may miss the edges in the picture
+LEAST_SHARE = 0.2  # of the points that must be left
 COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
 # Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame.
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
@@ -23,20 +29,43 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> Triangle
     The points also count turned by half and mirrored in the object's own upright frame, a little farther away: so the
     back looks like the front, and the outside of a cup does not run into its inside.
     """
-    step = max(1, len(view.points) // SOURCES)
+    seen, towards, shown = _find_sources(mesh, pose, view)
+    step = max(1, len(seen) // SOURCES)
     upright = Pose(pose.position, _extract_heading(pose))
     to_own = invert_pose(upright)
     turn = rotation_matrix(to_own.quaternion_wxyz)
-    points = transform_points(to_own, view.points[::step])
-    normals = view.normals[::step] @ turn.T
+    points = transform_points(to_own, seen[::step])
+    normals = towards[::step] @ turn.T
     sources = np.concatenate(
         [_stack_features(points * t, normals * t, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
     )
     rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
     vertices = mesh.vertices @ rotation.T
     targets = _stack_features(vertices, _compute_vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
-    colors = _mix_colors(sources, np.tile(view.colors[::step], (len(_TURNS), 1)), targets)
+    colors = _mix_colors(sources, np.tile(shown[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
+
+
+def _find_sources(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> tuple[Points, Points, Colors]:
+    """Find points, normals and colours: as observed, or of estimated depth, where the picture shows the mesh.
+
+    A shape fitted to estimated depth misses the edges in the picture a little: just behind them it shows no colour.
+    """
+    observed = view.points, view.normals, view.colors
+    if not view.estimated:
+        return observed
+    scene = make_raycasting_scene(place_mesh(mesh, pose))
+    rays = view.points - view.eye
+    hit = scene.cast_rays(pack_rays(view.eye, rays), nthreads=1)
+    share, normals = (hit[key].numpy().astype(np.float64) for key in ("t_hit", "primitive_normals"))
+    reach = max(1, round(EDGE_SHARE * float(np.sqrt(view.own.sum()))))
+    behind = find_behind_edges(scene, view.camera, view.camera_to_table, reach)
+    pixels = np.rint(project(transform_points(invert_pose(view.camera_to_table), view.points), view.camera))
+    column, row = np.clip(pixels.astype(int), 0, np.array(behind.shape[::-1]) - 1).T
+    kept = np.isfinite(share) & ~behind[row, column]
+    if kept.sum() < LEAST_SHARE * len(kept):
+        return observed
+    return view.eye + rays[kept] * share[kept, None], normals[kept], view.colors[kept]
 
 
 def _compute_vertex_normals(mesh: TriangleMesh) -> Points:

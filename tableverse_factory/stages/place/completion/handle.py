@@ -6,22 +6,39 @@ from manifold3d import Manifold
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from schemas.geometry import IdImage, Mask, Points
+from schemas.geometry import IdImage, Mask, Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
-from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, to_tensor
+from tableverse_factory.geometry.math.camera import backproject, project
+from tableverse_factory.geometry.math.transforms import (
+    invert_pose,
+    matrix_from_pose,
+    rotation_matrix,
+    transform_points,
+)
+from tableverse_factory.geometry.mesh.raycasting import (
+    RaycastingScene,
+    make_raycasting_scene,
+    pack_rays,
+    to_tensor,
+)
 from tableverse_factory.geometry.mesh.voxel_solids import (
     extract_surface,
     find_largest_part,
     from_manifold,
     make_grid,
+    simplify_solid,
     to_manifold,
 )
+from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit
 from tableverse_factory.stages.place.completion.underside import compute_half_width
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
+HANDLE_FREEDOM = 0.2  # cost of handles, as a share of the misfit that they remove: they complete only a good body
+WORTH_HANDLES_M = 0.004  # misfit from which the body is wrong and the rest is no handle [m]
+MAX_FACES = 3200
+TOLERANCE_M = 0.00005
 AWAY_M = 0.004  # distance outside the body from which points belong to another part [m]
+FRAYED_PX = 2  # by which a mask's outline is ragged where a net drew it, as wide as half of the thinnest handle
 MIN_PIXELS = 30
 MIN_SHARE = 0.025
 RADIUS_RANGE_M = (0.002, 0.012)
@@ -30,13 +47,45 @@ MAX_CELLS = 250_000
 MAX_BRIDGE_M = 0.06
 BRIDGE_RADIUS_M = 0.005
 NEIGHBOURS = 8
+JOINED_SHARE = 0.3  # of a handle's pixels that lie nearest to the body
+EDGE_ON = 0.5  # least sine of the angle at which a ray must meet a handle's plane to tell a place on it
+MOST_MOVED = 0.35  # of a point's distance from the camera, into that plane
 
 
-def add_handles(view: ObjectView, body: Manifold, hole: Manifold | None) -> Manifold:
+def join_handles(
+    view: ObjectView, rays: RaySample, body: Manifold, hole: Manifold | None, axis: Pose
+) -> tuple[TriangleMesh, Pose, float]:
+    """Join a body, in the frame of `axis`, with its handles, if they explain the picture better; its `hole` stays free.
+
+    Returns the mesh about the middle of its box, its pose in the table frame, and its misfit with the cost of handles
+    [m].
+    """
+    to_table = matrix_from_pose(axis)[:3]
+    body, hole = body.transform(to_table), None if hole is None else hole.transform(to_table)
+    mesh, pose = _center(body, axis)
+    cost = compute_mesh_misfit(rays, mesh, pose)
+    if cost < WORTH_HANDLES_M:
+        whole = _center(simplify_solid(_add_handles(view, body, hole, axis), MAX_FACES, TOLERANCE_M), axis)
+        better = compute_mesh_misfit(rays, *whole)
+        if better < cost:
+            return *whole, better + HANDLE_FREEDOM * (cost - better)
+    return mesh, pose, cost
+
+
+def _center(solid: Manifold, axis: Pose) -> tuple[TriangleMesh, Pose]:
+    mesh = from_manifold(solid)
+    vertices = transform_points(invert_pose(axis), mesh.vertices)
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    pose = Pose(transform_points(axis, middle[None])[0], axis.quaternion_wxyz)
+    return TriangleMesh(vertices - middle, mesh.faces), pose
+
+
+def _add_handles(view: ObjectView, body: Manifold, hole: Manifold | None, axis: Pose) -> Manifold:
     """Join the body with the protrusions observed, its cavity left free; all in the table frame."""
-    mask = _find_protrusions(view, body)
+    scene = make_raycasting_scene(from_manifold(body))
+    mask = _find_protrusions(view, scene)
     for label in range(1, int(mask.max(initial=0)) + 1):
-        part = _sweep_part(view, mask == label)
+        part = _sweep_part(view, mask == label, axis)
         if part is None:
             continue
         joined = _join_part(body, part)
@@ -59,15 +108,9 @@ def _join_part(body: Manifold, part: Manifold) -> Manifold:
     return joined + Manifold.batch_hull([ball.translate(tuple(start)), ball.translate(tuple(end))])
 
 
-def _find_protrusions(view: ObjectView, body: Manifold) -> IdImage:
+def _find_protrusions(view: ObjectView, scene: RaycastingScene) -> IdImage:
     """Label the parts of the object that lie outside the body, over the window."""
-    scene = make_raycasting_scene(from_manifold(body))
-    away = scene.compute_signed_distance(to_tensor(view.points), nthreads=1).numpy() > AWAY_M
-    mask: Mask = np.zeros(view.own.shape, dtype=bool)
-    row, column = _find_pixels(view, view.points[away])
-    mask[np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)] = True
-    grown = ndimage.binary_dilation(ndimage.binary_opening(mask), iterations=2) & view.own
-    labels, count = ndimage.label(grown)
+    labels, count = ndimage.label(_find_uncovered(view, scene) if view.estimated else _find_away(view, scene))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     least = max(MIN_PIXELS, MIN_SHARE * float(view.own.sum()))
     kept = [k for k in range(1, count + 1) if sizes[k] >= least]
@@ -76,14 +119,40 @@ def _find_protrusions(view: ObjectView, body: Manifold) -> IdImage:
     return number[labels]
 
 
+def _find_away(view: ObjectView, scene: RaycastingScene) -> Mask:
+    """Find the object's pixels whose points lie outside the body, and those beside them."""
+    away = scene.compute_signed_distance(to_tensor(view.points), nthreads=1).numpy() > AWAY_M
+    mask: Mask = np.zeros(view.own.shape, dtype=bool)
+    row, column = _find_pixels(view, view.points[away])
+    mask[np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)] = True
+    return ndimage.binary_dilation(ndimage.binary_opening(mask), iterations=2) & view.own
+
+
+def _find_uncovered(view: ObjectView, scene: RaycastingScene) -> Mask:
+    """Find the object's pixels beside the body's silhouette, and those between: estimated depth tells nothing there.
+
+    It is off by more than a handle is thick.
+    """
+    unit = backproject(np.ones(view.own.shape), view.camera)
+    rays = pack_rays(view.eye, unit @ rotation_matrix(view.camera_to_table.quaternion_wxyz).T)
+    covered = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
+    away_px = AWAY_M * view.camera.fx / float(np.median(np.linalg.norm(view.points - view.eye, axis=1)))
+    beside = view.own & (ndimage.distance_transform_edt(~covered) > away_px)
+    core = ndimage.binary_opening(beside, iterations=FRAYED_PX)
+    return ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & view.own
+
+
 def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Find row and column of points of the table frame in the window, not clipped."""
     pixels = np.rint(project(transform_points(invert_pose(view.camera_to_table), points), view.camera)).astype(int)
     return pixels[:, 1], pixels[:, 0]
 
 
-def _sweep_part(view: ObjectView, mask: Mask) -> Manifold | None:
-    """Sweep balls behind each of the part's points, as thick as the part looks wide, carved by free space."""
+def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
+    """Sweep balls along the part, as thick as it looks wide: behind each of its points, carved by free space.
+
+    Where depth is estimated and the part lies in a plane through the axis, the balls do, and its depth carves nothing.
+    """
     width = compute_half_width(ndimage.distance_transform_edt(mask))
     row, column = _find_pixels(view, view.points)
     inside = mask[np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)]
@@ -94,11 +163,35 @@ def _sweep_part(view: ObjectView, mask: Mask) -> Manifold | None:
     depth = np.linalg.norm(rays, axis=1)
     pixels = width[row[inside], column[inside]]
     radius = np.clip(pixels * depth / view.camera.fx, *RADIUS_RANGE_M)
-    centers = points + rays / depth[:, None] * radius[:, None]
-    return _build_balls(view, centers, radius)
+    flat = _move_into_plane(view, points, axis) if view.estimated else None
+    if flat is not None:
+        return _build_balls(view, flat, radius, carve=False)
+    return _build_balls(view, points + rays / depth[:, None] * radius[:, None], radius, carve=True)
 
 
-def _build_balls(view: ObjectView, centers: Points, radius: Float64[np.ndarray, " n"]) -> Manifold | None:
+def _move_into_plane(view: ObjectView, points: Points, axis: Pose) -> Points | None:
+    """Move a part's points along their rays into the plane through the axis in which handles lie.
+
+    It is joined to the body where its rays pass the axis nearest. None where the camera sees the plane almost edge-on,
+    or the points lie far from it.
+    """
+    eye = transform_points(invert_pose(axis), view.eye[None])[0, :2]
+    rays = points - view.eye
+    across = (rays @ rotation_matrix(axis.quaternion_wxyz))[:, :2]
+    nearest = eye - across * ((across @ eye) / (across**2).sum(axis=1))[:, None]
+    distance = np.linalg.norm(nearest, axis=1)
+    outward = nearest[distance <= np.quantile(distance, JOINED_SHARE)].mean(axis=0)
+    normal = np.array([-outward[1], outward[0]]) / max(float(np.linalg.norm(outward)), 1e-9)
+    towards = across @ normal
+    if float(np.median(np.abs(towards) / np.linalg.norm(rays, axis=1))) < EDGE_ON:
+        return None
+    share = -(eye @ normal) / towards
+    return view.eye + rays * share[:, None] if float(np.abs(share - 1.0).max()) < MOST_MOVED else None
+
+
+def _build_balls(
+    view: ObjectView, centers: Points, radius: Float64[np.ndarray, " n"], *, carve: bool
+) -> Manifold | None:
     reach = float(radius.max()) + CELL_M
     low, high = centers.min(axis=0) - reach, centers.max(axis=0) + reach
     cell = max(CELL_M, float(np.cbrt(np.prod(high - low) / MAX_CELLS)))
@@ -110,7 +203,9 @@ def _build_balls(view: ObjectView, centers: Points, radius: Float64[np.ndarray, 
     count = min(NEIGHBOURS, len(centers))
     distance, index = cKDTree(centers).query(samples, k=count)
     ball = (radius[np.reshape(index, (-1, count))] - np.reshape(distance, (-1, count))).max(axis=1)
-    ball = np.minimum(np.minimum(ball, measure_free_space(view, samples)), samples[:, 2] - view.support_z)
+    ball = np.minimum(ball, samples[:, 2] - view.support_z)
+    if carve:
+        ball = np.minimum(ball, measure_free_space(view, samples))
     field = np.full(int(np.prod(grid.shape)), -2 * cell)
     field[near] = ball
     try:

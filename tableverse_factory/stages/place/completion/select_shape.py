@@ -11,13 +11,14 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
+from tableverse_factory.stages.place.completion.handle import join_handles
 from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
 from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing
-from tableverse_factory.stages.place.completion.turned_profile import build_turned_mesh
+from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
@@ -108,11 +109,16 @@ def _draft_box(box: SolidBox) -> Draft:
     return Draft(box.misfit, lambda: (build_box_mesh(box), box.pose, box.misfit))
 
 
-def _draft_turned(shape: TurnedShape | None) -> Draft | None:
+def _draft_turned(view: ObjectView, rays: RaySample, shape: TurnedShape | None) -> Draft | None:
     if shape is None:
         return None
     profile, misfit = shape
-    return Draft(misfit, lambda: (*build_turned_mesh(profile), misfit))
+
+    def finish() -> Shape:
+        mesh, pose, _ = join_handles(view, rays, *build_turned_solid(profile), profile.frame)
+        return mesh, pose, misfit
+
+    return Draft(misfit, finish)
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
@@ -162,8 +168,8 @@ KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]],
 # The same for depth that a model estimated, whose errors a free shape follows.
 ESTIMATED_KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
     ("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
-    ("carved/turned", 0.0, lambda view, rays: _draft_turned(fit_standing(view, rays))),
-    ("carved/lying", 3e-4, lambda view, rays: _draft_turned(fit_lying(view, rays))),
+    ("carved/turned", 0.0, lambda view, rays: _draft_turned(view, rays, fit_standing(view, rays))),
+    ("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
     ("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
     ("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     ("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),

@@ -1,4 +1,4 @@
-"""Profiles of turned shapes: their closed meshes, and where rays meet them."""
+"""Profiles of turned shapes: their solids, and where rays meet them."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,8 @@ from jaxtyping import Float64
 from manifold3d import CrossSection, FillRule, JoinType, Manifold
 from scipy.interpolate import PchipInterpolator
 
-from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.transforms import rotation_matrix, transform_points
-from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
+from schemas.geometry import Frozen, Pose, Vector3
+from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, Depths, RaySample
 
 SEGMENTS = 48
@@ -34,20 +33,18 @@ class TurnedProfile(Frozen):
     inner_radii: Radii
 
 
-def build_turned_mesh(profile: TurnedProfile) -> tuple[TriangleMesh, Pose]:
-    """Build the closed mesh about the middle of its box, and its pose in the table frame."""
+def build_turned_solid(profile: TurnedProfile) -> tuple[Manifold, Manifold | None]:
+    """Build the solid, and its cavity if it has one, in the frame of the profile."""
     height = float(profile.heights[-1])
-    section = _build_section(profile.heights, profile.radii)
+    section, cavity = _build_section(profile.heights, profile.radii), None
     if len(profile.inner_heights):
         hole = _build_section(profile.inner_heights, profile.inner_radii)
         hole = hole + _build_mouth(float(profile.inner_radii[-1]), height)
         # Between knots the rounded cavity must not pierce the rounded body.
         within = (section + _build_mouth(float(profile.radii[-1]), height)).offset(-LEAST_WALL_M, JoinType.Round)
-        section = section - max((hole ^ within).decompose(), key=lambda part: part.area())
-    mesh = from_manifold(Manifold.revolve(section, SEGMENTS))
-    middle = np.array([0.0, 0.0, height / 2])
-    pose = Pose(transform_points(profile.frame, middle[None])[0], profile.frame.quaternion_wxyz)
-    return TriangleMesh(mesh.vertices - middle, mesh.faces), pose
+        hole = max((hole ^ within).decompose(), key=lambda part: part.area())
+        section, cavity = section - hole, Manifold.revolve(hole, SEGMENTS)
+    return Manifold.revolve(section, SEGMENTS), cavity
 
 
 def intersect_turned(rays: RaySample, profile: TurnedProfile) -> Depths:
