@@ -11,7 +11,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from tableverse_factory import pipeline
 from tableverse_factory.core.process_pool import parallel_map
 from tableverse_factory.dataset.dataset import Dataset
 from tableverse_factory.viz.destination import (
@@ -43,13 +42,6 @@ PAGE_SIZE = 24
 DRAW_ALL_LIMIT, FILMS_PER_SCENE = 60, 6  # all scenes up to this number are drawn, some 4 CPU s each, a film 3
 SAMPLE_SIZE = 6  # of more scenes
 MOST_RELATIVES = 24  # of a family on the page of each of its scenes
-
-STAGES = (
-    "manifest",
-    "read_layout",
-    "derive_cousin",
-    *(stage.name for stage in pipeline.STAGES),
-)  # stages of the funnel, in order
 
 _STATIC = ("gallery.css", "gallery.js")
 _RENEWAL_S = 10.0  # least time between two indexes of what is drawn so far
@@ -201,7 +193,7 @@ def _write_index_pages(site: Site, records: Records, cards: Mapping[str, SceneCa
 def _summarize_records(records: Records) -> dict[str, Any]:
     return {
         "records": records,
-        "funnel": compute_funnel(records.entered, records.list_losses(), STAGES),
+        "funnel": compute_funnel(records.entered, records.list_losses(), records.kinds),
         "charts": make_charts(records),
         "n_objects": sum(len(scene.objects) for scene in records.done),
         "n_tasks": sum(scene.n_tasks for scene in records.done),

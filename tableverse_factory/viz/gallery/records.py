@@ -109,6 +109,11 @@ class Records:
         return len(self.done) + len(self.lost)
 
     @property
+    def kinds(self) -> set[str]:
+        """Kinds of input of all scenes, the lost ones included."""
+        return {str(scene.row["kind"]) for scene in (*self.done, *self.lost)}
+
+    @property
     def has_trajectories(self) -> bool:
         """Whether any scene has trajectories."""
         return any(scene.trajectories for scene in self.done)

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tableverse_factory import pipeline
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.apart import require_apart
 from tableverse_factory.core.storage.files import write_atomic
@@ -40,18 +39,10 @@ def make_report(dataset: Dataset) -> dict[str, Any]:
 
 def _compute_all(dataset: Dataset) -> tuple[Statistics, tuple[FunnelStep, ...], dict[str, Any]]:
     statistics = compute_statistics(dataset)
-    steps = compute_funnel(statistics.scenes["entered"], statistics.losses, _list_stages(statistics))
+    kinds = {kind for rows in dataset.scenes.to_batches(columns=["kind"]) for kind in rows["kind"].unique().to_pylist()}
+    steps = compute_funnel(statistics.scenes["entered"], statistics.losses, kinds)
     funnel = [
         {"stage": step.stage, "left": step.left} | {status: step.count_lost(status) for status in ("dropped", "failed")}
         for step in steps
     ]
     return statistics, steps, {**statistics.to_json(), "funnel": funnel}
-
-
-def _list_stages(statistics: Statistics) -> tuple[str, ...]:
-    """List the stages of the pipelines of this dataset in order; layouts start at another stage than pictures."""
-    kinds = {name for name, _ in statistics.kinds.top}
-    pipelines = [stages for kind, stages in pipeline.PIPELINES.items() if kind.value in kinds] or [pipeline.STAGES]
-    shared = [stage.name for stage in pipelines[0] if all(stage in stages for stages in pipelines)]
-    own = [stage.name for stages in pipelines for stage in stages if stage.name not in shared]
-    return (*dict.fromkeys(own), *shared)
