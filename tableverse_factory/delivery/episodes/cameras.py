@@ -20,10 +20,10 @@ WRIST_FIELD_OF_VIEW = float(np.deg2rad(75.0))  # vertical
 _WRIST_GAP_M, _WRIST_TARGET_M = 0.05, (0.02, 0.0, 0.04)  # before the hand; in the gripper frame, beyond the fingertips
 _EYE_M = (1.2, 0.85, 1.0)  # in the robot's base frame: across the table and to its left, with table and arm in view
 _TARGET_M = (0.37, 0.02, 0.26)
-_ELEVATION = float(np.deg2rad(30.0))
+_ELEVATION = float(np.deg2rad(33.0))
 # Of the film camera about the viewer's side, from which instructions say left and right; never from beyond
 _AZIMUTHS = tuple(np.deg2rad([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 78.0, -78.0]))
-_CLEAR_M = 0.05  # sufficient distance of the arm from the line of sight to the object at the end
+_CLEAR_M = 0.05  # sufficient distance of the arm from the line of sight to the object
 _PATH_MARGIN_M = 0.15  # table shown around the object's path
 _FRAMING_SAMPLES = 40  # arm configurations considered for framing
 
@@ -76,17 +76,19 @@ def _make_camera(field_of_view: float, width: int, height: int) -> Camera:
 def place_film_camera(recording: Recording, figure: ArmMeshes, width: int, height: int) -> PosedCamera:
     """Place a camera for people: as near as the whole motion of arm and object allows.
 
-    It stands where instructions say left and right from, so that a film never mirrors them: straight there if the arm
-    does not hide the object at the end, else as little to one side as possible; where the arm hides it from everywhere,
-    where the line of sight is freest.
+    It stands on the side from which instructions say left and right, so that a film never mirrors them, and there where
+    the arm hides the object least, from the grasp to the release: a robot on that side itself is seen from beside it.
     """
     flat, up = np.cos(_ELEVATION), np.sin(_ELEVATION)
     sides = [np.array([flat * np.sin(angle), -flat * np.cos(angle), up]) for angle in _AZIMUTHS]
     samples = np.unique(np.rint(np.linspace(0, len(recording) - 1, _FRAMING_SAMPLES)).astype(int))
     arm = [_collect_arm_points(recording, figure, sample) for sample in samples]
-    room = [min(_measure_clearance(side, recording.object_pose[-1, :3], arm[-1]), _CLEAR_M) for side in sides]
-    side = sides[int(np.argmax(room))]
     way = recording.object_pose[:, :3].astype(np.float64)
+    room = [
+        sum(min(_measure_clearance(side, way[at], parts), _CLEAR_M) for at, parts in zip(samples, arm, strict=True))
+        for side in sides
+    ]
+    side = sides[int(np.argmax(room))]
     margins = (-_PATH_MARGIN_M, _PATH_MARGIN_M)
     around = [way + np.array([x, y, 0.0]) for x in margins for y in margins]
     return frame_points(np.concatenate([*arm, *around]), look_at(side, np.zeros(3)), width, height)
@@ -102,7 +104,7 @@ def _collect_arm_points(recording: Recording, figure: ArmMeshes, sample: int) ->
 
 def _measure_clearance(side: Vector3, target: Vector3, arm: Points) -> float:
     """Measure the arm's distance to the line of sight from a target along the unit vector `side` [m]."""
-    away = arm - target.astype(np.float64)
+    away = arm - target
     along = away @ side
     before = away[along > 0.0] - along[along > 0.0, None] * side
     return float(np.linalg.norm(before, axis=1).min(initial=np.inf))

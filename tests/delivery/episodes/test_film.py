@@ -145,6 +145,24 @@ def test_the_arm_does_not_stand_before_the_object_in_the_end(out, figure, yaw):
     assert green > red + 40
 
 
+@pytest.mark.heavy
+def test_a_robot_on_the_viewers_side_does_not_stand_before_what_it_carries(out, figure):
+    """An arm that reaches away from the viewer would hide the object straight below its hand all the way."""
+    taken, scene = recording(), open_dataset(out).scene("a-1")
+    turned = compose_poses(Pose(np.zeros(3), quaternion_about_z(np.pi / 2)), BASE)
+    moved = compose_poses(turned, invert_pose(taken.base))
+    poses = taken.object_pose.copy()
+    poses[:, :3] = transform_points(moved, taken.tcp[:, :3].astype(np.float64)) - [0.0, 0.0, 0.11]
+    carried = replace(taken, base=turned, object_pose=poses)
+    eye = place_film_camera(carried, figure, 320, 240)
+    samples = [0, 10, 20, 30, 40]
+    for sample, picture in zip(samples, render_frames(scene, X_ID, carried, figure, eye, samples), strict=True):
+        seen = transform_points(invert_pose(eye.camera_to_table), poses[sample, :3].astype(np.float64)[None])
+        x, y = np.rint(project(seen, eye.camera)[0]).astype(int)
+        red, green, _ = picture[y, x].astype(int)
+        assert green > red + 40
+
+
 def test_the_scenes_own_camera_keeps_its_middle_in_any_format():
     """What its optical axis hits stays in the middle of a picture of another shape."""
     keys = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240}
