@@ -1,5 +1,6 @@
 """Words for what a pydantic model refuses, in the terms of JSON and YAML."""
 
+import reprlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
@@ -7,6 +8,8 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 _SHOWN_CHARS: Final = 80
+_BRIEF: Final = reprlib.Repr()
+_BRIEF.maxother = _SHOWN_CHARS
 _MESSAGES: Final[Mapping[str, str]] = {
     "missing": "is missing",
     "extra_forbidden": "is no key here: leave it out",
@@ -27,7 +30,9 @@ _MESSAGES: Final[Mapping[str, str]] = {
     "less_than": "give less than {lt:g}",
     "less_than_equal": "give at most {le:g}",
     "string_too_long": "give at most {max_length} characters",
+    "string_pattern_mismatch": "give a text that matches {pattern}",
     "literal_error": "give {expected}",
+    "enum": "give {expected}",
     "json_invalid": "it is no JSON: {error}",
     "union_tag_not_found": "{discriminator} is missing",
     "union_tag_invalid": "{discriminator}: give one of {expected_tags}, not {tag!r}",
@@ -36,7 +41,7 @@ _WITHOUT_VALUE: Final = {"json_invalid", "missing", "extra_forbidden", "union_ta
 
 
 def describe_validation_error(error: "ValidationError", skipped: int = 0) -> str:
-    """Describe the first problem of a validation in one line, `where: what, not value`; long values are cut.
+    """Describe the first problem of a validation in one line, `where: what, not value`; values are escaped and cut.
 
     The first `skipped` parts of the place are left out.
     """
@@ -45,8 +50,11 @@ def describe_validation_error(error: "ValidationError", skipped: int = 0) -> str
     where = ".".join(str(part) for part in first["loc"][skipped:])
     wording = _MESSAGES.get(kind)
     message = first["msg"].removeprefix("Value error, ") if wording is None else wording.format(**first.get("ctx", {}))
-    is_shown = kind not in _WITHOUT_VALUE and isinstance(value, str | int | float | bool | None)
-    given = f", not {_shorten(repr(value))}" if is_shown else ""
+    is_plain = isinstance(value, str | int | float | bool | None)
+    is_shown = kind not in _WITHOUT_VALUE and (is_plain or kind.endswith("_type"))
+    # Of other types only a value of the wrong type says more than the place, and it may be large
+    text = _shorten(repr(value) if is_plain else _BRIEF.repr(value))
+    given = f", not {text}" if is_shown and not (kind == "value_error" and text in message) else ""
     return f"{where}: {message}{given}" if where else f"{message}{given}"
 
 

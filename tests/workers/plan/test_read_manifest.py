@@ -128,6 +128,25 @@ def test_times_that_python_cannot_hold_are_no_text_and_elsewhere_nobody_minds(tm
     assert rows[0].rejected_detail.startswith(f"row 0: {name}: ")
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "detail"),
+    [
+        ("uri", [1, 2], "uri: give a text, not [1, 2]"),
+        ("name", 2.5, "name: give a text, not 2.5"),
+        ("kind", "photo\x1b[2J", r"kind: give 'image', 'capture', 'layout' or 'cousin', not 'photo\x1b[2J'"),
+        ("scene_id", "a/b", "scene_id: id 'a/b' is not usable: give 1 to 80 letters, digits"),
+        ("content_sha256", "xyz", "content_sha256: give a text that matches ^([0-9a-f]{64})?$, not 'xyz'"),
+        ("uri", ["y" * 10**5] * 50, "uri: give a text, not ['yyyy"),
+    ],
+)
+def test_the_detail_names_the_value_and_what_would_be_right(tmp_path, column, value, detail):
+    (row,) = read_manifest(write(tmp_path / "m.parquet", pa.Table.from_pylist([{**GOOD, column: value}])))
+    assert row.rejected == "invalid_manifest_row"
+    assert row.rejected_detail.startswith(f"row 0: {detail}")
+    assert row.rejected_detail.isprintable()
+    assert len(row.rejected_detail) < 250
+
+
 def test_ids_of_rejected_rows_stay_what_they_were(tmp_path):
     """They are in the datasets that were built: another id would be another scene."""
     records = [GOOD, {**GOOD, "scene_id": "a/b"}, GOOD, {**GOOD, "kind": "photo", "uri": None}]
