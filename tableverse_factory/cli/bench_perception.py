@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 def bench_perception(
     folder: Annotated[
         Path,
-        typer.Argument(help="Folder of captures with seg.png or masks.png as truth.", exists=True, file_okay=False),
+        typer.Argument(
+            help="Folder of captures, or one of them, with seg.png or masks.png as truth.", exists=True, file_okay=False
+        ),
     ],
     detector: Annotated[
         str, typer.Option(help="Detector to measure: ensemble, geometric, picture, learned or replay.")
@@ -39,7 +41,9 @@ def bench_perception(
     """
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.errors import InputError
+    from tableverse_factory.evaluation.bench.captures import list_captures
     from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
+    from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
 
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
     scores = list(bench_masks(folder, load_config(config, chosen)))
@@ -50,14 +54,18 @@ def bench_perception(
         print_json([asdict(row) | _derive_scores(row) for row in rows])
     else:
         _show_masks(rows, detector)
-        if any(folder.glob("*/truth.json")):
+        if list_captures(folder, [GROUND_TRUTH_NAME]):
             _show_placements(folder, (("replay", "carved"),), config, as_json=False)
 
 
 def bench_placement(
     folder: Annotated[
         Path,
-        typer.Argument(help="Folder of captures with truth.json (`tableverse synth`).", exists=True, file_okay=False),
+        typer.Argument(
+            help="Folder of captures, or one of them, with truth.json (`tableverse synth`).",
+            exists=True,
+            file_okay=False,
+        ),
     ],
     detector: Annotated[
         str, typer.Option(help="Detector of the masks: replay (perfect masks) or geometric; both by default.")

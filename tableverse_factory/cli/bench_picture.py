@@ -17,7 +17,12 @@ if TYPE_CHECKING:
 
 def bench_picture(
     folder: Annotated[
-        Path, typer.Argument(help="Folder of captures; only their colour is given to the net.", exists=True)
+        Path,
+        typer.Argument(
+            help="Folder of captures, or one of them; only their colour is given to the net.",
+            exists=True,
+            file_okay=False,
+        ),
     ],
     other: Annotated[
         Path | None, typer.Option(help="Folder of pictures that show no table-top.", exists=True, file_okay=False)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def bench_twin(
-    captures: Annotated[Path, typer.Argument(help="Folder of captures.", exists=True, file_okay=False)],
+    captures: Annotated[Path, typer.Argument(help="Folder of captures, or one of them.", exists=True, file_okay=False)],
     dataset: Annotated[
         str, typer.Option(metavar="OUT", help="Dataset of these captures; by default their scenes are computed.")
     ] = "",

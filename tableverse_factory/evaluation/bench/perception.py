@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from schemas.objects import PerceivedObjects
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.captures import find_file, list_captures
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import COLOR_NAMES, MASKS_NAME, read_id_image
 from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
@@ -96,19 +97,19 @@ class TrueMasks(Frozen):
 
 
 def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
-    """Score every capture in `folder` that has a truth, in the order of their names; what cannot be read says so.
+    """Score every capture in `folder` that has a truth, or `folder` itself, by name; what cannot be read says so.
 
     The truth is `seg.png` or `masks.png`, and `truth.json` for containment. The largest id of a `seg.png` may be the
     table: it is left out if most of it lies on the plane that was found.
     """
-    names = sorted(p.name for p in folder.iterdir() if _find_file(p, TRUTH_NAMES) and _find_file(p, COLOR_NAMES))
-    if not names:
+    captures = list_captures(folder, TRUTH_NAMES, COLOR_NAMES)
+    if not captures:
         raise InputError(f"{str(folder)!r} holds no capture with {' or '.join(TRUTH_NAMES)}")
-    for name in names:
+    for capture in captures:
         try:
-            yield score_capture(folder / name, config)
+            yield score_capture(capture, config)
         except InputError as error:
-            yield MaskScore(name, 0, 0, (), 0, 0, 0, 0.0, str(error), unread=True)
+            yield MaskScore(capture.name, 0, 0, (), 0, 0, 0, 0.0, str(error), unread=True)
 
 
 def score_capture(capture: Path, config: Config) -> MaskScore:
@@ -179,7 +180,7 @@ def match_ids(truth: IdImage, found: IdImage) -> dict[int, int]:
 
 def read_true_masks(capture: Path, bounds: ObserveConfig, camera: Camera, depth: DepthImage) -> TrueMasks | None:
     """Read the true masks of a capture, whose `seg.png` may number the table; None if it has none."""
-    path = _find_file(capture, TRUTH_NAMES)
+    path = find_file(capture, TRUTH_NAMES)
     if path is None:
         return None
     return TrueMasks(mark_unlabelled(read_id_image(str(path), bounds, camera), depth), path.name == TRUTH_NAMES[0])
@@ -268,7 +269,3 @@ def _assign_by_f(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Assign true (rows) to found objects (columns), one to one, by the largest sum of their pairwise F."""
     return linear_sum_assignment(-2 * shared / np.maximum(true_sizes[:, None] + found_sizes[None], 1))
-
-
-def _find_file(capture: Path, names: Iterable[str]) -> Path | None:
-    return next((capture / name for name in names if (capture / name).is_file()), None)

@@ -18,6 +18,7 @@ from schemas.observation import Observation
 from schemas.outcome import Done, Outcome
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.captures import list_captures
 from tableverse_factory.evaluation.bench.perception import (
     MaskScore,
     compare_masks,
@@ -27,7 +28,7 @@ from tableverse_factory.evaluation.bench.perception import (
 )
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
-from tableverse_factory.sources.capture import COLOR_NAMES
+from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES
 from tableverse_factory.sources.image_file import read_image
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
@@ -79,21 +80,22 @@ def bench_pictures(
     with_focal: bool = False,
     on_picture: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Iterator[PictureScore]:
-    """Score the colour of every capture in `folder`, in the order of their names; what cannot be read says so.
+    """Score the colour of every capture in `folder`, or of `folder` itself, by name; what cannot be read says so.
 
     What lies on the table, and where the table is, tells the sensor through the detector `geometric`; objects are those
     of `seg.png` or `masks.png` where there is one. `with_focal` gives the net the capture's focal length.
     """
-    names = sorted(path.parent.name for path in folder.glob("*/camera.json"))
-    if not names:
+    captures = list_captures(folder, [CAMERA_NAME])
+    if not captures:
         raise InputError(f"{str(folder)!r} holds no capture: a folder with color.png, depth.png and camera.json")
-    for done, name in enumerate(names, 1):
+    for done, capture in enumerate(captures, 1):
         try:
-            yield score_picture(folder / name, config, with_focal)
+            yield score_picture(capture, config, with_focal)
         except InputError as error:
             nothing = float("nan")
-            yield PictureScore(name, nothing, nothing, nothing, nothing, nothing, 0.0, None, str(error), unread=True)
-        on_picture(done, len(names))
+            figures = (nothing,) * 5
+            yield PictureScore(capture.name, *figures, 0.0, None, str(error), unread=True)
+        on_picture(done, len(captures))
 
 
 def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, str]]:

@@ -16,6 +16,7 @@ from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.captures import list_captures
 from tableverse_factory.evaluation.methods.heading import compute_heading_error, find_symmetric_turns
 from tableverse_factory.evaluation.methods.sources import read_pose
 from tableverse_factory.geometry.math.aabb import aabb
@@ -27,6 +28,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh, read_mesh
 from tableverse_factory.models.services import Services
+from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.place.place import place
@@ -77,12 +79,12 @@ class PlacementTruth:
 def bench_placement(
     folder: Path, config: Config, ways: tuple[tuple[str, str], ...]
 ) -> Iterator[dict[tuple[str, str], list[PlacementError]]]:
-    """Run every capture with a `truth.json` in `folder` up to `place`, once for each pair of backends.
+    """Run every capture with a `truth.json` in `folder`, or `folder` itself, up to `place`, for each pair of backends.
 
     A way is a pair of `perceive.detector` and `place.mesh_model`. For the mesh model `replay`, the true meshes are
     recorded at longest side 1 and at random headings, as an ideal MeshModel would return them.
     """
-    captures = [path.parent for path in sorted(folder.glob("*/truth.json"))]
+    captures = list_captures(folder, [GROUND_TRUTH_NAME])
     if not captures:
         raise InputError(f"{folder} holds no captures with a truth.json: make some with `tableverse synth`")
     for capture in captures:
@@ -98,7 +100,7 @@ def _select_backends(config: Config, masks: str, meshes: str) -> Config:
 
 def read_placement_truth(capture: Path) -> PlacementTruth:
     """Read the `truth.json` of a capture and its meshes."""
-    truth = json.loads((capture / "truth.json").read_text())
+    truth = json.loads((capture / GROUND_TRUTH_NAME).read_text())
     return PlacementTruth(
         tuple(_read_true_object(capture, entry) for entry in truth["objects"]), read_pose(truth["camera_to_table"])
     )

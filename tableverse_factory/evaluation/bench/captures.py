@@ -1,0 +1,20 @@
+"""Captures of a benchmark: one folder with color.png, depth.png and camera.json, or a folder of such folders."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
+    """List the captures that have a file of each group of names: `folder` itself, or those in it, sorted by name."""
+    if _has_files(folder, needed):
+        return [folder.resolve()]  # `.` has no name
+    return sorted(path for path in folder.iterdir() if _has_files(path, needed))
+
+
+def find_file(capture: Path, names: Iterable[str]) -> Path | None:
+    """Find the first of these files that a capture has."""
+    return next((capture / name for name in names if (capture / name).is_file()), None)
+
+
+def _has_files(capture: Path, needed: Iterable[Iterable[str]]) -> bool:
+    return all(find_file(capture, names) is not None for names in needed)
