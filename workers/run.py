@@ -108,7 +108,7 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
             run = request.out / "run.json"
             before = read_run(run) if run.exists() else None
             rows, recorded, base = given, collect_external_inputs(request.config, before), None
-        plan = start_or_resume(
+        plan, record_build = start_or_resume(
             request.out, rows, pipelines, request.config, recorded, request.from_stage, lock.check, base
         )
         added = post_export_stages(pipelines)
@@ -123,7 +123,9 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
         try:
             if spec.todo:
                 remove_merged_tables(request.out)
-                over = _run_driver(request, spec, ledger, budget, tally, display, signals)
+                over = _run_driver(request, spec, ledger, budget, tally, display, signals, record_build)
+            else:
+                record_build()
         except StoppedError as stopped:
             return BuildSummary(request.out, tally, stopped.number)
         finally:
@@ -216,8 +218,9 @@ def _run_driver(
     tally: Tally,
     display: Display,
     signals: StopSignals | None,
+    record_build: Callable[[], None],
 ) -> bool:
-    """Run the scenes; returns whether the budget stopped the run."""
+    """Run the scenes, once the build is recorded; returns whether the budget stopped the run."""
 
     def check() -> None:
         if signals is not None:
@@ -234,6 +237,7 @@ def _run_driver(
     with closing(_make_executor(request, spec, watch)) as executor:
         if signals is not None:
             signals.install()  # again, because `ray.init` takes SIGTERM for itself
+        record_build()
         if request.executor == "ray":
             from workers.progress.ray_metrics import RayMetrics
 

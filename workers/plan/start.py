@@ -61,13 +61,16 @@ def start_or_resume(
     section: str | None = None,
     guard: Callable[[], None] = lambda: None,
     base: Mapping[str, Any] | None = None,
-) -> Plan:
+) -> tuple[Plan, Callable[[], None]]:
     """Start a build, or check that it may resume the one in `out`, whose lock is held.
 
     Stages that were added at the end of the pipelines since are computed for the scenes that are done without them.
     `section` is of the first stage to recompute; a recomputation that is under way from it with this configuration is
     resumed. `guard` raises if this process is no longer the writer. `base` is run.json, if the rows were restored from
     the dataset itself: only added stages may differ then.
+
+    Returns the plan, and a function that records the build in `out`, to be called when its workers are there: one that
+    is refused until then, as by a preflight, leaves nothing that would refuse another one.
     """
     plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
     fingerprints = {
@@ -80,19 +83,22 @@ def start_or_resume(
     added = "" if before is None else _find_added_stage(out, before, record)
     section = section or added or None
     points = {} if section is None else find_restart_points(pipelines, plan.kinds, section)
-    if before is None:
-        write_plan(out / "plan.parquet", plan)
-    else:
+    if before is not None:
         differing = diff_run_records(before, record)
         _check_same_build(out, plan, pipelines, points, differing, section, "" if base is None else AGAIN_OPTION)
         if section is None or (not added and not differing and is_rerun_under_way(out, section, record)):
-            return plan
+            return plan, lambda: None
         _invalidate_from(out, plan, rows, pipelines, points, fingerprints, guard)
+
+    def record_build() -> None:
         guard()
-    write_run(run_json, record)
-    if section is not None:
-        write_rerun_marker(out, section, record)
-    return plan
+        if before is None:
+            write_plan(out / "plan.parquet", plan)
+        write_run(run_json, record)
+        if section is not None:
+            write_rerun_marker(out, section, record)
+
+    return plan, record_build
 
 
 def _list_kinds(pipelines: Pipelines, plan: Plan) -> list[SceneKind]:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import socket
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -49,6 +50,22 @@ def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
     assert json.loads(run("status", out, "--json")[1])["remaining"] == 1
     build_tiny(out.parent / "images.parquet", out)
     assert json.loads(run("status", out, "--json")[1])["failed"] == 1
+
+
+def test_a_refused_build_leaves_nothing_that_refuses_the_next(run, tmp_path):
+    """The cause may lie in the manifest, as where the cluster does not see its inputs: it is another one then."""
+    rows = [{"scene_id": name, "kind": "capture", "uri": "/x", "rejected": "unreadable_color"} for name in "ab"]
+    out, manifest = tmp_path / "out", tmp_path / "images.parquet"
+    pq.write_table(pa.Table.from_pylist(rows), manifest)
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        code, _, errors = run("build", manifest, out, "--address", f"127.0.0.1:{closed.getsockname()[1]}")
+    assert (code, "cannot be reached" in errors) == (1, True)
+    assert list(out.iterdir()) == []
+    pq.write_table(pa.Table.from_pylist(rows[:1]), manifest)
+    code, text, errors = run("build", manifest, out, "--executor", "local")
+    assert (code, "1 dropped" in text) == (0, True), errors
+    assert run("build", manifest, out, "--executor", "local")[:1] == (0,)
 
 
 def test_nothing_failed_is_said(run, tmp_path):

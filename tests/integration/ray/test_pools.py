@@ -54,6 +54,7 @@ def test_pools_that_can_never_be_are_refused_before_anything_waits(tmp_path):
     greedy = Pools(perception=PoolSpec(gpus=3))
     with pytest.raises(BuildError, match=r"pool perception wants 3 GPUs .*--pools"):
         run_build(replace(asked, executor="ray", workers=2, pools=greedy), Silent())
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_file_of_pools(tmp_path):
