@@ -43,7 +43,10 @@ class PoolSpec(Section):
         if self.max is not None and self.min > self.max:
             raise ValueError(f"min {self.min} is more than max {self.max}")
         if not (self.cpus or self.gpus or self.memory_mb or any(self.resources.values())):
-            raise ValueError("an actor would hold nothing: give cpus, gpus, memory_mb or resources above 0")
+            raise ValueError(
+                "cpus is 0, and no gpus, memory_mb or resources are above 0: an actor would hold nothing; "
+                "leave cpus out for 1, or give one of the others"
+            )
         return self
 
     def needs(self) -> dict[str, float]:

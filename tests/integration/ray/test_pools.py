@@ -74,7 +74,7 @@ def test_a_file_of_pools(tmp_path):
         "physics: {cpus: 0.00001}": "steps of 0.0001",
         "physics: {resources: {GPU: 1}}": "give cpus, gpus or memory_mb",
         "physics: {min: 3, max: 2}": "min 3 is more than max 2",
-        "physics: {cpus: 0}": "would hold nothing: give cpus, gpus, memory_mb or resources above 0",
+        "physics: {cpus: 0}": "physics: cpus is 0, .*: an actor would hold nothing; leave cpus out",
     }.items():
         path.write_text(text)
         with pytest.raises(ConfigError, match=says):
