@@ -1,4 +1,4 @@
-"""The mesh model `carved`: the simplest of seven kinds of shape that explains the picture."""
+"""The mesh model `carved`: the simplest of eight kinds of shape that explains the picture."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_b
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
-from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing
+from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing, shows_cavity
 from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.interfaces import Completion
@@ -28,6 +28,7 @@ BOX_DISCOUNT_M = 0.0008  # most forgiven to boxes [m]: flat faces carry all erro
 HOLLOW_BONUS_M = 0.0012  # of a cavity seen [m]: a thin wall in noise must not lose to a solid that follows the noise
 UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedom alone costs more is not tried
 ESTIMATED_UNAVOIDABLE_M = 7e-4  # the same where a model estimated the depth
+FEW_NUMBERS_M = 1.2e-3  # the same of a turned shape of few numbers, less the bonus of its cavity
 
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
@@ -41,6 +42,15 @@ class Draft(NamedTuple):
 
     least: float
     finish: Callable[[], Shape]
+
+
+class Kind(NamedTuple):
+    """A kind of shape."""
+
+    method: str  # its name in the dataset
+    freedom: float  # cost of its freedom to follow the picture [m]
+    make: Callable[[ObjectView, RaySample], Draft | None]  # the best fit
+    unavoidable: float | None = None  # misfit of even the true shape [m], if it is not that of most kinds
 
 
 class _Search:
@@ -77,20 +87,20 @@ class _Search:
 
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
-    """Fit boxes, a surface of revolution, solids of a half turn, sheets, inflation and columns, and select the best."""
+    """Fit boxes, surfaces of revolution, solids of a half turn, sheets, inflation and columns, and select the best."""
     rays = sample_rays(view)
     search = _Search()
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
-    for method, freedom, make in kinds:
-        if search.is_below(freedom + unavoidable):
+    for kind in kinds:
+        if search.is_below(kind.freedom + (kind.unavoidable or unavoidable)):
             continue
         try:
-            draft = make(view, rays)
+            draft = kind.make(view, rays)
         except GeometryError as error:
             search.reasons.append(str(error))
             continue
         if draft is not None:
-            search.add(method, freedom, draft)
+            search.add(kind.method, kind.freedom, draft)
     search.finish()
     if search.best is None:
         raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
@@ -119,6 +129,19 @@ def _draft_turned(view: ObjectView, rays: RaySample, shape: TurnedShape | None) 
         return mesh, pose, misfit
 
     return Draft(misfit, finish)
+
+
+def _draft_vessel(view: ObjectView, rays: RaySample) -> Draft | None:
+    """Draft a turned shape whose cavity was seen: where smeared depth tears a surface of revolution, it stays whole."""
+    profile, misfit = fit_standing(view, rays)
+    if not shows_cavity(rays, profile):
+        return None
+
+    def finish() -> Shape:
+        mesh, pose, cost = join_handles(view, rays, *build_turned_solid(profile), profile.frame)
+        return mesh, pose, cost - HOLLOW_BONUS_M
+
+    return Draft(misfit - HOLLOW_BONUS_M - SIMPLER_M, finish)
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
@@ -153,25 +176,25 @@ def _price_raggedness(mesh: TriangleMesh) -> float:
     return RAGGED_M * max(compute_surface_area(mesh) / hull - SMOOTH, 0.0)
 
 
-# Name in the dataset, cost of its freedom to follow the picture [m] and best fit of each kind, in the order of trial:
-# the fewer freedoms a kind has, the earlier and the cheaper.
-KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
-    ("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
-    ("carved/revolution", 1e-4, _draft_revolution),
-    ("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
-    ("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
-    ("carved/sheet", 1e-3, _draft_sheet),
-    ("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
-    ("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+# In the order of trial: the fewer freedoms a kind has, the earlier and the cheaper, but for the dearest.
+KINDS = (
+    Kind("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
+    Kind("carved/revolution", 1e-4, _draft_revolution),
+    Kind("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
+    Kind("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    Kind("carved/sheet", 1e-3, _draft_sheet),
+    Kind("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    Kind("carved/columns", 2.6e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+    Kind("carved/turned", 3e-4, _draft_vessel, FEW_NUMBERS_M),
 )
 
 # The same for depth that a model estimated, whose errors a free shape follows.
-ESTIMATED_KINDS: tuple[tuple[str, float, Callable[[ObjectView, RaySample], Draft | None]], ...] = (
-    ("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
-    ("carved/turned", 0.0, lambda view, rays: _draft_turned(view, rays, fit_standing(view, rays))),
-    ("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
-    ("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
-    ("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
-    ("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
-    ("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+ESTIMATED_KINDS = (
+    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
+    Kind("carved/turned", 0.0, lambda view, rays: _draft_turned(view, rays, fit_standing(view, rays))),
+    Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
+    Kind("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
+    Kind("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
+    Kind("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
+    Kind("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )

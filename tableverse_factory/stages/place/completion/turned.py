@@ -6,6 +6,7 @@ the depth shows. What another object hides goes on around the axis.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     quaternion_from_matrix,
 )
-from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit
+from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample, compute_misfit
 from tableverse_factory.stages.place.completion.turned_profile import Radii, TurnedProfile, intersect_turned
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -46,6 +47,7 @@ LYING = (
     (0.3, 0.7, 1.0, 0.8, 0.5, 0.3),
     (0.3, 0.5, 0.8, 1.0, 0.7, 0.3),
 )
+SHOWN_INSIDE = 0.15  # least share of the object's rays that must show a cavity's inside
 LONG = 1.15  # least length over breadth of what may lie
 FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
 
@@ -72,6 +74,16 @@ def fit_standing(view: ObjectView, rays: RaySample) -> TurnedShape:
         GeometryError: if too little was seen to start from.
     """
     return _fit_best(view, rays, _measure_footprint(view), (("solid", STANDING), ("hollow", HOLLOW)))
+
+
+def shows_cavity(rays: RaySample, profile: TurnedProfile) -> bool:
+    """Whether the object's rays meet the inside of a cavity, and not by a few: what is hidden may have any."""
+    if not len(profile.inner_heights):
+        return False
+    count = len(rays.facing)
+    solid = replace(profile, inner_heights=np.zeros(0), inner_radii=np.zeros(0))
+    met, lid = (intersect_turned(rays, shape)[:count] for shape in (profile, solid))
+    return float(((rays.facing > 0.0) & (met < MISS_M) & (met > lid)).mean()) > SHOWN_INSIDE
 
 
 def fit_lying(view: ObjectView, rays: RaySample) -> TurnedShape | None:

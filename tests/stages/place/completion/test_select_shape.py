@@ -24,9 +24,9 @@ def test_no_shape_costs_less_than_its_draft_and_the_cheapest_is_selected(name):
     support = find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
     view = view_object(scene, scene.objects[0], support)
     rays, costs = sample_rays(view), {}
-    for method, freedom, make in KINDS:
-        if (draft := make(view, rays)) is not None:
-            costs[method] = draft.finish()[2] + freedom
-            assert costs[method] >= draft.least + freedom
+    for kind in KINDS:
+        if (draft := kind.make(view, rays)) is not None:
+            costs[kind.method] = draft.finish()[2] + kind.freedom
+            assert costs[kind.method] >= draft.least + kind.freedom
     assert len(costs) >= 4
     assert complete_by_carving(scene, view).method == min(costs, key=costs.__getitem__)
