@@ -52,10 +52,19 @@ def describe_validation_error(error: "ValidationError", skipped: int = 0) -> str
     message = first["msg"].removeprefix("Value error, ") if wording is None else wording.format(**first.get("ctx", {}))
     is_plain = isinstance(value, str | int | float | bool | None)
     is_shown = kind not in _WITHOUT_VALUE and (is_plain or kind.endswith("_type"))
-    # Of other types only a value of the wrong type says more than the place, and it may be large
-    text = _shorten(repr(value) if is_plain else _BRIEF.repr(value))
-    given = f", not {text}" if is_shown and not (kind == "value_error" and text in message) else ""
+    # Of other types only a value of the wrong type says more than the place
+    text = represent(value) if is_shown else ""
+    is_told = not text or (kind == "value_error" and isinstance(value, str) and text in message)
+    given = "" if is_told else f", not {text}"
     return f"{where}: {message}{given}" if where else f"{message}{given}"
+
+
+def represent(value: object) -> str:
+    """Represent a value in few characters, which may be large; integers of thousands of digits have no text."""
+    try:
+        return _shorten(repr(value) if isinstance(value, str | int | float | bool | None) else _BRIEF.repr(value))
+    except ValueError:
+        return "an integer of thousands of digits"
 
 
 def _shorten(text: str) -> str:

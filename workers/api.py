@@ -76,7 +76,8 @@ def build(
         signals: Handlers of SIGINT and SIGTERM that end the run; None leaves signals alone.
 
     Returns:
-        The counts of this run. `summary.read_state()` reads those of the whole dataset, with the reasons of losses.
+        The counts of this run. `summary.read_state()` reads those of the whole dataset, with the reasons of losses;
+        a new build that was stopped while its executor started has none.
 
     Raises:
         TableverseError: if the build cannot go on; the message says what to change. Failed scenes raise nothing: they

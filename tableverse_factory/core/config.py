@@ -11,10 +11,10 @@ import yaml
 from pydantic import ValidationError
 
 from schemas.config import Config
+from schemas.error_text import represent
 from tableverse_factory.core.errors import ConfigError
 
 MAX_FILE_BYTES = 1024 * 1024
-_MAX_REPR_CHARS = 80
 _BOUNDS = {
     "exclusiveMinimum": "more than",
     "minimum": "at least",
@@ -43,7 +43,7 @@ class _StrictLoader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 raise ConfigError(f"line {key.start_mark.line + 1}: a key is a word")
             if key.value in seen:
-                raise ConfigError(f"line {key.start_mark.line + 1}: key {_shorten_repr(key.value)} stands twice")
+                raise ConfigError(f"line {key.start_mark.line + 1}: key {represent(key.value)} stands twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -170,13 +170,13 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key = key.strip()
     if not equals or key.count(".") != 1:
         raise ConfigError(
-            f"{_OVERRIDE_PREFIX}{_shorten_repr(text)}: write section.key=value, e.g. rectify.clearance_m=0.001"
+            f"{_OVERRIDE_PREFIX}{represent(text)}: write section.key=value, e.g. rectify.clearance_m=0.001"
         )
     try:
         return key, yaml.load(value, _StrictLoader)  # noqa: S506 a SafeLoader with less
     except (yaml.YAMLError, RecursionError, *_TAG_ERRORS) as error:
         raise ConfigError(
-            f"{_OVERRIDE_PREFIX}{key}: {_shorten_repr(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
+            f"{_OVERRIDE_PREFIX}{key}: {represent(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
         ) from None
 
 
@@ -185,7 +185,7 @@ def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
     inside = tree.get(section)
     if inside is not None and not isinstance(inside, dict):
         raise ConfigError(
-            f"{_OVERRIDE_PREFIX}{section}: {_shorten_repr(inside)} is no section; "
+            f"{_OVERRIDE_PREFIX}{section}: {represent(inside)} is no section; "
             f"give keys, e.g. {_format_example(section)}"
         )
     tree[section] = {**(inside or {}), name: value}
@@ -204,13 +204,13 @@ def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
     if error["type"] == "value_error":  # our own message; the value may be a secret
         return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
     if key in known:
-        return f"{key}: {_shorten_repr(value)} is not allowed; give {describe_allowed_values(known[key])}", ""
+        return f"{key}: {represent(value)} is not allowed; give {describe_allowed_values(known[key])}", ""
     sections = [*Config.model_fields]
     if len(location) == 1 and key in sections:
-        return f"{key}: {_shorten_repr(value)} is no section; give keys, e.g. {_format_example(key)}", ""
+        return f"{key}: {represent(value)} is no section; give keys, e.g. {_format_example(key)}", ""
     if not all(isinstance(part, str) for part in location):
-        return f"{_shorten_repr(key)}: {message}", ""
-    return f"unknown key {_shorten_repr(key)}", _suggest_key(key, list(known))
+        return f"{represent(key)}: {message}", ""
+    return f"unknown key {represent(key)}", _suggest_key(key, list(known))
 
 
 def _suggest_key(key: str, known: list[str]) -> str:
@@ -239,7 +239,3 @@ def _resolve_definition(reference: Mapping[str, Any]) -> str:
 def _format_comment(text: str, indent: str) -> Iterator[str]:
     return (f"{indent}# {line.strip()}" for line in text.splitlines() if line.strip())
 
-
-def _shorten_repr(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= _MAX_REPR_CHARS else text[: _MAX_REPR_CHARS - 1] + "…"

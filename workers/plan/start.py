@@ -69,8 +69,9 @@ def start_or_resume(
     resumed. `guard` raises if this process is no longer the writer. `base` is run.json, if the rows were restored from
     the dataset itself: only added stages may differ then.
 
-    Returns the plan, and a function that records the build in `out`, to be called when its workers are there: one that
-    is refused until then, as by a preflight, leaves nothing that would refuse another one.
+    Returns the plan, and a function that records a new build in `out`, to be called when an executor has accepted it:
+    one that is refused until then, as by a preflight, leaves nothing that would refuse another one. What is computed
+    again is recorded at once.
     """
     plan = make_plan(rows, config.run.shard_size) if base is None else read_plan(out / "plan.parquet")
     fingerprints = {
@@ -83,12 +84,6 @@ def start_or_resume(
     added = "" if before is None else _find_added_stage(out, before, record)
     section = section or added or None
     points = {} if section is None else find_restart_points(pipelines, plan.kinds, section)
-    if before is not None:
-        differing = diff_run_records(before, record)
-        _check_same_build(out, plan, pipelines, points, differing, section, "" if base is None else AGAIN_OPTION)
-        if section is None or (not added and not differing and is_rerun_under_way(out, section, record)):
-            return plan, lambda: None
-        _invalidate_from(out, plan, rows, pipelines, points, fingerprints, guard)
 
     def record_build() -> None:
         guard()
@@ -98,6 +93,14 @@ def start_or_resume(
         if section is not None:
             write_rerun_marker(out, section, record)
 
+    if before is not None:
+        differing = diff_run_records(before, record)
+        _check_same_build(out, plan, pipelines, points, differing, section, "" if base is None else AGAIN_OPTION)
+        if section is None or (not added and not differing and is_rerun_under_way(out, section, record)):
+            return plan, lambda: None
+        _invalidate_from(out, plan, rows, pipelines, points, fingerprints, guard)
+        record_build()
+        return plan, lambda: None
     return plan, record_build
 
 

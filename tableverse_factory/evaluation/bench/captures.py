@@ -1,4 +1,4 @@
-"""Captures of a benchmark: one folder with color.png, depth.png and camera.json, or a folder of such folders."""
+"""Captures of a benchmark: one folder that has the files it needs, or a folder of such folders."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
     """List the captures that have a file of each group of names: `folder` itself, or those in it, sorted by name."""
     if _has_files(folder, needed):
-        return [folder.resolve()]  # `.` has no name
+        return [folder.absolute()]  # `.` has no name
     return sorted(path for path in folder.iterdir() if _has_files(path, needed))
 
 

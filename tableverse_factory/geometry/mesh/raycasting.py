@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from schemas.geometry import TriangleMesh
+from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.core.open3d_import import o3d
+from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.geometry.math.transforms import rotation_matrix
 
 RaycastingScene = o3d.t.geometry.RaycastingScene
 
@@ -28,3 +30,9 @@ def pack_rays(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
     rays = np.empty((*shape[:-1], 6), dtype=np.float32)
     rays[..., :3], rays[..., 3:] = origins, directions
     return o3d.core.Tensor.from_numpy(rays)
+
+
+def pack_pixel_rays(camera: Camera, camera_to_scene: Pose) -> o3d.core.Tensor:
+    """Rays of all pixels, shape (h, w, 6); where one meets a surface, `t_hit` is the depth along the optical axis."""
+    unit = backproject(np.ones((camera.height, camera.width)), camera)
+    return pack_rays(camera_to_scene.position, unit @ rotation_matrix(camera_to_scene.quaternion_wxyz).T)

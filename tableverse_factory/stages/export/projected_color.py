@@ -23,7 +23,6 @@ from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_ra
 
 LEAST_FACING = 0.2  # least cosine between normal and line of sight; pixels of steeper faces are too stretched
 BORDER_PIXELS = 2  # width of the outline whose pixels mix the object with its background [px]
-EDGE_SHARE = 0.03  # of an object's size, by which a mesh fitted to estimated depth misses the edges in the picture
 SAME_SURFACE = 0.004  # share of the distance by which the first surface on the line to a visible point may be nearer
 
 
@@ -121,8 +120,7 @@ def _remove_edges(photograph: ColorProjector, scene: RaycastingScene) -> Mask:
     (rows, columns), camera = ndimage.find_objects(own.astype(np.uint8))[0], photograph.camera
     size = columns.stop - columns.start, rows.stop - rows.start
     window = Camera(camera.fx, camera.fy, camera.cx - columns.start, camera.cy - rows.start, *size)
-    reach = max(1, round(EDGE_SHARE * float(np.sqrt(own.sum()))))
-    own[rows, columns] &= ~find_behind_edges(scene, window, identity_pose(), reach)
+    own[rows, columns] &= ~find_behind_edges(scene, window, identity_pose(), own[rows, columns])
     return own
 
 

@@ -16,8 +16,7 @@ NEIGHBOURS = 5
 SOURCES = 8000
 LEAF_SIZE = 64  # points in a leaf of the tree: in seven dimensions half the time of the default
 NORMAL_M = 0.03  # half the extra distance of a surface that faces the opposite way [m]
-EDGE_SHARE = 0.03  # of an object's size, by which a shape fitted to estimated depth may miss the edges in the picture
-LEAST_SHARE = 0.2  # of the points that must be left
+LEAST_SHARE = 0.2  # of the points that must show the mesh, and not behind an edge
 COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
 # Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame.
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
@@ -58,8 +57,7 @@ def _find_sources(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> tuple[Poi
     rays = view.points - view.eye
     hit = scene.cast_rays(pack_rays(view.eye, rays), nthreads=1)
     share, normals = (hit[key].numpy().astype(np.float64) for key in ("t_hit", "primitive_normals"))
-    reach = max(1, round(EDGE_SHARE * float(np.sqrt(view.own.sum()))))
-    behind = find_behind_edges(scene, view.camera, view.camera_to_table, reach)
+    behind = find_behind_edges(scene, view.camera, view.camera_to_table, view.own)
     pixels = np.rint(project(transform_points(invert_pose(view.camera_to_table), view.points), view.camera))
     column, row = np.clip(pixels.astype(int), 0, np.array(behind.shape[::-1]) - 1).T
     kept = np.isfinite(share) & ~behind[row, column]

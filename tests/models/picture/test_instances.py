@@ -119,6 +119,15 @@ def test_what_is_probably_one_object_is_joined_where_the_surface_goes_on_and_now
     assert segment(replace(even, depth=depth)).max() == 2
 
 
+@pytest.mark.parametrize(("spread_px", "count"), [(0.0, 1), (25.0, 2)])
+def test_a_handle_of_the_same_middle_is_joined_where_its_depth_steps(spread_px: float, count: int) -> None:
+    found = draw_boundary(vote_in_halves(spread_px), 59, 60)
+    depth = found.depth.copy()
+    depth[:, 60:] = 1.2
+    found = replace(found, depth=depth, affinity=np.full_like(found.affinity, -0.5))
+    assert segment(found).max() == count
+
+
 def test_ids_are_dense_from_one_the_largest_first() -> None:
     small, tiny = (slice(60, 80), slice(70, 100)), (slice(20, 32), slice(100, 112))
     ids = segment(make_prediction(tiny, small, LARGE))

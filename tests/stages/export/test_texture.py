@@ -1,6 +1,7 @@
 """Textures: every corner shows its vertex's colour, what the picture shows is on the mesh, what it hides is not."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from PIL import Image
 
 from schemas.geometry import Camera, Pose, Texture, TriangleMesh
 from schemas.objects import Evidence
-from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.geometry.mesh.meshes import concatenate_meshes, from_trimesh
 from tableverse_factory.stages.export.atlas import find_corner_texels, lay_out_atlas, list_triangle_texels
-from tableverse_factory.stages.export.projected_color import load_projectors
+from tableverse_factory.stages.export.projected_color import PhotographedMesh, load_projectors
 from tableverse_factory.stages.export.texture import bake_texture
 from tests.helpers.simple_scenes import UPRIGHT, box
 
@@ -137,3 +138,18 @@ def test_what_the_picture_shows_is_on_the_mesh_and_nowhere_else(scale: float) ->
 def test_pixels_of_another_object_are_not_taken() -> None:
     upper, _ = top_and_bottom(1.0, np.full((240, 320), 3))
     np.testing.assert_allclose(upper, 99, atol=1)
+
+
+def test_just_behind_an_edge_the_picture_shows_no_colour_where_depth_was_estimated() -> None:
+    """The edge of a mesh that is not exact may show there: the picture of a rim on the floor of its cup."""
+    floor, lid = (from_trimesh(trimesh.creation.box(size)) for size in ((0.2, 0.14, 0.01), (0.08, 0.06, 0.01)))
+    raised = TriangleMesh(lid.vertices + np.array([0.0, 0.0, 0.1]), lid.faces)
+    mesh = concatenate_meshes([floor, raised])
+    edge = 0.04 * 0.495 / 0.395  # of the lid, as it looks on the floor
+    on_floor = np.array([[edge + 0.002, 0.0, 0.005], [edge + 0.03, 0.0, 0.005]])
+    face = int(np.flatnonzero((mesh.vertices[mesh.faces][:, :, 2] == 0.005).all(axis=1))[0])
+    evidence = evidence_of_a_card(np.full((240, 320), 7))
+    for source, shown in (("sensor", [0, 1]), ("estimated", [1])):
+        (photograph,) = load_projectors(replace(evidence, scale_source=source), [Pose(np.zeros(3), UPRIGHT)], [1.0])
+        found, _ = PhotographedMesh(photograph, mesh).find_shown(on_floor, np.array([face, face]))
+        assert found.tolist() == shown

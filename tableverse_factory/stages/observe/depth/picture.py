@@ -32,15 +32,17 @@ def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
         AnswerInvalidError: reasons `no_table`, `table_out_of_bounds`.
     """
     bounds, photo = config.observe, read_rgb_image(item.uri, config.observe)
-    spread = FOCAL_SIGMA if photo.exif_px is None and bounds.focal_px is None else 0.0
+    is_guess = photo.exif_px is None and bounds.focal_px is None
     focal_px, source = photo.get_focal_px(bounds.focal_px), photo.intrinsics_source
     camera, found = _predict(photo, focal_px, bounds)
-    if spread and UNSURE_PROBABILITY <= found.table_probability < bounds.min_table_probability:
-        tried = [_predict(photo, photo.get_field_px(field), bounds) for field in NARROWER_FIELDS_DEG]
-        camera, found = max(tried, key=lambda each: each[1].table_probability)
-        source = "model"
+    if is_guess and UNSURE_PROBABILITY <= found.table_probability < bounds.min_table_probability:
+        usual = found
+        narrower = [_predict(photo, photo.get_field_px(field), bounds) for field in NARROWER_FIELDS_DEG]
+        camera, found = max([(camera, usual), *narrower], key=lambda each: each[1].table_probability)
+        source = source if found is usual else "model"
     check_table(found, bounds)
     capture = build_capture(photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=source), bounds)
+    spread = FOCAL_SIGMA if is_guess else 0.0
     return replace(capture, camera=camera, scale_sigma=math.hypot(SIGMA_FACTOR * found.scale_sigma, spread))
 
 

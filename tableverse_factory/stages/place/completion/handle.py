@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from schemas.geometry import IdImage, Mask, Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.camera import backproject, project
+from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import (
     invert_pose,
     matrix_from_pose,
@@ -18,7 +18,7 @@ from tableverse_factory.geometry.math.transforms import (
 from tableverse_factory.geometry.mesh.raycasting import (
     RaycastingScene,
     make_raycasting_scene,
-    pack_rays,
+    pack_pixel_rays,
     to_tensor,
 )
 from tableverse_factory.geometry.mesh.voxel_solids import (
@@ -38,7 +38,7 @@ WORTH_HANDLES_M = 0.004  # misfit from which the body is wrong and the rest is n
 MAX_FACES = 3200
 TOLERANCE_M = 0.00005
 AWAY_M = 0.004  # distance outside the body from which points belong to another part [m]
-FRAYED_PX = 2  # by which a mask's outline is ragged where a net drew it, as wide as half of the thinnest handle
+FRAYED_PX = 2  # by which an outline that a net drew is ragged; a handle under twice that width is lost
 MIN_PIXELS = 30
 MIN_SHARE = 0.025
 RADIUS_RANGE_M = (0.002, 0.012)
@@ -47,8 +47,8 @@ MAX_CELLS = 250_000
 MAX_BRIDGE_M = 0.06
 BRIDGE_RADIUS_M = 0.005
 NEIGHBOURS = 8
-JOINED_SHARE = 0.3  # of a handle's pixels that lie nearest to the body
-EDGE_ON = 0.5  # least sine of the angle at which a ray must meet a handle's plane to tell a place on it
+ALONG_AXIS = 0.5  # sine of the angle between axis and line of sight up to which a handle stands before the body
+MOST_POINTS = 0.95  # share of a part's points that must lie near its plane
 MOST_MOVED = 0.35  # of a point's distance from the camera, into that plane
 
 
@@ -133,8 +133,7 @@ def _find_uncovered(view: ObjectView, scene: RaycastingScene) -> Mask:
 
     It is off by more than a handle is thick.
     """
-    unit = backproject(np.ones(view.own.shape), view.camera)
-    rays = pack_rays(view.eye, unit @ rotation_matrix(view.camera_to_table.quaternion_wxyz).T)
+    rays = pack_pixel_rays(view.camera, view.camera_to_table)
     covered = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
     away_px = AWAY_M * view.camera.fx / float(np.median(np.linalg.norm(view.points - view.eye, axis=1)))
     beside = view.own & (ndimage.distance_transform_edt(~covered) > away_px)
@@ -151,7 +150,8 @@ def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarr
 def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
     """Sweep balls along the part, as thick as it looks wide: behind each of its points, carved by free space.
 
-    Where depth is estimated and the part lies in a plane through the axis, the balls do, and its depth carves nothing.
+    Where depth is estimated, they lie in a plane through the axis, if the camera does not look along it, and nothing is
+    carved.
     """
     width = compute_half_width(ndimage.distance_transform_edt(mask))
     row, column = _find_pixels(view, view.points)
@@ -170,23 +170,21 @@ def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
 
 
 def _move_into_plane(view: ObjectView, points: Points, axis: Pose) -> Points | None:
-    """Move a part's points along their rays into the plane through the axis in which handles lie.
+    """Move a part's points along their rays into the plane through the axis that lies across the line of sight.
 
-    It is joined to the body where its rays pass the axis nearest. None where the camera sees the plane almost edge-on,
-    or the points lie far from it.
+    A silhouette does not tell about how much a handle turns out of that plane. None where the camera looks along the
+    axis, or most points lie far from the plane.
     """
     eye = transform_points(invert_pose(axis), view.eye[None])[0, :2]
     rays = points - view.eye
     across = (rays @ rotation_matrix(axis.quaternion_wxyz))[:, :2]
-    nearest = eye - across * ((across @ eye) / (across**2).sum(axis=1))[:, None]
-    distance = np.linalg.norm(nearest, axis=1)
-    outward = nearest[distance <= np.quantile(distance, JOINED_SHARE)].mean(axis=0)
-    normal = np.array([-outward[1], outward[0]]) / max(float(np.linalg.norm(outward)), 1e-9)
-    towards = across @ normal
-    if float(np.median(np.abs(towards) / np.linalg.norm(rays, axis=1))) < EDGE_ON:
+    sight = across.mean(axis=0)
+    if float(np.linalg.norm(sight)) < ALONG_AXIS * float(np.linalg.norm(rays, axis=1).mean()):
         return None
-    share = -(eye @ normal) / towards
-    return view.eye + rays * share[:, None] if float(np.abs(share - 1.0).max()) < MOST_MOVED else None
+    share = -(eye @ sight) / (across @ sight)
+    if float(np.quantile(np.abs(share - 1.0), MOST_POINTS)) > MOST_MOVED:
+        return None
+    return view.eye + rays * np.clip(share, 1.0 - MOST_MOVED, 1.0 + MOST_MOVED)[:, None]
 
 
 def _build_balls(

@@ -125,6 +125,7 @@ def _draft_turned(view: ObjectView, rays: RaySample, shape: TurnedShape | None) 
     profile, misfit = shape
 
     def finish() -> Shape:
+        # The cost stays that of the body: handles decide nothing between kinds, as their own depth is a guess
         mesh, pose, _ = join_handles(view, rays, *build_turned_solid(profile), profile.frame)
         return mesh, pose, misfit
 
