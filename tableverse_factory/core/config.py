@@ -238,4 +238,3 @@ def _resolve_definition(reference: Mapping[str, Any]) -> str:
 
 def _format_comment(text: str, indent: str) -> Iterator[str]:
     return (f"{indent}# {line.strip()}" for line in text.splitlines() if line.strip())
-
