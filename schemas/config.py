@@ -3,7 +3,8 @@
 from abc import abstractmethod
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from schemas.address import ModelUrl
 from schemas.config_values import VOCABULARY, Interval, KeyVariable, Metres, ModelName, Positive, Vocabulary, Weights
@@ -16,6 +17,14 @@ class Section(BaseModel):
     """Base of the sections."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _refuse_booleans(cls, value: object, info: ValidationInfo) -> object:
+        # pydantic takes true for 1, and YAML takes yes and on for true
+        if isinstance(value, bool) and cls.model_fields[str(info.field_name)].annotation is not bool:
+            raise PydanticCustomError("boolean", "give a number or a text")
+        return value
 
 
 class StageSection(Section):

@@ -70,6 +70,8 @@ def test_numbers_are_read_as_people_write_them(text):
         ("run.seed=1.5", ["run.seed", "1.5", "a whole number"]),
         ("run.seed=many", ["run.seed", "'many'", "a whole number"]),
         ("run.seed=", ["run.seed", "None"]),
+        ("run.seed=yes", ["run.seed: True is not allowed; give a whole number"]),
+        ("observe.max_depth_m=on", ["observe.max_depth_m: True is not allowed; give a number"]),
         ("run.seed=[1, 2]", ["run.seed", "[1, 2]"]),
         ("run.seed=[1, 2", ["run.seed", "no YAML value"]),
         ("run.seed=!!bool maybe", ["run.seed", "no YAML value"]),
