@@ -3,14 +3,28 @@
 from abc import abstractmethod
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from schemas.address import ModelUrl
 from schemas.config_values import VOCABULARY, Interval, KeyVariable, Metres, ModelName, Positive, Vocabulary, Weights
-from schemas.section import Section
 
 MODEL_LOAD_S = 1200.0  # wall time in which a model downloads and loads its weights, and its process starts [s]
 MAX_SLOW_MESHES = 30  # objects of a scene that may each take the whole `place.mesh_timeout_s`; most take much less
+
+
+class Section(BaseModel):
+    """Base of the sections."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _refuse_booleans(cls, value: object, info: ValidationInfo) -> object:
+        # pydantic takes true for 1, and YAML takes yes and on for true
+        if isinstance(value, bool) and cls.model_fields[str(info.field_name)].annotation is not bool:
+            raise PydanticCustomError("boolean", "give a number or a text")
+        return value
 
 
 class StageSection(Section):

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from schemas.section import Section
+from schemas.config import Section
 
 RAY_NAMES = ("CPU", "GPU", "memory", "object_store_memory")  # resources that Ray takes by keywords of their own
 STEPS = 10_000  # of a resource that Ray tells apart
