@@ -133,19 +133,18 @@ class ObserveConfig(StageSection):
 class PerceiveConfig(RemoteModelSection):
     """Detector, segmenter and limits on objects."""
 
-    detector: Literal[
-        "auto", "geometric", "picture", "ensemble", "learned", "replay", "grounding_dino", "openai", "gemini"
-    ] = "auto"
+    detector: Literal["auto", "geometric", "picture", "ensemble", "replay", "grounding_dino", "openai", "gemini"] = (
+        "auto"
+    )
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `ensemble`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `geometric` is depth alone;
     `ensemble` lets depth and the net decide together, for each group of objects that overlap or hold one another, where
-    that explains the picture better than depth alone; without a sensor it is `picture`. `learned` is a net of
-    `tableverse train segmenter`, `grounding_dino` finds the things of `vocabulary` by colour, `openai` is any server of
-    OpenAI's chat completions, `gemini` Google's own protocol.
+    that explains the picture better than depth alone; without a sensor it is `picture`. `grounding_dino` finds the
+    things of `vocabulary` by colour, `openai` is any server of OpenAI's chat completions, `gemini` Google's protocol.
     """
     detector_weights: Weights = ""
-    """The `.onnx` file of `learned`, or of `picture`, whose own is in the package; of `grounding_dino` a folder, or
-    `owner/name` or `owner/name@revision` on the Hub, empty for the published ones.
+    """The `.onnx` file of `picture`, whose own is in the package; of `grounding_dino` a folder, or `owner/name` or
+    `owner/name@revision` on the Hub, empty for the published ones.
     """
     vocabulary: Vocabulary = VOCABULARY
     """Things that `grounding_dino` looks for: English nouns in lower case. The table and people are found besides."""
@@ -183,11 +182,9 @@ class PerceiveConfig(RemoteModelSection):
     @model_validator(mode="after")
     def _check_required_keys(self) -> "PerceiveConfig":
         names = [f"perceive.{name}" for name in self.find_missing_keys()]
-        if self.detector == "learned" and not self.detector_weights:
-            names.append("perceive.detector_weights")
         if names:
             raise ValueError(f"the detector {self.detector!r} needs {' and '.join(names)}")
-        if self.detector in ("auto", "geometric", "picture", "ensemble", "learned") and self.segmenter != "geometric":
+        if self.detector in ("auto", "geometric", "picture", "ensemble") and self.segmenter != "geometric":
             where = " where a capture has no detections.json" if self.detector == "auto" else ""
             raise ValueError(
                 f"the detector {self.detector!r} gives masks, not boxes{where}, so perceive.segmenter "

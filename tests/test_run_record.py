@@ -72,10 +72,9 @@ def test_the_code_is_part_of_a_run():
     ("section", "keys"),
     [
         ("perceive", {"segmenter": "sam2", "detector": "replay", "segmenter_weights": ""}),
-        ("perceive", {"detector": "learned", "detector_weights": ""}),
         ("observe", {"depth": "moge_2", "depth_weights": ""}),
     ],
-    ids=["segmenter", "detector", "depth"],
+    ids=["segmenter", "depth"],
 )
 @pytest.mark.parametrize("there", ["nothing", "an empty folder"])
 def test_weights_on_the_disk_must_be_there_before_a_build_begins(tmp_path, section, keys, there):

@@ -25,11 +25,9 @@ def bench_perception(
         ),
     ],
     detector: Annotated[
-        str, typer.Option(help="Detector to measure: ensemble, geometric, picture, learned or replay.")
+        str, typer.Option(help="Detector to measure: ensemble, geometric, picture or replay.")
     ] = "ensemble",
-    weights: Annotated[
-        str, typer.Option(metavar="FILE", help="The .onnx file of `learned`, or another one of `picture`.")
-    ] = "",
+    weights: Annotated[str, typer.Option(metavar="FILE", help="Another .onnx file of our net.")] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`tableverse train`: training of networks on synthetic scenes, and of policies on the motions of a dataset."""
+"""`tableverse train`: training of the network of pictures on synthetic scenes, and of policies on a dataset."""
 
 import sys
 from pathlib import Path
@@ -10,11 +10,12 @@ from tableverse_factory.cli.options import require_local_path
 from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
-    from tableverse_factory.evaluation.training.train import TrainProgress
     from tableverse_factory.models.local.device import Device
 
 train = typer.Typer(
-    name="train", help="Train networks on synthetic scenes, and policies on a dataset.", no_args_is_help=True
+    name="train",
+    help="Train the network of pictures on synthetic scenes, and policies on a dataset.",
+    no_args_is_help=True,
 )
 
 
@@ -30,73 +31,20 @@ def _require_folder(path: Path) -> Path:
 TrainFolder = Annotated[
     Path, typer.Argument(metavar="DIR", callback=_require_folder, help="New folder, or one to continue.")
 ]
-TrainSteps = Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps of the training.")]
-TrainBatch = Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")]
 TrainSeed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of what is drawn, and of the first weights.")]
 TrainDevice = Annotated[Literal["auto", "cpu", "cuda"], typer.Option(help="Device to train on.")]
 TrainMinutes = Annotated[
     float | None, typer.Option(min=0.1, help="Stop with a checkpoint after so many; the command again continues.")
 ]
 _PICTURES_FROM = "Train goals on pictures instead; motions are those of these weights, of a policy on states."
-TrainJobs = Annotated[
-    int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make views; one per CPU by default.")
-]
-
-
-@train.command("segmenter")
-def train_segmenter(
-    folder: TrainFolder,
-    scenes: Annotated[int, typer.Option("--scenes", "-n", min=1, max=1_000_000, help="Training scenes.")] = 2000,
-    steps: TrainSteps = 20_000,
-    batch: TrainBatch = 16,
-    seed: TrainSeed = 0,
-    device: TrainDevice = "auto",
-    jobs: TrainJobs = None,
-) -> None:
-    """Train the network of the detector `learned` on depth images of synthetic scenes.
-
-    Writes DIR/views (six images of each scene), DIR/checkpoint.safetensors and DIR/segmenter.onnx. The same command
-    again continues from the checkpoint.
-
-    Example: `tableverse train segmenter net --scenes 240 --steps 800 --batch 4 --device cpu`
-    """
-    from tableverse_factory.cli.progress_bar import count_progress
-    from tableverse_factory.core.process_pool import count_available_cpus
-    from tableverse_factory.evaluation.training.onnx_file import write_onnx
-    from tableverse_factory.evaluation.training.train import TrainSettings, train_network
-    from tableverse_factory.evaluation.training.views import make_views
-
-    where = _prepare_training(device)
-    processes = count_available_cpus() if jobs is None else jobs
-    with count_progress("scenes", scenes) as made:
-        views = make_views(folder / "views", scenes, seed, made, processes)
-    recent: list[TrainProgress] = []
-    with count_progress("steps", steps) as done:
-
-        def on_step(progress: "TrainProgress") -> None:
-            recent[:] = [*recent[-99:], progress]
-            done.update(progress.step, steps)
-
-        network = train_network(
-            views, folder, TrainSettings(scenes, steps, seed, batch), where, on_step, jobs=processes
-        )
-    path = folder / "segmenter.onnx"
-    difference = write_onnx(network, path)
-    if recent:
-        offset_mm = 1e3 * sum(step.offset_m for step in recent) / len(recent)
-        entropy = sum(step.objects for step in recent) / len(recent)
-        print(
-            f"last {len(recent)} steps: centres off by {offset_mm:.1f} mm, cross entropy of thing or not {entropy:.3f}"
-        )
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, within {difference:.0e} of the net in torch")
 
 
 @train.command("picture")
 def train_picture(
     folder: TrainFolder,
-    steps: TrainSteps = 7_900,
+    steps: Annotated[int, typer.Option(min=1, max=10_000_000, help="Steps of the training.")] = 7_900,
     minutes: TrainMinutes = None,
-    batch: TrainBatch = 64,
+    batch: Annotated[int, typer.Option(min=1, max=1024, help="Views per step.")] = 64,
     views: Annotated[
         int, typer.Option(min=64, max=1_000_000, help="Views that are kept to draw from, 1.3 MB of the GPU each.")
     ] = 24_000,
@@ -112,7 +60,9 @@ def train_picture(
         int | None, typer.Option(min=1, max=64, help="GPUs to train on, each with a batch of its own; all without.")
     ] = None,
     device: TrainDevice = "auto",
-    jobs: TrainJobs = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", min=0, help="Processes that make views; one per CPU by default.")
+    ] = None,
 ) -> None:
     """Train the network of pictures, with a sensor's depth and without, on views that a GPU renders beside it.
 

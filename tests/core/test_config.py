@@ -80,7 +80,7 @@ def test_numbers_are_read_as_people_write_them(text):
         ("run.seed=!!python/object/apply:os.system [id]", ["run.seed", "no YAML value"]),
         ("rectify.clearance_m=.nan", ["rectify.clearance_m", "nan", "at least 0, at most 100"]),
         ("rectify.clearance_m=.inf", ["rectify.clearance_m", "inf"]),
-        ("perceive.detector=magic", ["'magic'", "one of auto, geometric, picture, ensemble, learned, replay"]),
+        ("perceive.detector=magic", ["'magic'", "one of auto, geometric, picture, ensemble, replay"]),
         ("observe.table_distance_m=[4, 0.1]", ["observe.table_distance_m", "4, must be less than the second, 0.1"]),
         ("seed=3", ["section.key=value"]),
         ("run.seed", ["section.key=value"]),
@@ -209,7 +209,6 @@ def test_a_message_names_where_the_mistake_stands(tmp_path):
     ("detector", "says"),
     [
         ("geometric", "gives masks, not boxes, so perceive.segmenter 'sam2' would do nothing"),
-        ("learned", "gives masks, not boxes, so perceive.segmenter 'sam2' would do nothing"),
         ("auto", "not boxes where a capture has no detections.json, so perceive.segmenter 'sam2' would do nothing"),
     ],
 )

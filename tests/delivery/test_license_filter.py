@@ -201,7 +201,6 @@ def test_what_the_public_cannot_open_becomes_a_name(uri, public):
 @pytest.mark.parametrize(
     ("detector", "weights", "public"),
     [
-        ("learned", "acme/net.onnx", "net.onnx"),
         ("picture", "acme/net.onnx", "net.onnx"),
         ("ensemble", "acme/net.onnx", "net.onnx"),
         ("auto", "acme/net.onnx", "net.onnx"),
@@ -224,7 +223,7 @@ def test_the_record_of_a_published_dataset_names_no_place(dataset, tmp_path):
     }
     config["place"] |= meshes
     config["observe"] |= {"depth": "moge_2", "depth_weights": "Ruicheng/moge-2-vitl@v1"}
-    config["perceive"] |= {"detector": "learned", "detector_weights": "acme/net.onnx"}
+    config["perceive"] |= {"detector": "picture", "detector_weights": "acme/net.onnx"}
     write_run(dataset / "run.json", {**read_run(dataset / "run.json"), "config": config})
     write_filtered_dataset(dataset, tmp_path / "public", "permissive")
     record = read_run(tmp_path / "public" / "run.json")

@@ -6,7 +6,6 @@ from schemas.config import Config
 from schemas.manifest import SceneKind
 from tableverse_factory.models.local.preflight import check_weights
 from tableverse_factory.models.picture.net import check_picture_net
-from tableverse_factory.stages.perceive.learned.onnx import check_net
 
 
 def check_perception_models(config: Config, kinds: Collection[SceneKind], here: bool) -> None:
@@ -15,8 +14,6 @@ def check_perception_models(config: Config, kinds: Collection[SceneKind], here: 
     by_net = own.detector == "auto" and not {SceneKind.IMAGE, SceneKind.CAPTURE}.isdisjoint(kinds)
     if by_net or own.detector in ("picture", "ensemble") or own.segmenter == "picture":
         check_picture_net(own.detector_weights, "perceive.detector_weights")
-    if own.detector == "learned":
-        check_net(own.detector_weights)
     if own.detector == "grounding_dino":
         check_weights("perceive.detector_weights", own.detector, own.detector_weights, config.models, here)
     if own.segmenter in ("sam2", "sam3"):

@@ -126,3 +126,19 @@ def test_answers_of_another_size_or_that_are_no_numbers_are_refused(tmp_path: Pa
     nothing = load(str(write_net(tmp_path / "nan.onnx", INPUTS, {**MAPS, **VECTORS}, value=np.nan)))
     with pytest.raises(ModelError, match="finite"):
         ask(nothing, 32, 32)
+
+
+def test_a_user_s_net_reads_no_weights_from_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_net(tmp_path / "net.onnx", INPUTS, MAPS | VECTORS)
+    assert isinstance(load(str(path)), PictureNet)
+    model = onnx.load(path)
+    constant = model.graph.initializer[0]
+    (tmp_path / "beside.bin").write_bytes(constant.raw_data)
+    constant.ClearField("raw_data")
+    constant.data_location = onnx.TensorProto.EXTERNAL
+    entry = constant.external_data.add()
+    entry.key, entry.value = "location", "beside.bin"
+    path.write_bytes(model.SerializeToString())
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ModelAccessError, match="is no ONNX file"):
+        load(str(path))
