@@ -10,6 +10,7 @@ import typer
 
 from tableverse_factory.cli.options import AsJson, ConfigFile
 from tableverse_factory.cli.tables import print_figures, print_json
+from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.completion import CompletionScore
@@ -39,8 +40,9 @@ def bench_perception(
     """
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.evaluation.bench.captures import list_captures
-    from tableverse_factory.evaluation.bench.perception import bench_masks, merge_scores
+    from tableverse_factory.evaluation.bench.captures import list_captures, list_without
+    from tableverse_factory.evaluation.bench.perception import TRUTH_NAMES, bench_masks, merge_scores
+    from tableverse_factory.sources.capture import COLOR_NAMES
     from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
 
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
@@ -52,6 +54,8 @@ def bench_perception(
         print_json([asdict(row) | _derive_scores(row) for row in rows])
     else:
         _show_masks(rows, detector)
+        if untold := list_without(folder, COLOR_NAMES, TRUTH_NAMES):
+            print(f"without {' or '.join(TRUTH_NAMES)}: {', '.join(sanitize_line(path.name) for path in untold)}")
         if list_captures(folder, [GROUND_TRUTH_NAME]):
             _show_placements(folder, (("replay", "carved"),), config, as_json=False)
 

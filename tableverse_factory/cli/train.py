@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 train = typer.Typer(
     name="train",
-    help="Train the network of pictures on synthetic scenes, and policies on a dataset.",
+    help="Train the network of pictures, and policies on a dataset.",
     no_args_is_help=True,
 )
 

@@ -68,7 +68,7 @@ def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), origin:
             (_OVERRIDE_PREFIX if _is_overridden(problem["loc"], overridden) else origin, *_explain(problem))
             for problem in error.errors()
         ]
-        raise ConfigError(_join_problems(problems)) from None
+        raise ConfigError(_join_problems([*dict.fromkeys(problems)])) from None
 
 
 def _join_problems(problems: Sequence[tuple[str, str, str]]) -> str:
@@ -138,9 +138,25 @@ def describe_allowed_values(field: Mapping[str, Any]) -> str:
     if "enum" in field:
         return "one of " + ", ".join(str(choice) for choice in field["enum"])
     kinds = {"number": "a number", "integer": "a whole number", "boolean": "true or false", "string": "text"}
-    words = [kinds.get(field.get("type", ""), {"null": "null"}.get(field.get("type", ""), "a list"))]
+    if field.get("type") == "array":
+        return _describe_list(field)
+    words = [kinds.get(field.get("type", ""), "null")]
+    words += [f"that matches {field['pattern']}"] if "pattern" in field else []
     words += [f"{word} {field[bound]:.15g}" for bound, word in _BOUNDS.items() if bound in field]
     return ", ".join(words)
+
+
+def _describe_list(field: Mapping[str, Any]) -> str:
+    """Describe a list by how many values it may have and what each is: `a list of 2, each a number, more than 0`."""
+    least, most = field.get("minItems", 0), field["maxItems"]
+    count = f"{most}" if least == most else f"{least} to {most}"
+    return f"a list of {count}, each {describe_allowed_values(_find_item(field, 0))}"
+
+
+def _find_item(field: Mapping[str, Any], index: int) -> Mapping[str, Any]:
+    """Find the schema of a value of a list, by its index."""
+    found: Mapping[str, Any] = field["prefixItems"][index] if "prefixItems" in field else field["items"]
+    return found
 
 
 def load_yaml(path: Path) -> dict[str, Any]:
@@ -157,7 +173,7 @@ def load_yaml(path: Path) -> dict[str, Any]:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, *_TAG_ERRORS) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:300]}") from None
+        raise ConfigError(f"{path}: not valid YAML: {_describe_yaml_error(error)}") from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -176,8 +192,14 @@ def _parse_override(text: str) -> tuple[str, Any]:
         return key, yaml.load(value, _StrictLoader)  # noqa: S506 a SafeLoader with less
     except (yaml.YAMLError, RecursionError, *_TAG_ERRORS) as error:
         raise ConfigError(
-            f"{_OVERRIDE_PREFIX}{key}: {represent(value)} is no YAML value: {' '.join(str(error).split())[:200]}"
+            f"{_OVERRIDE_PREFIX}{key}: {represent(value)} is no YAML value: {_describe_yaml_error(error)}"
         ) from None
+
+
+def _describe_yaml_error(error: Exception) -> str:
+    """Describe in one line what YAML refuses; of long integers Python says how its limit is raised."""
+    text = " ".join(str(error).split())[:300]
+    return "an integer of thousands of digits" if "set_int_max_str_digits" in str(error) else text
 
 
 def _set_key(tree: dict[str, Any], key: str, value: Any) -> None:
@@ -204,7 +226,11 @@ def _explain(error: Mapping[str, Any]) -> tuple[str, str]:
     if error["type"] == "value_error":  # our own message; the value may be a secret
         return f"{key}: {error['ctx']['error']}" if key else str(error["ctx"]["error"]), ""
     if key in known:
-        return f"{key}: {represent(value)} is not allowed; give {describe_allowed_values(known[key])}", ""
+        field: Mapping[str, Any] = known[key]
+        index = next((part for part in location[2:] if isinstance(part, int)), None)
+        if index is not None and error["type"] != "missing":  # one value of a list; one that is missing is the list's
+            key, field = f"{key}.{index}", _find_item(field, index)
+        return f"{key}: {represent(value)} is not allowed; give {describe_allowed_values(field)}", ""
     sections = [*Config.model_fields]
     if len(location) == 1 and key in sections:
         return f"{key}: {represent(value)} is no section; give keys, e.g. {_format_example(key)}", ""

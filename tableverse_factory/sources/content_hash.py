@@ -38,7 +38,7 @@ def verify_content_hash(row: ImageRow, bounds: ObserveConfig) -> None:
     """Compare an entry with the hash in the manifest, if there is one, else raise `content_changed`."""
     if row.content_sha256 and (found := hash_entry(row.kind, row.uri, bounds)) != row.content_sha256:
         change = f"sha256 {found[:12]}, not {row.content_sha256[:12]}"
-        problem = f"its files are not those that the manifest saw ({change}): make the manifest again"
+        problem = f"read as {row.kind.value}, it is not what the manifest saw ({change}): make the manifest again"
         raise InputError(problem, "content_changed")
 
 
@@ -62,6 +62,10 @@ def _hash_capture(uri: str, bounds: ObserveConfig) -> str:
     """Hash the files that exist, and the meshes that `place.mesh_model` = replay would read."""
     folder = uri.rstrip("/")
     present = [name for name in _CAPTURE_FILES if exists(f"{folder}/{name}")]
+    if not any(name in COLOR_NAMES for name in present):
+        raise InputError(
+            f"no {' or '.join(COLOR_NAMES)} in {folder!r}: a capture is a folder with one", "missing_color"
+        )
     files = (read_bytes(f"{folder}/{name}", bounds.max_file_bytes, "unreadable_file") for name in present)
     parts = [part for name, data in zip(present, files, strict=True) for part in (name.encode(), data)]
     for name in list_recorded_meshes(folder):

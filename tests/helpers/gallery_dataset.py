@@ -27,7 +27,7 @@ HOSTILE = (
 )
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 EYE = look_at(np.array([0.0, -0.6, 0.45]), np.array([0.0, 0.0, 0.0]))
-MEASURED = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif"}
+MEASURED = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif", "field_of_view_deg": 56.1}
 RED, GREEN = (210, 30, 30), (30, 160, 40)
 
 

@@ -11,6 +11,11 @@ def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
     return sorted(path for path in folder.iterdir() if _has_files(path, needed))
 
 
+def list_without(folder: Path, needed: Iterable[str], others: Iterable[str]) -> list[Path]:
+    """List the captures in `folder` that have a file of `needed` and none of `others`, sorted by name."""
+    return [path for path in list_captures(folder, needed) if find_file(path, others) is None]
+
+
 def find_file(capture: Path, names: Iterable[str]) -> Path | None:
     """Find the first of these files that a capture has."""
     return next((capture / name for name in names if (capture / name).is_file()), None)

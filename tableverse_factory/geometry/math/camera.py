@@ -22,6 +22,12 @@ def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
     return Camera(camera.fx * x, camera.fy * y, (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5, width, height)
 
 
+def compute_field_of_view_deg(camera: Camera) -> float:
+    """Compute the angle that the longer side of the picture spans [°]."""
+    size, focal = max((camera.width, camera.fx), (camera.height, camera.fy))
+    return float(np.degrees(2.0 * np.arctan(size / (2.0 * focal))))
+
+
 def backproject(depth: DepthImage, camera: Camera) -> Float64[np.ndarray, "h w 3"]:
     """Points in the camera frame [m], pixel by pixel; zero depth gives the origin."""
     z = np.asarray(depth, dtype=np.float64)

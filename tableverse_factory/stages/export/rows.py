@@ -12,6 +12,7 @@ from schemas.geometry import ConvexPieces
 from schemas.objects import Evidence, PlacedObject
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.geometry.math.aabb import aabb_size
+from tableverse_factory.geometry.math.camera import compute_field_of_view_deg
 from tableverse_factory.physics.mjcf.spec import SceneBody
 from tableverse_factory.physics.simulate.sizes import SimulationSizes
 
@@ -89,7 +90,8 @@ def describe_metric(evidence: Evidence | None) -> dict[str, Any]:
         return {"scale_source": "given"}
     is_known = evidence.scale_sigma > 0.0 or evidence.scale_source == "sensor"  # a model may tell no uncertainty
     sigma = evidence.scale_sigma if is_known else None
-    return {**_pick(evidence, "scale_source", "scale_deviation", "intrinsics_source"), "scale_sigma": sigma}
+    columns = _pick(evidence, "scale_source", "scale_deviation", "intrinsics_source")
+    return {**columns, "scale_sigma": sigma, "field_of_view_deg": compute_field_of_view_deg(evidence.camera)}
 
 
 def build_object_rows(

@@ -34,7 +34,7 @@ _EXPLANATIONS = {
     "unsupported_pixels": "the picture is not 8-bit colour or grey",
     "animated_picture": "the picture has several frames",
     "transparent_picture": "the picture has transparent pixels",
-    "no_table": "the picture shows no table-top, as sure as the net is",
+    "no_table": "the net sees no table-top in the picture",
     "no_table_plane": "no table plane was found",
     "no_table_detected": "the detector found no table-top",
     "no_objects": "nothing stands on the table",
@@ -129,8 +129,9 @@ def format_scale(row: Mapping[str, Any]) -> str:
 
 
 def format_camera(row: Mapping[str, Any]) -> str:
-    """Format where the intrinsics of a scene's camera come from."""
-    return CAMERA_NAMES.get(str(row.get("intrinsics_source")), DASH)
+    """Format where the intrinsics of a scene's camera come from, and the angle of its view."""
+    name, field = CAMERA_NAMES.get(str(row.get("intrinsics_source")), DASH), row.get("field_of_view_deg")
+    return f"{name}, {field:.0f}° wide" if isinstance(field, float) else name
 
 
 def format_code(text: str | None) -> str:

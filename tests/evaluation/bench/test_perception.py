@@ -170,6 +170,10 @@ def test_a_truth_that_does_not_say_what_lies_in_what_is_refused(tmp_path):
 def test_the_command_says_what_lies_in_what_in_json(tmp_path):
     bowl, block = Bowl(0.0, 0.0, 0.09), Box(0.0, 0.01, (0.045, 0.045, 0.06), z=0.012, color=(230, 200, 40))
     write_look(tmp_path / "a", [bowl, block], contained_in={2: 1})
+    (tmp_path / "untold").mkdir()
+    (tmp_path / "untold" / "color.png").write_bytes((tmp_path / "a" / "color.png").read_bytes())
+    said = CliRunner().invoke(app, ["bench", "perception", str(tmp_path)]).stdout
+    assert "without seg.png or masks.png: untold" in said
     result = CliRunner().invoke(app, ["bench", "perception", str(tmp_path), "--json"])
     assert result.exit_code == 0, result.output
     for row in json.loads(result.stdout):

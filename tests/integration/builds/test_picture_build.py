@@ -93,6 +93,7 @@ def test_every_file_becomes_a_row(tmp_path, run) -> None:
     }
     table = rows["table.png"]
     assert (table["scale_source"], table["intrinsics_source"]) == ("estimated", "assumed")
+    assert table["field_of_view_deg"] == pytest.approx(58.0)
     assert table["scale_sigma"] > 0
     assert table["scale_deviation"] is None
     mistaken = rows["mistaken.png"]

@@ -315,6 +315,14 @@ def test_a_capture_that_is_not_what_the_manifest_saw_is_dropped(tmp_path, name):
     assert refusal(observe(row, Config(), ANYTHING, SERVICES)) == "content_changed"
 
 
+def test_a_picture_that_its_row_calls_a_capture_is_told_what_a_capture_is(tmp_path):
+    write_capture(tmp_path / "c", 1)
+    (row,) = make_manifest([str(tmp_path / "c" / "color.png")], Config().observe).rows
+    outcome = observe(row.model_copy(update={"kind": SceneKind.CAPTURE}), Config(), ANYTHING, SERVICES)
+    assert refusal(outcome) == "missing_color"
+    assert "a capture is a folder" in outcome.detail
+
+
 def test_a_layout_whose_mesh_was_swapped_is_dropped(tmp_path):
     path = write_layout(tmp_path / "a.json")
     (row,) = make_manifest([str(path)], Config().observe).rows

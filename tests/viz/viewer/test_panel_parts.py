@@ -312,14 +312,15 @@ def test_foreign_text_stays_text():
 
 
 def test_the_panel_tells_where_metres_come_from():
-    row = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif"}
+    row = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif", "field_of_view_deg": 56.1}
     html = format_facts(row, {}, [], [], "")
     assert "measured by a known length, ±1.3 %<" in html
-    assert "from EXIF" in html
+    assert "from EXIF, 56° wide<" in html
     near, far = (format_facts({**row, "scale_deviation": value}, {}, [], [], "") for value in (-2.7, 3.4))
     assert "±1.3 %, 2.7 standard deviations smaller than estimated<" in near
     assert "±1.3 %, 3.4 standard deviations larger than estimated: check the known length<" in far
-    odd = {"scale_source": HOSTILE, "scale_sigma": HOSTILE, "scale_deviation": HOSTILE, "intrinsics_source": HOSTILE}
+    odd = {"scale_source": HOSTILE, "scale_sigma": HOSTILE, "scale_deviation": HOSTILE}
+    odd |= {"intrinsics_source": HOSTILE, "field_of_view_deg": HOSTILE}
     assert "camera" not in format_facts(odd, {}, [], [], "")
 
 
