@@ -1,14 +1,14 @@
 """Handles and spouts: parts outside a surface of revolution, as thick as they look wide."""
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from manifold3d import Manifold
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from schemas.geometry import IdImage, Mask, Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.camera import project
+from tableverse_factory.geometry.math.camera import backproject, project
 from tableverse_factory.geometry.math.transforms import (
     invert_pose,
     matrix_from_pose,
@@ -48,6 +48,9 @@ MAX_BRIDGE_M = 0.06
 BRIDGE_RADIUS_M = 0.005
 NEIGHBOURS = 8
 ALONG_AXIS = 0.5  # sine of the angle between axis and line of sight up to which a handle stands before the body
+MEDIAL_SHARE = 0.6  # of the half width, from which a pixel is amid the part
+LEAST_ASIDE = 0.7  # length of the mean way from the axis to a part's points, as a share of their mean distance
+LEAST_CROSSING = 0.3  # sine of the angle at which a ray must cross the plane of a part
 MOST_POINTS = 0.95  # share of a part's points that must lie near its plane
 MOST_MOVED = 0.35  # of a point's distance from the camera, into that plane
 
@@ -109,9 +112,14 @@ def _join_part(body: Manifold, part: Manifold) -> Manifold:
 
 
 def _find_protrusions(view: ObjectView, scene: RaycastingScene) -> IdImage:
-    """Label the parts of the object that lie outside the body, over the window."""
-    labels, count = ndimage.label(_find_uncovered(view, scene) if view.estimated else _find_away(view, scene))
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
+    """Label the parts of the object that lie outside the body, over the window.
+
+    A sensor's points tell of them, which go on beside the silhouette where it reads nothing.
+    """
+    beside = _find_uncovered(view, scene)
+    told = beside if view.estimated else _find_away(view, scene)
+    labels, count = ndimage.label(told | (beside & view.unread))
+    sizes = np.bincount(labels[told], minlength=count + 1)
     least = max(MIN_PIXELS, MIN_SHARE * float(view.own.sum()))
     kept = [k for k in range(1, count + 1) if sizes[k] >= least]
     number = np.zeros(count + 1, dtype=np.int32)
@@ -129,16 +137,16 @@ def _find_away(view: ObjectView, scene: RaycastingScene) -> Mask:
 
 
 def _find_uncovered(view: ObjectView, scene: RaycastingScene) -> Mask:
-    """Find the object's pixels beside the body's silhouette, and those between: estimated depth tells nothing there.
+    """Find the object's pixels beside the body's silhouette, and those between.
 
-    It is off by more than a handle is thick.
+    Of estimated depth they alone tell of a handle: it is off by more than that is thick.
     """
-    rays = pack_pixel_rays(view.camera, view.camera_to_table)
+    rays, shown = pack_pixel_rays(view.camera, view.camera_to_table), view.own | view.unread
     covered = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
     away_px = AWAY_M * view.camera.fx / float(np.median(np.linalg.norm(view.points - view.eye, axis=1)))
-    beside = view.own & (ndimage.distance_transform_edt(~covered) > away_px)
+    beside = shown & (ndimage.distance_transform_edt(~covered) > away_px)
     core = ndimage.binary_opening(beside, iterations=FRAYED_PX)
-    return ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & view.own
+    return ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & shown
 
 
 def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -153,20 +161,62 @@ def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
     Where depth is estimated, they lie in a plane through the axis, if the camera does not look along it, and nothing is
     carved.
     """
-    width = compute_half_width(ndimage.distance_transform_edt(mask))
+    inset = ndimage.distance_transform_edt(mask)
+    width = compute_half_width(inset)
     row, column = _find_pixels(view, view.points)
     inside = mask[np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)]
     points = view.points[inside]
     if len(points) < MIN_PIXELS:
         return None
-    rays = points - view.eye
-    depth = np.linalg.norm(rays, axis=1)
-    pixels = width[row[inside], column[inside]]
-    radius = np.clip(pixels * depth / view.camera.fx, *RADIUS_RANGE_M)
+    radius = _measure_radius(view, points, width[row[inside], column[inside]])
     flat = _move_into_plane(view, points, axis) if view.estimated else None
     if flat is not None:
         return _build_balls(view, flat, radius, carve=False)
-    return _build_balls(view, points + rays / depth[:, None] * radius[:, None], radius, carve=True)
+    rays = points - view.eye
+    centers = points + rays / np.linalg.norm(rays, axis=1)[:, None] * radius[:, None]
+    part = _build_balls(view, centers, radius, carve=True)
+    unread = mask & view.unread & (inset > MEDIAL_SHARE * width)
+    more, known = _continue_in_plane(view, unread, centers, axis)
+    if part is None or not len(more):
+        return part
+    # Along their middle, as wide as the mask there: no free space cuts what the sensor does not see
+    rest = _build_balls(view, more, _measure_radius(view, more, inset[unread][known]), carve=False)
+    return part if rest is None else part + rest
+
+
+def _measure_radius(view: ObjectView, points: Points, pixels: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Measure radii at points, of so many pixels [m]."""
+    depth = np.linalg.norm(points - view.eye, axis=1)
+    return np.clip(pixels * depth / view.camera.fx, *RADIUS_RANGE_M)
+
+
+def _continue_in_plane(
+    view: ObjectView, unread: Mask, centers: Points, axis: Pose
+) -> tuple[Points, Bool[np.ndarray, " n"]]:
+    """Place pixels without a reading in the half plane from the axis in which the centres of a part lie.
+
+    Returns the points, and which of the pixels they are of: those whose rays cross it, near the part. None are where
+    the part stands all around the axis.
+    """
+    to_axis, turn = invert_pose(axis), rotation_matrix(axis.quaternion_wxyz)
+    ends = backproject(unread.astype(np.float64), view.camera)[unread]
+    rays = transform_points(view.camera_to_table, ends) - view.eye
+    across = transform_points(to_axis, centers)[:, :2]
+    away, spread = across.mean(axis=0), float(np.linalg.norm(across, axis=1).mean())
+    normal = np.array([-away[1], away[0]]) / max(float(np.linalg.norm(away)), 1e-9)
+    eye, slope = transform_points(to_axis, view.eye[None])[0, :2], (rays @ turn)[:, :2] @ normal
+    crosses = np.abs(slope) > LEAST_CROSSING * np.linalg.norm(rays, axis=1)
+    share = -(eye @ normal) / np.where(crosses, slope, 1.0)
+    points = view.eye + rays * share[:, None]
+    near = np.isfinite(cKDTree(centers).query(points, distance_upper_bound=MAX_BRIDGE_M)[0])
+    known = (
+        (np.linalg.norm(away) > LEAST_ASIDE * spread)
+        & crosses
+        & near
+        & (share > 0.0)
+        & (transform_points(to_axis, points)[:, :2] @ away > 0.0)
+    )
+    return points[known], known
 
 
 def _move_into_plane(view: ObjectView, points: Points, axis: Pose) -> Points | None:

@@ -5,14 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
+from skimage.color import rgb2lab
 
-from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Points, Pose
+from schemas.geometry import Camera, Colors, DepthImage, Frozen, Mask, Picture, Points, Pose
 from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, rotation_matrix, transform_points
 from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
 from tableverse_factory.stages.place.view.object_pixels import (
+    RARITY,
+    compute_color_share,
     compute_outline_distance,
     compute_pixel_normals,
     drop_outline,
@@ -45,6 +48,7 @@ class ObjectView(Frozen):
         camera: Intrinsics of the window: pixel (0, 0) is the window's corner.
         window: Rows and columns of the picture that the window shows.
         own: Pixels of the object, without those whose reading was smeared over its outline.
+        unread: Pixels that show the object where the sensor reads nothing, or what lies behind it.
         depth: Smoothed depth [m]; 0 where unknown.
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
@@ -60,6 +64,7 @@ class ObjectView(Frozen):
     camera_to_table: Pose
     window: tuple[slice, slice]
     own: Mask
+    unread: Mask
     depth: DepthImage
     facing: DepthImage
     past: Mask
@@ -91,7 +96,9 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     false = find_flying_pixels(color, raw, own, ids <= 0)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & find_denoised_pixels(item.points_camera, window, raw)
-    own, trusted = _remove_bleed(own, trusted, raw, window, pose, support.height)
+    bleed = _find_bleed(trusted, raw, window, pose, support.height)
+    own, trusted = own & ~bleed, trusted & ~bleed
+    shown = own | _find_own_colors(color, bleed, trusted, ids <= 0)
     trusted &= ~find_depth_ramps(raw, own, trusted, window)
     estimated = scene.observation.bend > 0.0
     if estimated:
@@ -114,6 +121,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
         camera_to_table=pose,
         window=(rows, columns),
         own=own,
+        unread=shown & (own_depth <= 0.0),
         depth=np.where(own, own_depth, np.where(past, end, raw)),
         facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,
@@ -180,14 +188,22 @@ def sample_nearest(
     return z, [image[row, column] for image in images]
 
 
-def _remove_bleed(
-    own: Mask, trusted: Mask, raw: DepthImage, window: Camera, camera_to_table: Pose, support_z: float
-) -> tuple[Mask, Mask]:
-    """Remove the pixels of the support beside the object from both masks."""
+def _find_bleed(trusted: Mask, raw: DepthImage, window: Camera, camera_to_table: Pose, support_z: float) -> Mask:
+    """Find the trusted pixels whose readings are of the support beside the object."""
     points = transform_points(camera_to_table, backproject(raw, window)[trusted])
-    kept = trusted.copy()
-    kept[trusted] = ~find_background_bleed(points, support_z)
-    return own & (kept | ~trusted), kept
+    bleed = np.zeros_like(trusted)
+    bleed[trusted] = find_background_bleed(points, support_z)
+    return bleed
+
+
+def _find_own_colors(color: Picture, pixels: Mask, own: Mask, beside: Mask) -> Mask:
+    """Find those of some pixels with colours of the object that what lies beside it lacks."""
+    found = np.zeros_like(pixels)
+    if pixels.any() and own.any() and beside.any():
+        shown = rgb2lab(color)
+        on, off = (compute_color_share(shown[pixels], shown[of]) for of in (own, beside))
+        found[pixels] = on > RARITY * off
+    return found
 
 
 def _project_columns(points: Points, to_camera: Pose, camera: Camera) -> tuple[Distances, Distances, Distances]:

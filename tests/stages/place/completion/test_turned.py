@@ -12,7 +12,7 @@ from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.evaluation.bench.completion import render_noisy_view, stand_on_table
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.geometry.math.transforms import matrix_from_pose, quaternion_about_z
+from tableverse_factory.geometry.math.transforms import matrix_from_pose, quaternion_about_z, transform_points
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
@@ -101,15 +101,19 @@ def test_a_box_is_a_box_and_a_lying_can_lies() -> None:
     assert np.ptp(lying.mesh.vertices, axis=0)[2] == pytest.approx(0.14, rel=0.15)
 
 
-def test_a_mug_keeps_its_handle() -> None:
-    """Estimated depth is bent by more than the handle is thick: its silhouette tells that it is there."""
+def _build_mug(turned: float = 0.0) -> TriangleMesh:
+    """Build a mug whose handle is seen from its side, or turned by an angle."""
     handle = trimesh.creation.torus(0.022, 0.005)
     upright = trimesh.transformations.rotation_matrix(np.pi / 2, [1.0, 0.0, 0.0])
-    beside = trimesh.transformations.rotation_matrix(AZIMUTH + np.pi / 2, [0.0, 0.0, 1.0])
+    beside = trimesh.transformations.rotation_matrix(AZIMUTH + np.pi / 2 + turned, [0.0, 0.0, 1.0])
     handle.apply_transform(beside @ trimesh.transformations.translation_matrix([0.05, 0.0, 0.045]) @ upright)
     inside = to_manifold(turn([(0.0, 0.0), (0.036, 0.0), (0.036, 0.09), (0.0, 0.09)]))
-    bare = turn(MUG)
-    mug = from_manifold(to_manifold(bare) + (to_manifold(from_trimesh(handle)) - inside))
+    return from_manifold(to_manifold(turn(MUG)) + (to_manifold(from_trimesh(handle)) - inside))
+
+
+def test_a_mug_keeps_its_handle() -> None:
+    """Estimated depth is bent by more than the handle is thick: its silhouette tells that it is there."""
+    mug, bare = _build_mug(), turn(MUG)
     for mesh, reach in ((mug, 0.077), (bare, 0.04)):
         (found,) = complete(mesh)
         assert found.method == "carved/turned"
@@ -119,6 +123,29 @@ def test_a_mug_keeps_its_handle() -> None:
         if mesh is mug:
             assert np.arctan2(farthest[1], farthest[0]) == pytest.approx(AZIMUTH + np.pi / 2, abs=0.25)
         assert len(to_manifold(found.mesh).decompose()) == 1
+
+
+@pytest.mark.parametrize("read", ["nothing", "the table behind"])
+def test_a_handle_goes_on_where_a_sensor_does_not_read_it(read: str) -> None:
+    """Its mask and colour show that it is there, and its ends in which plane."""
+    scene = render_noisy_view([_build_mug(-0.3)], AZIMUTH, 0.85, np.random.default_rng(3), 0.0005)
+    (item,), observation, own = scene.objects, scene.observation, scene.instance_ids > 0
+    rows, columns = np.indices(own.shape)
+    lost = own & (columns > np.quantile(columns[own], 0.93))
+    lost &= np.abs(rows - np.median(rows[lost])) < 9
+    eye = scene.camera_to_table.position
+    rays = transform_points(scene.camera_to_table, backproject(np.ones(own.shape), observation.camera)[lost]) - eye
+    depth = observation.depth.copy()
+    depth[lost] = 0.0 if read == "nothing" else -eye[2] / rays[:, 2]
+    color = np.where(own[..., None], np.uint8([30, 40, 160]), np.uint8([180, 150, 110]))
+    item = replace(item, points_camera=backproject(depth, observation.camera)[own & (depth > 0.0)])
+    scene = replace(scene, observation=replace(observation, depth=depth, color=color), objects=(item,))
+    supports = find_supports(scene.objects, scene.camera_to_table)
+    found = complete_by_carving(scene, view_object(scene, item, supports[item.object_id]))
+    solid = to_manifold(found.mesh)
+    assert len(solid.decompose()) == 1
+    assert solid.genus() >= 1, "the handle is broken"
+    assert np.linalg.norm(place(found).vertices[:, :2], axis=1).max() == pytest.approx(0.077, abs=0.006)
 
 
 BOWL = [
