@@ -5,7 +5,7 @@ from functools import partial
 from tableverse_factory.stages.perceive.base.interfaces import BoxSegmenter, Detector
 from tableverse_factory.stages.perceive.base.replay import replay_detections
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth, segment_boxes_from_depth
-from tableverse_factory.stages.perceive.ensemble.detector import detect_with_both
+from tableverse_factory.stages.perceive.ensemble.detector import detect_with_ensemble
 from tableverse_factory.stages.perceive.grounding_dino.detector import detect_with_grounding_dino
 from tableverse_factory.stages.perceive.picture.detector import detect_in_picture, segment_boxes_in_picture
 from tableverse_factory.stages.perceive.sam.segmenter import segment_with_sam
@@ -13,7 +13,7 @@ from tableverse_factory.stages.perceive.vlm.detector import detect_with_vlm
 
 DETECTORS: dict[str, Detector] = {
     "geometric": detect_from_depth,
-    "ensemble": detect_with_both,
+    "ensemble": detect_with_ensemble,
     "picture": detect_in_picture,
     "replay": replay_detections,
     "grounding_dino": detect_with_grounding_dino,

@@ -1,8 +1,9 @@
-"""The detector `ensemble`: each group by depth alone or by both, as the boundaries that our net sees decide."""
+"""The detector `ensemble`: each group by depth, by the net, or by both, as the boundaries that the net sees decide."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,7 +19,7 @@ from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.segment import detect_from_depth, to_box
 from tableverse_factory.stages.perceive.ensemble.fused import detect_fused, upsample_map
-from tableverse_factory.stages.perceive.picture.detector import find_label, predict_view
+from tableverse_factory.stages.perceive.picture.detector import detect_predicted, find_label, predict_view
 
 REACH_PX = 2  # a boundary this near is that of a border: the net sees every second or third pixel of a picture
 INNER_WEIGHT = 0.35  # of a pixel within an object, against one on a border
@@ -29,27 +30,55 @@ COMMON_SHARE = 0.3  # of the smaller of two objects, one of each answer, from wh
 # has one object, and only its outline is in question. One of more objects may be worse by as much: a sensor joins what
 # touches and misses what is thin, but sees no seams where there are none.
 FAVOUR, OUTLINE_FAVOUR = 0.35, 0.1
+# The same for the answer of the net alone, where it parts what is one so far; where much of a group has no reading, no
+# more is asked of it than to be better. Outlines stay those that depth knows.
+PARTING_FAVOUR, MUCH_UNREAD = 0.2, 0.1
 
 Probabilities = Float32[np.ndarray, "h w"]
 
 
-def detect_with_both(view: TableView, config: Config, services: Services) -> DetectionResult:
-    """Detect objects by depth, and by depth and the net together, and choose one answer for each group."""
+class Comparison(NamedTuple):
+    """Two segmentations of one group of objects.
+
+    Attributes:
+        counts: Objects of each.
+        gain: Log-likelihood of the boundaries by which the second explains them better, per pixel of border.
+        unread: Share of the group's pixels without a reading.
+    """
+
+    counts: tuple[int, int]
+    gain: float
+    unread: float
+
+
+def detect_with_ensemble(view: TableView, config: Config, services: Services) -> DetectionResult:
+    """Detect objects by depth, by depth and the net, and by the net alone, and choose an answer for each group."""
     seen = predict_view(view, config.perceive.detector_weights)
-    answers = detect_from_depth(view, config, services), detect_fused(view, seen)
-    ids = [_get_ids(answer) for answer in answers]
     boundary = upsample_map(seen.boundary, view.valid.shape)
-    contained = [_list_contained(answer) for answer in answers]
+    unread, fused = view.observation.depth <= 0, detect_fused(view, seen)
+    answer = _choose_answers(detect_from_depth(view, config, services), fused, boundary, unread, prefer_fused)
+    answer = _choose_answers(answer, detect_predicted(view, seen), boundary, unread, prefer_net)
+    return replace(answer, shown=fused.shown, table_top=find_label(seen, TABLE, view.valid.shape))
+
+
+def _choose_answers(
+    first: DetectionResult,
+    second: DetectionResult,
+    boundary: Probabilities,
+    unread: Mask,
+    prefers_second: Callable[[Comparison], bool],
+) -> DetectionResult:
+    """Take the second answer for each group of objects of which it is preferred, else the first."""
+    answers = first, second
+    ids, contained = [_get_ids(answer) for answer in answers], [_list_contained(answer) for answer in answers]
     numbers = group_objects(ids[0], ids[1], contained[0], contained[1])
     groups = [number[own] for number, own in zip(numbers, ids, strict=True)]
     takes_second = np.zeros(max(int(each.max()) for each in groups) + 1, dtype=bool)
     for group in np.setdiff1d(groups, 0):
         window = expand_window((groups[0] == group) | (groups[1] == group), 2 * REACH_PX)
         own = [np.where(each[window] == group, part[window], 0) for each, part in zip(groups, ids, strict=True)]
-        inside = ndimage.binary_dilation((own[0] > 0) | (own[1] > 0), iterations=REACH_PX)
-        takes_second[group] = prefer_second(own, boundary[window], inside)
-    merged = _merge_answers(answers, ids, groups, takes_second)
-    return replace(merged, shown=answers[1].shown, table_top=find_label(seen, TABLE, view.valid.shape))
+        takes_second[group] = prefers_second(compare_answers(own, boundary[window], unread[window]))
+    return _merge_answers(answers, ids, groups, takes_second)
 
 
 def _list_contained(answer: DetectionResult) -> list[tuple[int, int]]:
@@ -92,16 +121,30 @@ def group_objects(
     return np.append(np.int32(0), group[: counts[0]]), np.append(np.int32(0), group[counts[0] :])
 
 
-def prefer_second(ids: Sequence[IdImage], boundary: Probabilities, inside: Mask) -> bool:
-    """Decide whether the second of two segmentations explains the boundaries so much better that it is taken.
-
-    `boundary` is their probability at each pixel, of which those `inside` count; `FAVOUR` says how much better.
-    """
+def compare_answers(ids: Sequence[IdImage], boundary: Probabilities, unread: Mask) -> Comparison:
+    """Compare two segmentations of a group by the probability of a boundary at each pixel. Shapes (h, w)."""
+    own = (ids[0] > 0) | (ids[1] > 0)
+    inside = ndimage.binary_dilation(own, iterations=REACH_PX)
     borders = [_find_borders(each) & inside for each in ids]
     first, second = (_score_borders(border, boundary, inside) for border in borders)
-    counts = [len(np.unique(each[each > 0])) for each in ids]
-    favour = OUTLINE_FAVOUR if counts == [1, 1] else math.copysign(FAVOUR, counts[0] - counts[1])
-    return bool(second - first > favour * max(1, *(int(border.sum()) for border in borders)))
+    length = max(1, *(int(border.sum()) for border in borders))
+    count_first, count_second = (len(np.unique(each[each > 0])) for each in ids)
+    share = float(unread[own].mean()) if own.any() else 0.0
+    return Comparison((count_first, count_second), (second - first) / length, share)
+
+
+def prefer_fused(group: Comparison) -> bool:
+    """Decide whether the answer of depth and net is so much better than that of depth that it is taken."""
+    first, second = group.counts
+    return group.gain > (OUTLINE_FAVOUR if group.counts == (1, 1) else math.copysign(FAVOUR, first - second))
+
+
+def prefer_net(group: Comparison) -> bool:
+    """Decide whether the answer of the net alone is taken, which may part objects and see what depth does not."""
+    first, second = group.counts
+    if group.unread > MUCH_UNREAD and second > 0 and group.counts != (1, 1):
+        return group.gain > 0.0
+    return second > first and group.gain > PARTING_FAVOUR
 
 
 def _score_borders(border: Mask, boundary: Probabilities, inside: Mask) -> float:

@@ -39,7 +39,11 @@ SPECK_PX = 2  # half the width of the holes that every sensor has between readin
 
 def detect_in_picture(view: TableView, config: Config, _services: Services) -> DetectionResult:
     """Detect the objects that the net sees on the table as unnamed candidates, the largest first."""
-    found = predict_view(view, config.perceive.detector_weights)
+    return detect_predicted(view, predict_view(view, config.perceive.detector_weights))
+
+
+def detect_predicted(view: TableView, found: PicturePrediction) -> DetectionResult:
+    """Detect the objects that the net has `found`, as `detect_in_picture`."""
     regions = keep_objects(segment_prediction(found, view.valid.shape), view, by_depth=False)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))

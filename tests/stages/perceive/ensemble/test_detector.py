@@ -14,10 +14,13 @@ from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
 from tableverse_factory.stages.perceive.ensemble.detector import (
+    Comparison,
     _merge_answers,
-    detect_with_both,
+    compare_answers,
+    detect_with_ensemble,
     group_objects,
-    prefer_second,
+    prefer_fused,
+    prefer_net,
 )
 from tableverse_factory.stages.perceive.ensemble.fused import find_openings
 from tableverse_factory.stages.perceive.perceive import choose_detector
@@ -43,7 +46,11 @@ def draw_boundary(*lines: tuple[slice, slice]) -> np.ndarray:
     return boundary
 
 
-EVERYWHERE = np.ones(SHAPE, dtype=bool)
+READ = np.zeros(SHAPE, dtype=bool)
+
+
+def prefers_fused(first: np.ndarray, second: np.ndarray, boundary: np.ndarray) -> bool:
+    return prefer_fused(compare_answers([first, second], boundary, READ))
 
 
 @pytest.mark.parametrize(
@@ -59,7 +66,7 @@ EVERYWHERE = np.ones(SHAPE, dtype=bool)
     ids=["seams are seen", "no seam is seen", "seams stay", "nothing to part", "both alike", "one sees nothing"],
 )
 def test_the_answer_whose_borders_are_seen_is_taken(first, second, boundary, second_wins):
-    assert prefer_second([first, second], boundary, EVERYWHERE) is second_wins
+    assert prefers_fused(first, second, boundary) is second_wins
 
 
 def test_a_seam_that_is_half_seen_parts_but_joins_nothing() -> None:
@@ -67,18 +74,18 @@ def test_a_seam_that_is_half_seen_parts_but_joins_nothing() -> None:
     halves = np.where((ONE > 0) & (np.arange(SHAPE[1]) >= 60), 2, ONE).astype(np.int32)
     boundary = draw_boundary()
     boundary[20:60, 58:62] = 0.6
-    assert prefer_second([ONE, halves], boundary, EVERYWHERE)
+    assert prefers_fused(ONE, halves, boundary)
     boundary[20:60, 58:62] = 0.4
-    assert not prefer_second([halves, ONE], boundary, EVERYWHERE)
+    assert not prefers_fused(halves, ONE, boundary)
 
 
 def test_an_answer_of_more_objects_may_explain_the_boundaries_less_well() -> None:
     halves = np.where((ONE > 0) & (np.arange(SHAPE[1]) >= 60), 2, ONE).astype(np.int32)
     boundary = draw_boundary()
     boundary[20:60, 58:62] = 0.3  # a seam that is improbable, but not impossible
-    assert prefer_second([ONE, halves], boundary, EVERYWHERE)
+    assert prefers_fused(ONE, halves, boundary)
     boundary[20:60, 58:62] = 0.02
-    assert not prefer_second([ONE, halves], boundary, EVERYWHERE)
+    assert not prefers_fused(ONE, halves, boundary)
 
 
 def test_an_outline_is_taken_from_both_sooner_than_a_way_to_part_objects() -> None:
@@ -86,9 +93,34 @@ def test_an_outline_is_taken_from_both_sooner_than_a_way_to_part_objects() -> No
     boundary = draw_boundary()
     narrow = np.where(np.arange(SHAPE[1]) < 92, ONE, 0).astype(np.int32)
     boundary[18:62, 86:98] = 0.5
-    assert prefer_second([narrow, ONE], boundary, EVERYWHERE)
+    assert prefers_fused(narrow, ONE, boundary)
     halves, wider = (np.where((each > 0) & (np.arange(SHAPE[1]) >= 60), 2, each) for each in (narrow, ONE))
-    assert not prefer_second([halves, wider], boundary, EVERYWHERE)
+    assert not prefers_fused(halves, wider, boundary)
+
+
+@pytest.mark.parametrize(
+    ("counts", "gain", "unread", "taken"),
+    [
+        ((1, 2), 0.25, 0.0, True),
+        ((1, 2), 0.15, 0.0, False),
+        ((0, 1), 0.25, 0.0, True),
+        ((2, 1), 0.9, 0.0, False),
+        ((2, 1), 0.05, 0.15, True),
+        ((2, 1), -0.05, 0.15, False),
+        ((1, 0), 0.05, 0.9, False),
+        ((1, 1), 0.9, 0.9, False),
+    ],
+)
+def test_the_net_alone_parts_objects_and_decides_where_a_sensor_reads_little(
+    counts: tuple[int, int], gain: float, unread: float, taken: bool
+) -> None:
+    assert prefer_net(Comparison(counts, gain, unread)) is taken
+
+
+def test_the_share_without_a_reading_is_that_of_the_group() -> None:
+    unread = np.arange(SHAPE[1]) < np.full(SHAPE, 40)
+    assert compare_answers([ONE, EIGHT], draw_boundary(), unread).unread == pytest.approx(0.25)
+    assert compare_answers([ONE, EIGHT], draw_boundary(), unread).counts == (1, 8)
 
 
 def test_objects_that_overlap_are_one_group_and_neighbours_are_not() -> None:
@@ -173,7 +205,7 @@ def test_ids_are_dense_and_containers_come_first(tmp_path: Path, count: int) -> 
         seen = observe(row, config, np.random.default_rng(0), services)
         assert isinstance(seen, Done), seen
         view = find_table(seen.value, np.random.default_rng(0))
-        found = detect_with_both(view, config, services)
+        found = detect_with_ensemble(view, config, services)
         assert found.ids is not None
         assert set(np.unique(found.ids)) == {*range(len(found.candidates) + 1)}
         for index, candidate in enumerate(found.candidates):
