@@ -30,9 +30,9 @@ COMMON_SHARE = 0.3  # of the smaller of two objects, one of each answer, from wh
 # has one object, and only its outline is in question. One of more objects may be worse by as much: a sensor joins what
 # touches and misses what is thin, but sees no seams where there are none.
 FAVOUR, OUTLINE_FAVOUR = 0.35, 0.1
-# The same for the answer of the net alone, where it parts what is one so far; where much of a group has no reading, no
-# more is asked of it than to be better. Outlines stay those that depth knows.
-PARTING_FAVOUR, MUCH_UNREAD = 0.2, 0.1
+# The same for an object that the net alone sees. Where much of a group has no reading, no more is asked of its answer
+# than to be better. Of one object it parts none: handles, caps and what is painted in two colours are one for depth.
+ADDING_FAVOUR, MUCH_UNREAD = 0.2, 0.1
 
 Probabilities = Float32[np.ndarray, "h w"]
 
@@ -140,11 +140,11 @@ def prefer_fused(group: Comparison) -> bool:
 
 
 def prefer_net(group: Comparison) -> bool:
-    """Decide whether the answer of the net alone is taken, which may part objects and see what depth does not."""
+    """Decide whether the answer of the net alone is taken: for what it alone sees, or several with few readings."""
     first, second = group.counts
-    if group.unread > MUCH_UNREAD and second > 0 and group.counts != (1, 1):
-        return group.gain > 0.0
-    return second > first and group.gain > PARTING_FAVOUR
+    if first == 0:
+        return group.gain > ADDING_FAVOUR
+    return first > 1 and second > 0 and group.unread > MUCH_UNREAD and group.gain > 0.0
 
 
 def _score_borders(border: Mask, boundary: Probabilities, inside: Mask) -> float:

@@ -101,17 +101,16 @@ def test_an_outline_is_taken_from_both_sooner_than_a_way_to_part_objects() -> No
 @pytest.mark.parametrize(
     ("counts", "gain", "unread", "taken"),
     [
-        ((1, 2), 0.25, 0.0, True),
-        ((1, 2), 0.15, 0.0, False),
         ((0, 1), 0.25, 0.0, True),
-        ((2, 1), 0.9, 0.0, False),
+        ((0, 1), 0.15, 0.0, False),
         ((2, 1), 0.05, 0.15, True),
+        ((2, 3), 0.9, 0.05, False),
         ((2, 1), -0.05, 0.15, False),
-        ((1, 0), 0.05, 0.9, False),
-        ((1, 1), 0.9, 0.9, False),
+        ((2, 0), 0.05, 0.9, False),
+        ((1, 2), 0.9, 0.9, False),
     ],
 )
-def test_the_net_alone_parts_objects_and_decides_where_a_sensor_reads_little(
+def test_the_net_alone_adds_objects_and_decides_of_several_where_a_sensor_reads_little(
     counts: tuple[int, int], gain: float, unread: float, taken: bool
 ) -> None:
     assert prefer_net(Comparison(counts, gain, unread)) is taken
