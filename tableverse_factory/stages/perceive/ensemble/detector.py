@@ -1,7 +1,7 @@
 """The detector `ensemble`: each group by depth, by the net, or by both, as the boundaries that the net sees decide."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -56,8 +56,9 @@ def detect_with_ensemble(view: TableView, config: Config, services: Services) ->
     seen = predict_view(view, config.perceive.detector_weights)
     boundary = upsample_map(seen.boundary, view.valid.shape)
     unread, fused = view.observation.depth <= 0, detect_fused(view, seen)
-    answer = _choose_answers(detect_from_depth(view, config, services), fused, boundary, unread, prefer_fused)
-    answer = _choose_answers(answer, detect_predicted(view, seen), boundary, unread, prefer_net)
+    by_depth = _choose_answers(detect_from_depth(view, config, services), fused, boundary, unread, prefer_fused)
+    answer = _choose_answers(by_depth, detect_predicted(view, seen), boundary, unread, prefer_net)
+    answer = contain_as(by_depth, answer)  # depth shows hollows better than the net alone
     return replace(answer, shown=fused.shown, table_top=find_label(seen, TABLE, view.valid.shape))
 
 
@@ -190,6 +191,37 @@ def _merge_answers(
     boxes = map(to_box, ndimage.find_objects(merged))
     boxed = (replace(candidate, box=box) for candidate, box in zip(candidates, boxes, strict=True))
     return DetectionResult(tuple(boxed), ids=merged)
+
+
+def contain_as(known: DetectionResult, answer: DetectionResult) -> DetectionResult:
+    """Contain the objects of an answer in one another as those of another, `known`, that most of their pixels are."""
+    ids, candidates = [_get_ids(each) for each in (known, answer)], answer.candidates
+    index_of = {candidate.instance: index for index, candidate in enumerate(candidates)}
+    holders: dict[int, int] = {}
+    for pair in _list_contained(known):
+        content, holder = (index_of.get(_find_successor(ids[0] == instance, ids[1])) for instance in pair)
+        if content is not None and holder is not None and content not in (holder, *_list_holders(holder, holders)):
+            holders.setdefault(content, holder)
+    order = sorted(range(len(candidates)), key=lambda index: len(_list_holders(index, holders)))
+    place = {index: k for k, index in enumerate(order)}  # containers come before their contents
+    found = (replace(candidates[index], container=place.get(holders.get(index, -1))) for index in order)
+    return replace(answer, candidates=tuple(found))
+
+
+def _find_successor(mask: Mask, ids: IdImage) -> int:
+    """Find the object that has most of the pixels of a mask, 0 if none has."""
+    counts = np.bincount(ids[mask], minlength=1)
+    best = int(counts.argmax())
+    return best if counts[best] > MIN_LEFT * mask.sum() else 0
+
+
+def _list_holders(index: int, holders: Mapping[int, int]) -> list[int]:
+    """List what holds an object, what holds that, and so on."""
+    found = []
+    while index in holders:
+        index = holders[index]
+        found.append(index)
+    return found
 
 
 def _list_left(ids: IdImage, share: IdImage) -> list[int]:

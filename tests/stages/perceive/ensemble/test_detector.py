@@ -17,6 +17,7 @@ from tableverse_factory.stages.perceive.ensemble.detector import (
     Comparison,
     _merge_answers,
     compare_answers,
+    contain_as,
     detect_with_ensemble,
     group_objects,
     prefer_fused,
@@ -145,6 +146,35 @@ def test_ids_without_pixels_have_groups_too() -> None:
 
 
 BOX = (0.0, 0.0, 1.0, 1.0)
+
+
+def test_objects_lie_in_one_another_as_the_same_pixels_do_in_the_other_answer() -> None:
+    """A can in a bowl on a tray, which the other answer numbers and orders otherwise; and two that are one there."""
+    known = DetectionResult(
+        tuple(Candidate("object", 1.0, BOX, k, holder) for k, holder in ((1, None), (2, 0), (3, 1), (4, 0), (5, 3))),
+        ids=np.array([[1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 5]], dtype=np.int32),
+    )
+    ids = np.array([[7, 7, 0, 5, 5, 5, 6, 6, 5, 2, 2, 2]], dtype=np.int32)
+    answer = DetectionResult(tuple(Candidate("object", 1.0, BOX, k) for k in (6, 5, 2, 7)), ids=ids)
+    found = contain_as(known, answer)
+    told = {
+        c.instance: None if c.container is None else found.candidates[c.container].instance for c in found.candidates
+    }
+    assert told == {7: None, 5: 7, 6: 5, 2: 7}
+    places = [candidate.instance for candidate in found.candidates]
+    assert places.index(7) < places.index(5) < places.index(6)
+    assert np.array_equal(found.ids, ids)
+
+
+def test_what_would_lie_in_itself_lies_in_nothing() -> None:
+    known = DetectionResult(
+        tuple(Candidate("object", 1.0, BOX, k, holder) for k, holder in ((1, None), (2, 0), (3, 1))),
+        ids=np.array([[1, 1, 2, 2, 3, 3]], dtype=np.int32),
+    )
+    answer = DetectionResult(
+        tuple(Candidate("object", 1.0, BOX, k) for k in (1, 2)), ids=np.array([[1, 1, 2, 2, 1, 1]], dtype=np.int32)
+    )
+    assert [candidate.container for candidate in contain_as(known, answer).candidates] == [None, 0]
 
 
 def merge(
