@@ -1,10 +1,11 @@
 """`tableverse bench perception | placement | completion`: comparison of masks, poses and meshes with the truth."""
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -26,9 +27,11 @@ def bench_perception(
         ),
     ],
     detector: Annotated[
-        str, typer.Option(help="Detector to measure: ensemble, geometric, picture or replay.")
+        Literal["ensemble", "geometric", "picture", "replay"], typer.Option(help="Detector to measure.")
     ] = "ensemble",
-    weights: Annotated[str, typer.Option(metavar="FILE", help="Another .onnx file of our net.")] = "",
+    weights: Annotated[
+        str, typer.Option(metavar="FILE", help="Another .onnx file of our net, for ensemble and picture.")
+    ] = "",
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -45,17 +48,20 @@ def bench_perception(
     from tableverse_factory.sources.capture import COLOR_NAMES
     from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
 
+    if weights and detector in ("geometric", "replay"):
+        raise typer.BadParameter(f"--weights is for ensemble and picture: {detector} asks no net")
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
     scores = list(bench_masks(folder, load_config(config, chosen)))
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     rows = [*scores, merge_scores(scores)]
+    if untold := list_without(folder, COLOR_NAMES, TRUTH_NAMES):
+        names = ", ".join(sanitize_line(path.name) for path in untold)
+        print(f"without {' or '.join(TRUTH_NAMES)}: {names}", file=sys.stderr)
     if as_json:
         print_json([asdict(row) | _derive_scores(row) for row in rows])
     else:
         _show_masks(rows, detector)
-        if untold := list_without(folder, COLOR_NAMES, TRUTH_NAMES):
-            print(f"without {' or '.join(TRUTH_NAMES)}: {', '.join(sanitize_line(path.name) for path in untold)}")
         if list_captures(folder, [GROUND_TRUTH_NAME]):
             _show_placements(folder, (("replay", "carved"),), config, as_json=False)
 

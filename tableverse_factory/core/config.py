@@ -3,6 +3,7 @@
 import difflib
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,11 @@ _OVERRIDE_PREFIX = "--set or override: "  # Start of messages about overrides
 _TAG_ERRORS = (ValueError, KeyError, IndexError, AttributeError)  # of `!!bool maybe`, `!!int ''`, `!!timestamp x`
 
 
+_NUMBER_TAGS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
+
+
 class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML without aliases, which can blow up, and without repeated keys."""
+    """Safe YAML without aliases, which can blow up, repeated keys, and numbers of base 8 (010) and 60 (1:30)."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -46,6 +50,23 @@ class _StrictLoader(yaml.SafeLoader):
                 raise ConfigError(f"line {key.start_mark.line + 1}: key {represent(key.value)} stands twice")
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+# Of YAML 1.1 a leading zero means base 8, and colons base 60: no one means that of a seed or a length.
+_StrictLoader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _NUMBER_TAGS]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"[-+]?(0|[1-9][0-9_]*)$"), list("-+0123456789")
+)
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"
+    ),
+    list("-+0123456789."),
+)
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
@@ -64,11 +85,17 @@ def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), origin:
     try:
         return Config.model_validate(sections)
     except ValidationError as error:
+        found = error.errors()
         problems = [
             (_OVERRIDE_PREFIX if _is_overridden(problem["loc"], overridden) else origin, *_explain(problem))
-            for problem in error.errors()
+            for problem in found
+            if not any(_is_within(other["loc"], problem["loc"]) for other in found)  # a list lacks its wrong values
         ]
         raise ConfigError(_join_problems([*dict.fromkeys(problems)])) from None
+
+
+def _is_within(location: tuple[int | str, ...], outer: tuple[int | str, ...]) -> bool:
+    return len(location) > len(outer) and location[: len(outer)] == outer
 
 
 def _join_problems(problems: Sequence[tuple[str, str, str]]) -> str:

@@ -23,6 +23,7 @@ from tableverse_factory.core.storage.untrusted import (
     parse_json,
     read_bytes,
 )
+from tableverse_factory.geometry.math.camera import compute_field_of_view_deg
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
@@ -36,6 +37,7 @@ DEPTH_MODES = ("I;16", "I;16B", "I;16L")
 MAX_CAMERA_BYTES = 1024 * 1024
 MAX_DETECTION_BYTES = 16 * 1024 * 1024
 MAX_FOCAL_PX = 1e6
+FIELD_RANGE_DEG = (1.0, 160.0)  # of a camera without distortion, over the longer side; focal lengths in 0–1 span more
 MAX_DEPTH_SCALE = 10.0
 MAX_RECORDED_MESHES = 1024
 _RECORDED_MESH = re.compile(r"[1-9][0-9]{0,9}\.obj")
@@ -100,7 +102,12 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
     if size[0] != width or size[1] != height:
         sizes = f"{size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}"
         raise InputError(f"{CAMERA_NAME} is for {sizes}", "bad_intrinsics")
-    return Camera(fx, fy, cx, cy, width, height), depth_scale
+    camera = Camera(fx, fy, cx, cy, width, height)
+    field, (low, high) = compute_field_of_view_deg(camera), FIELD_RANGE_DEG
+    if not low <= field <= high:
+        given = f"fx = {fx:g} and fy = {fy:g} px for {width} x {height} pixels span {field:.4g}°"
+        raise InputError(f"{CAMERA_NAME}: {given}; give pixels, for {low:g}° to {high:g}°", "bad_intrinsics")
+    return camera, depth_scale
 
 
 def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> float:

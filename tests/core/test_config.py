@@ -58,6 +58,14 @@ def test_numbers_are_read_as_people_write_them(text):
     assert load_config(None, [f"rectify.clearance_m={text}"]).rectify.clearance_m == 0.001
 
 
+def test_numbers_are_decimal_and_a_wrong_value_of_a_list_is_told_once():
+    assert load_config(None, ["run.seed=010"]).run.seed == 10
+    assert load_config(None, ["rectify.clearance_m=1e-3"]).rectify.clearance_m == 1e-3
+    with pytest.raises(ConfigError) as told:
+        load_config(None, ["perceive.vocabulary=[Mug]"])
+    assert str(told.value).count("is not allowed") == 1
+
+
 @pytest.mark.parametrize(
     ("override", "words"),
     [
@@ -86,6 +94,7 @@ def test_numbers_are_read_as_people_write_them(text):
             "observe.table_distance_m=[a, 2]",
             ["observe.table_distance_m.0: 'a' is not allowed; give a number, more than"],
         ),
+        ("rectify.clearance_m=1:30", ["rectify.clearance_m", "'1:30'"]),
         ("perceive.vocabulary=[]", ["perceive.vocabulary: []", "a list of 1 to 200, each text"]),
         ("perceive.vocabulary=[Mug]", ["perceive.vocabulary.0: 'Mug' is not allowed; give text, that matches"]),
         ("run.seed=" + "9" * 5000, ["run.seed", "an integer of thousands of digits"]),

@@ -202,6 +202,14 @@ def test_a_hostile_capture_is_a_row_with_its_reason(tmp_path, reason):
     assert " at 0x" not in bad.rejected_detail, "an address in memory is another one in every run"
 
 
+@pytest.mark.parametrize("focal", [0.82, 1e5])
+def test_focal_lengths_that_are_no_pixels_are_told_so(tmp_path, focal):
+    write_capture(tmp_path / "bad", 1, fx=focal, fy=focal)
+    (row,) = rows_of(tmp_path)
+    assert row.rejected == "bad_intrinsics"
+    assert "give pixels, for 1° to 160°" in row.rejected_detail
+
+
 HOSTILE_LAYOUTS = {
     "bad_layout": {"id": "../../x"},
     "bad_layout ": {"scale": -1},

@@ -235,7 +235,7 @@ def compare_masks(name: str, truth: IdImage, found: IdImage, cpu_s: float, reaso
 
 def merge_scores(scores: list[MaskScore]) -> MaskScore:
     """Merge the scores of captures; means are over all true objects."""
-    scores = [score for score in scores if not score.unread]
+    total, scores = len(scores), [score for score in scores if not score.unread]
     known = [(c.true, c.found, c.correct) for c in (score.containment for score in scores) if c is not None]
     return MaskScore(
         "all",
@@ -246,6 +246,7 @@ def merge_scores(scores: list[MaskScore]) -> MaskScore:
         sum(s.found_pixels for s in scores),
         sum(s.true_pixels for s in scores),
         float(np.median([s.cpu_s for s in scores])) if scores else 0.0,
+        f"without {total - len(scores)} of {total} captures" if len(scores) < total else "",
         containment=Containment(*(sum(counts) for counts in zip(*known, strict=True))) if known else None,
     )
 

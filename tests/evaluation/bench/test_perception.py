@@ -172,7 +172,7 @@ def test_the_command_says_what_lies_in_what_in_json(tmp_path):
     write_look(tmp_path / "a", [bowl, block], contained_in={2: 1})
     (tmp_path / "untold").mkdir()
     (tmp_path / "untold" / "color.png").write_bytes((tmp_path / "a" / "color.png").read_bytes())
-    said = CliRunner().invoke(app, ["bench", "perception", str(tmp_path)]).stdout
+    said = CliRunner().invoke(app, ["bench", "perception", str(tmp_path)]).stderr
     assert "without seg.png or masks.png: untold" in said
     result = CliRunner().invoke(app, ["bench", "perception", str(tmp_path), "--json"])
     assert result.exit_code == 0, result.output
