@@ -22,7 +22,8 @@ class Section(BaseModel):
     @classmethod
     def _refuse_booleans(cls, value: object, info: ValidationInfo) -> object:
         # pydantic takes true for 1, and YAML takes yes and on for true
-        if isinstance(value, bool) and cls.model_fields[str(info.field_name)].annotation is not bool:
+        values = value if isinstance(value, list | tuple) else [value]
+        if cls.model_fields[str(info.field_name)].annotation is not bool and any(isinstance(v, bool) for v in values):
             raise PydanticCustomError("boolean", "give a number or a text")
         return value
 
@@ -138,9 +139,10 @@ class PerceiveConfig(RemoteModelSection):
     )
     """`auto` replays `detections.json` if the capture has one, with `masks.png` if it is there; else it is `ensemble`
     where a sensor measured depth, and `picture`, our own net, where a model estimated it. `geometric` is depth alone;
-    `ensemble` lets depth and the net decide together, for each group of objects that overlap or hold one another, where
-    that explains the picture better than depth alone; without a sensor it is `picture`. `grounding_dino` finds the
-    things of `vocabulary` by colour, `openai` is any server of OpenAI's chat completions, `gemini` Google's protocol.
+    `ensemble` takes, for each group of objects that overlap or hold one another, the answer of depth, of depth and the
+    net, or of the net, whichever explains the picture better; without a sensor it is `picture`. `grounding_dino` finds
+    the things of `vocabulary` by colour, `openai` is any server of OpenAI's chat completions, `gemini` Google's own
+    protocol.
     """
     detector_weights: Weights = ""
     """The `.onnx` file of `picture`, whose own is in the package; of `grounding_dino` a folder, or `owner/name` or

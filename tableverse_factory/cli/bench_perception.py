@@ -13,6 +13,8 @@ from tableverse_factory.cli.options import AsJson, ConfigFile
 from tableverse_factory.cli.tables import print_figures, print_json
 from tableverse_factory.core.text import sanitize_line
 
+MOST_NAMED = 8  # captures without a truth that are named
+
 if TYPE_CHECKING:
     from tableverse_factory.evaluation.bench.completion import CompletionScore
     from tableverse_factory.evaluation.bench.perception import MaskScore
@@ -43,7 +45,7 @@ def bench_perception(
     """
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.errors import InputError
-    from tableverse_factory.evaluation.bench.captures import list_captures, list_without
+    from tableverse_factory.evaluation.bench.captures import list_captures, list_captures_lacking
     from tableverse_factory.evaluation.bench.perception import TRUTH_NAMES, bench_masks, merge_scores
     from tableverse_factory.sources.capture import COLOR_NAMES
     from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
@@ -55,9 +57,10 @@ def bench_perception(
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     rows = [*scores, merge_scores(scores)]
-    if untold := list_without(folder, COLOR_NAMES, TRUTH_NAMES):
-        names = ", ".join(sanitize_line(path.name) for path in untold)
-        print(f"without {' or '.join(TRUTH_NAMES)}: {names}", file=sys.stderr)
+    if untold := list_captures_lacking(folder, COLOR_NAMES, TRUTH_NAMES):
+        names = [sanitize_line(path.name) for path in untold[:MOST_NAMED]]
+        more = f" and {len(untold) - MOST_NAMED} more" if len(untold) > MOST_NAMED else ""
+        print(f"without {' or '.join(TRUTH_NAMES)}: {', '.join(names)}{more}", file=sys.stderr)
     if as_json:
         print_json([asdict(row) | _derive_scores(row) for row in rows])
     else:

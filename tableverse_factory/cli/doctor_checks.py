@@ -41,10 +41,10 @@ EXTRAS = {  # of pyproject.toml, without `dev` and `docs`: packages and purpose
     "newton": (("newton",), "verify --engine newton"),
     "usd": (("usd-core",), "tableverse extract --format usd"),
     "models": (
-        ("torch", "transformers", "onnx"),
+        ("torch", "transformers"),
         "real models instead of the embedded ones, depth_anything_2 among them; tableverse train",
     ),
-    "training": (("cupy-cuda13x",), "tableverse train picture on a GPU"),
+    "training": (("cupy-cuda13x", "onnx"), "tableverse train picture on a GPU"),
     "bench": (("pandas",), "the comparison of tableverse bench with Ray Data"),
 }
 _SIMULATOR = """

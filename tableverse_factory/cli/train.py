@@ -77,6 +77,7 @@ def train_picture(
     from tableverse_factory.core.process_pool import count_available_cpus
 
     where = _prepare_training(device).kind
+    import_extra("onnx", "training", "training")
     if where == "cuda":
         import_extra("cupy", "rendering on a GPU", "training")
     from tableverse_factory.evaluation.training.picture.export import export_network
@@ -153,7 +154,7 @@ def train_policy(
 
     from tableverse_factory.core.errors import ConfigError
 
-    where = _prepare_training(device, ("torch", "safetensors")).kind
+    where = _prepare_training(device).kind
     from tableverse_factory.evaluation.training.policy.settings import PolicySettings
     from tableverse_factory.evaluation.training.policy.train import (
         TrainRun,
@@ -243,15 +244,12 @@ def _provide_pool(folder: Path, scenes: int, seed: int, jobs: int) -> Path:
     return path
 
 
-def _prepare_training(
-    device: Literal["auto", "cpu", "cuda"],
-    modules: tuple[str, ...] = ("torch", "safetensors", "onnx", "onnxruntime"),
-) -> "Device":
+def _prepare_training(device: Literal["auto", "cpu", "cuda"]) -> "Device":
     """Choose the device, and fail before any work if a package is missing."""
     from schemas.config import ModelsConfig
     from tableverse_factory.core.optional_imports import import_extra
     from tableverse_factory.models.local.device import select_device
 
-    for module in modules:
+    for module in ("torch", "safetensors"):
         import_extra(module, "training", "models")
     return select_device(ModelsConfig(device=device, precision="float32"), "--device")

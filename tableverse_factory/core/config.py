@@ -91,6 +91,7 @@ def build_config(tree: Mapping[str, Any], overrides: Sequence[str] = (), origin:
             for problem in found
             if not any(_is_within(other["loc"], problem["loc"]) for other in found)  # a list lacks its wrong values
         ]
+        # Of a list that is too short pydantic gives one problem for each value that it lacks
         raise ConfigError(_join_problems([*dict.fromkeys(problems)])) from None
 
 

@@ -94,6 +94,7 @@ def test_numbers_are_decimal_and_a_wrong_value_of_a_list_is_told_once():
             "observe.table_distance_m=[a, 2]",
             ["observe.table_distance_m.0: 'a' is not allowed; give a number, more than"],
         ),
+        ("observe.table_distance_m=[yes, 2]", ["observe.table_distance_m", "[True, 2]"]),
         ("rectify.clearance_m=1:30", ["rectify.clearance_m", "'1:30'"]),
         ("perceive.vocabulary=[]", ["perceive.vocabulary: []", "a list of 1 to 200, each text"]),
         ("perceive.vocabulary=[Mug]", ["perceive.vocabulary.0: 'Mug' is not allowed; give text, that matches"]),

@@ -11,9 +11,9 @@ def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
     return sorted(path for path in folder.iterdir() if _has_files(path, needed))
 
 
-def list_without(folder: Path, needed: Iterable[str], others: Iterable[str]) -> list[Path]:
-    """List the captures in `folder` that have a file of `needed` and none of `others`, sorted by name."""
-    return [path for path in list_captures(folder, needed) if find_file(path, others) is None]
+def list_captures_lacking(folder: Path, needed: Iterable[str], missing: Iterable[str]) -> list[Path]:
+    """List the captures in `folder` that have a file of `needed` and none of `missing`, sorted by name."""
+    return [path for path in list_captures(folder, needed) if find_file(path, missing) is None]
 
 
 def find_file(capture: Path, names: Iterable[str]) -> Path | None:

@@ -23,9 +23,12 @@ def rescale_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def compute_field_of_view_deg(camera: Camera) -> float:
-    """Compute the angle that the longer side of the picture spans [°]."""
-    size, focal = max((camera.width, camera.fx), (camera.height, camera.fy))
-    return float(np.degrees(2.0 * np.arctan(size / (2.0 * focal))))
+    """Compute the angle that the longer side of the picture spans [°]; the principal point may be anywhere."""
+    size, focal, center = camera.width, camera.fx, camera.cx
+    if camera.height > camera.width:
+        size, focal, center = camera.height, camera.fy, camera.cy
+    before, behind = center + 0.5, size - 0.5 - center
+    return float(np.degrees(np.arctan(before / focal) + np.arctan(behind / focal)))
 
 
 def backproject(depth: DepthImage, camera: Camera) -> Float64[np.ndarray, "h w 3"]:

@@ -1,5 +1,6 @@
 """Formatting of figures and codes for pages; unknown values become a dash. Templates use them as filters."""
 
+import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -130,8 +131,10 @@ def format_scale(row: Mapping[str, Any]) -> str:
 
 def format_camera(row: Mapping[str, Any]) -> str:
     """Format where the intrinsics of a scene's camera come from, and the angle of its view."""
-    name, field = CAMERA_NAMES.get(str(row.get("intrinsics_source")), DASH), row.get("field_of_view_deg")
-    return f"{name}, {field:.0f}° wide" if isinstance(field, float) else name
+    name, field = CAMERA_NAMES.get(str(row.get("intrinsics_source"))), row.get("field_of_view_deg")
+    if name is None:
+        return DASH
+    return f"{name}, {field:.0f}°" if isinstance(field, float) and math.isfinite(field) else name
 
 
 def format_code(text: str | None) -> str:

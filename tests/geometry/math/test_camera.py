@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas.geometry import Camera
-from tableverse_factory.geometry.math.camera import backproject, project
+from tableverse_factory.geometry.math.camera import backproject, compute_field_of_view_deg, project
 
 cameras = st.builds(
     Camera,
@@ -51,3 +51,9 @@ def test_a_far_plane_keeps_its_size():
     camera = Camera(300.0, 300.0, 160.0, 120.0, 320, 240)
     left, right = project(np.array([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]), camera)[:, 0]
     assert right - left == 150.0
+
+
+def test_the_field_of_view_is_the_angle_between_the_outer_borders() -> None:
+    assert compute_field_of_view_deg(Camera(320.0, 300.0, 319.5, 239.5, 640, 480)) == pytest.approx(90.0)
+    assert compute_field_of_view_deg(Camera(300.0, 320.0, 239.5, 319.5, 480, 640)) == pytest.approx(90.0)
+    assert compute_field_of_view_deg(Camera(640.0, 640.0, -0.5, 239.5, 640, 480)) == pytest.approx(45.0)

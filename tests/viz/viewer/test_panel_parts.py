@@ -315,7 +315,7 @@ def test_the_panel_tells_where_metres_come_from():
     row = {"scale_source": "measured", "scale_sigma": 0.0132, "intrinsics_source": "exif", "field_of_view_deg": 56.1}
     html = format_facts(row, {}, [], [], "")
     assert "measured by a known length, ±1.3 %<" in html
-    assert "from EXIF, 56° wide<" in html
+    assert "from EXIF, 56°<" in html
     near, far = (format_facts({**row, "scale_deviation": value}, {}, [], [], "") for value in (-2.7, 3.4))
     assert "±1.3 %, 2.7 standard deviations smaller than estimated<" in near
     assert "±1.3 %, 3.4 standard deviations larger than estimated: check the known length<" in far

@@ -25,7 +25,7 @@ def export_network(folder: Path, path: Path) -> float:
 
     It is relative to the largest value of each output; beyond `TOLERANCE` a `ModelError` is raised.
     """
-    onnx: Any = import_extra("onnx", "training", "models")
+    onnx: Any = import_extra("onnx", "training", "training")
     network = make_network(0)
     read_weights(folder / WEIGHTS, network)
     partial = path.with_suffix(".partial")

@@ -26,7 +26,7 @@ def read_start(path: Path, network: Any) -> bool:
     if path.suffix != ".onnx":
         read_weights(path, network)
         return False
-    onnx: Any = import_extra("onnx", "training", "models")
+    onnx: Any = import_extra("onnx", "training", "training")
     try:
         graph = onnx.load(path).graph
         _load_graph(graph, {each.name: onnx.numpy_helper.to_array(each) for each in graph.initializer}, network)

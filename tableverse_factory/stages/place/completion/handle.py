@@ -48,9 +48,12 @@ MAX_BRIDGE_M = 0.06
 BRIDGE_RADIUS_M = 0.005
 NEIGHBOURS = 8
 ALONG_AXIS = 0.5  # sine of the angle between axis and line of sight up to which a handle stands before the body
-MEDIAL_SHARE = 0.6  # of the half width, from which a pixel is amid the part
-LEAST_ASIDE = 0.7  # length of the mean way from the axis to a part's points, as a share of their mean distance
-LEAST_CROSSING = 0.3  # sine of the angle at which a ray must cross the plane of a part
+MAX_GAP_M = 0.06  # between what is seen of a part and what goes on of it: a cup's handle is seldom longer
+MEDIAL_SHARE = 0.6  # of the half width, from which a pixel is amid the part: balls of others would bulge the outline
+LEAST_ASIDE = 0.7  # mean of a part's points, as a share of their mean distance from the axis: a ring has no plane
+LEAST_CROSSING = (
+    0.3  # sine of the angle at which a ray must cross a part's plane: errors of the plane grow by its inverse
+)
 MOST_POINTS = 0.95  # share of a part's points that must lie near its plane
 MOST_MOVED = 0.35  # of a point's distance from the camera, into that plane
 
@@ -175,9 +178,11 @@ def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
     rays = points - view.eye
     centers = points + rays / np.linalg.norm(rays, axis=1)[:, None] * radius[:, None]
     part = _build_balls(view, centers, radius, carve=True)
+    if part is None:
+        return None
     unread = mask & view.unread & (inset > MEDIAL_SHARE * width)
     more, known = _continue_in_plane(view, unread, centers, axis)
-    if part is None or not len(more):
+    if not len(more):
         return part
     # Along their middle, as wide as the mask there: no free space cuts what the sensor does not see
     rest = _build_balls(view, more, _measure_radius(view, more, inset[unread][known]), carve=False)
@@ -208,7 +213,7 @@ def _continue_in_plane(
     crosses = np.abs(slope) > LEAST_CROSSING * np.linalg.norm(rays, axis=1)
     share = -(eye @ normal) / np.where(crosses, slope, 1.0)
     points = view.eye + rays * share[:, None]
-    near = np.isfinite(cKDTree(centers).query(points, distance_upper_bound=MAX_BRIDGE_M)[0])
+    near = np.isfinite(cKDTree(centers).query(points, distance_upper_bound=MAX_GAP_M)[0])
     known = (
         (np.linalg.norm(away) > LEAST_ASIDE * spread)
         & crosses

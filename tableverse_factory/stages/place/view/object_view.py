@@ -33,6 +33,7 @@ Distances = Float64[np.ndarray, " n"]
 WINDOW_MARGIN_PX = 24
 MIN_DEPTH_M = 0.01
 PAST_SLACK_M = 0.006
+LEAST_OWN = 0.05  # of the object's colours, from which a pixel's is one of them
 TOP_QUANTILE = 0.98  # of heights: flying pixels lie higher than an object's seen top
 BAND_M, UPRIGHT_SINE = 0.01, 0.5  # height of the band of upright sides that goes on under what hides the rest
 
@@ -48,7 +49,7 @@ class ObjectView(Frozen):
         camera: Intrinsics of the window: pixel (0, 0) is the window's corner.
         window: Rows and columns of the picture that the window shows.
         own: Pixels of the object, without those whose reading was smeared over its outline.
-        unread: Pixels that show the object where the sensor reads nothing, or what lies behind it.
+        unread: Pixels that show the object where a sensor reads nothing, or the support behind it.
         depth: Smoothed depth [m]; 0 where unknown.
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
@@ -98,7 +99,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     trusted = own & find_denoised_pixels(item.points_camera, window, raw)
     bleed = _find_bleed(trusted, raw, window, pose, support.height)
     own, trusted = own & ~bleed, trusted & ~bleed
-    shown = own | _find_own_colors(color, bleed, trusted, ids <= 0)
+    unread = (own & (raw <= 0.0)) | _find_own_colors(color, bleed, trusted, ids <= 0)
     trusted &= ~find_depth_ramps(raw, own, trusted, window)
     estimated = scene.observation.bend > 0.0
     if estimated:
@@ -121,7 +122,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
         camera_to_table=pose,
         window=(rows, columns),
         own=own,
-        unread=shown & (own_depth <= 0.0),
+        unread=unread & (not estimated),
         depth=np.where(own, own_depth, np.where(past, end, raw)),
         facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,
@@ -197,12 +198,12 @@ def _find_bleed(trusted: Mask, raw: DepthImage, window: Camera, camera_to_table:
 
 
 def _find_own_colors(color: Picture, pixels: Mask, own: Mask, beside: Mask) -> Mask:
-    """Find those of some pixels with colours of the object that what lies beside it lacks."""
+    """Find those of some pixels with colours of the object, of which what lies beside it has few."""
     found = np.zeros_like(pixels)
     if pixels.any() and own.any() and beside.any():
         shown = rgb2lab(color)
         on, off = (compute_color_share(shown[pixels], shown[of]) for of in (own, beside))
-        found[pixels] = on > RARITY * off
+        found[pixels] = (on > LEAST_OWN) & (on > RARITY * off)
     return found
 
 

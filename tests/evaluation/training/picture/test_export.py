@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
-onnx = pytest.importorskip("onnx", reason="the extra `models` is not installed")
+onnx = pytest.importorskip("onnx", reason="the extra `training` is not installed")
 from tableverse_factory.core.errors import ModelError  # noqa: E402
 from tableverse_factory.evaluation.training.checkpoint import WEIGHTS, read_weights, write_weights  # noqa: E402
 from tableverse_factory.evaluation.training.picture import export as export_module  # noqa: E402

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 torch = pytest.importorskip("torch", reason="the extra `models` is not installed")
-onnx = pytest.importorskip("onnx", reason="the extra `models` is not installed")
+onnx = pytest.importorskip("onnx", reason="the extra `training` is not installed")
 from tableverse_factory.core.errors import InputError  # noqa: E402
 from tableverse_factory.evaluation.training.checkpoint import WEIGHTS  # noqa: E402
 from tableverse_factory.evaluation.training.picture.network import Convolution, make_network  # noqa: E402

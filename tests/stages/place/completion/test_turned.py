@@ -141,7 +141,9 @@ def test_a_handle_goes_on_where_a_sensor_does_not_read_it(read: str) -> None:
     item = replace(item, points_camera=backproject(depth, observation.camera)[own & (depth > 0.0)])
     scene = replace(scene, observation=replace(observation, depth=depth, color=color), objects=(item,))
     supports = find_supports(scene.objects, scene.camera_to_table)
-    found = complete_by_carving(scene, view_object(scene, item, supports[item.object_id]))
+    view = view_object(scene, item, supports[item.object_id])
+    assert view.unread[lost[view.window]].mean() > 0.8
+    found = complete_by_carving(scene, view)
     solid = to_manifold(found.mesh)
     assert len(solid.decompose()) == 1
     assert solid.genus() >= 1, "the handle is broken"
