@@ -14,7 +14,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import ModelCost
 from schemas.pools import Pools
 from schemas.work import SandboxSetup
-from tableverse_factory.core.errors import BuildError, InputError
+from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, read_whole, remove_folder, write_atomic
 from tableverse_factory.dataset.card import make_dataset_card
 from tableverse_factory.dataset.consolidated_tables import remove_merged_tables, write_merged_tables
@@ -142,8 +142,6 @@ def _read_rows(request: BuildRequest) -> Sequence[ImageRow] | None:
     if request.manifest is None:
         return None
     rows = read_manifest(request.manifest)
-    if not rows:
-        raise InputError(f"{request.manifest} has no row: there is nothing to build")
     check_shards(request.shards, len(rows), request.config.run.shard_size)
     return rows
 

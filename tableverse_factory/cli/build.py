@@ -123,7 +123,7 @@ def report_summary(summary: "BuildSummary", out: str) -> None:
     elif state.remaining > tally.postponed:
         print(f"still to do: {left}; run it again, without --limit or --shards for all of them")
     if tally.before == tally.total:
-        print("nothing was left to do")
+        print("nothing was left to do" if tally.total else "the manifest has no row: this dataset is empty")
     planned = pluralize(state.total, "scene")
     print(f"{state.done} done, {state.dropped} dropped, {state.failed} failed of {planned}, in {out}")
     if state.done:

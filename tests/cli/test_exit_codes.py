@@ -41,6 +41,13 @@ def run(home: Path, *arguments: str, **variables: str) -> subprocess.CompletedPr
     return subprocess.run([*TABLEVERSE, *arguments], cwd=home, env=environment, capture_output=True, text=True)
 
 
+def test_a_build_of_an_empty_manifest_says_that_its_dataset_is_empty(home: Path, tmp_path: Path) -> None:
+    pq.write_table(pq.read_table(home / "images.parquet").slice(0, 0), tmp_path / "none.parquet")
+    ended = run(tmp_path, "build", "none.parquet", "new", "--executor", "local")
+    assert ended.returncode == 0
+    assert "the manifest has no row: this dataset is empty" in ended.stdout
+
+
 def pipeline(home: Path, line: str) -> tuple[list[int], str, str]:
     """Exit codes of a line of bash in which `T` stands for the command, its stdout and stderr."""
     ours = f"{sys.executable} -c '{TABLEVERSE[2]}'"
