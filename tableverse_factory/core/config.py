@@ -176,7 +176,7 @@ def describe_allowed_values(field: Mapping[str, Any]) -> str:
 
 def _describe_list(field: Mapping[str, Any]) -> str:
     """Describe a list by how many values it may have and what each is: `a list of 2, each a number, more than 0`."""
-    least, most = field.get("minItems", 0), field["maxItems"]
+    least, most = field.get("minItems", 0), field.get("maxItems", "any number")
     count = f"{most}" if least == most else f"{least} to {most}"
     return f"a list of {count}, each {describe_allowed_values(_find_item(field, 0))}"
 
