@@ -8,7 +8,7 @@ from manifold3d import CrossSection, FillRule, JoinType
 from scipy import ndimage
 from skimage.measure import find_contours
 
-from schemas.geometry import Pose
+from schemas.geometry import Points, Pose
 from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
 from tableverse_factory.stages.place.completion.ring_votes import (
     Cells,
@@ -23,9 +23,11 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 WALL_RANGE_M = (0.001, 0.012)
 USUAL_WALL_M = 0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls
 WALL_POINTS, LEAST_POINTS = 300, 30
+LIP_HEIGHT_M = 0.008  # next to the rim, over which a lip may turn outward and down: a rolled edge is lower
 LIP_M = 0.004  # height next to rim and floor over which a wall is not measured: both are rounded
 # Least height of a floor that the cavity's own wall hid: deep cups stand on a thick one or on a ring.
 HIDDEN_FLOOR_M = 0.004
+INWARD = 0.3  # most part of a normal that points away from the axis on the inside
 FLAT = 0.2  # most sideways part of the normal of a level floor
 FLOOR_SHARE = 0.9  # part of a cavity's radius within which level points are its floor
 FLOOR_CELLS = 2  # height above the lowest open cell up to which they are
@@ -40,6 +42,7 @@ LID_WIDTH = 0.6  # middle of a mouth, as a share of its radius
 LID_DEPTH = 0.25  # of a lid below the rim, as a share of the cavity's: a wall that slants up from the floor is no lid
 LID_POINTS = 20
 FLOOR_POINTS = 20
+CONTENTS_M = 0.002  # what rises further from the median of its ring lies in the vessel, or is noise [m]
 RESTING_M = 0.001  # most height of a wall's lowest part at which it rests on the support itself, without a foot [m]
 FOOT_RING_M = 0.0025  # least width of the ring on which a floor above the support stands [m]
 HOLLOW_FOOT_M = (0.0008, 0.008)  # hollow gaps below a floor: narrower ones are filled, taller ones are no foot ring
@@ -66,7 +69,8 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
                 body, hole = _build_solid(votes), _build_cavity(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
             if cavity is not None:
-                return _build_thin_wall(swollen, cavity, profile, outward, swelling * votes.band, is_upright(axis))
+                inside = points[outward < INWARD] if is_upright(axis) else None
+                return _build_thin_wall(swollen, cavity, profile, outward, inside, swelling * votes.band)
     section = _build_solid(votes)
     return None if section.is_empty() else (section, CrossSection())
 
@@ -115,12 +119,27 @@ def _measure_wall_across(hole: CrossSection, outer: Profile, low: float, high: f
     return float(np.clip(np.median(distance.min(axis=1)[beside]), *WALL_RANGE_M))
 
 
-def _measure_inside_height(votes: RingVotes, inner: Profile, mouth: float) -> float:
-    """Measure the least height of the seen inside over the support [m]: what rests there is no thicker."""
-    slices = np.floor(inner[:, 0] / SLICE_M).astype(int)
-    rows = [slices == k for k in range(int(mouth / SLICE_M))]
-    heights = [float(np.median(inner[row, 1])) for row in rows if row.sum() >= FLOOR_POINTS]
-    return min(heights, default=np.inf) - votes.bottom
+def _measure_inside_height(votes: RingVotes, inside: Points, mouth: float) -> float:
+    """Measure the least height of the seen inside over the support [m]: what rests there is no thicker.
+
+    A vessel that leans a little or is bent rests on few points, where its inside is lower than that of the whole ring.
+    `inside` are points about the axis, shape (n, 3) [m].
+    """
+    rings = np.floor(np.linalg.norm(inside[:, :2], axis=1) / SLICE_M).astype(int)
+    count = np.bincount(rings)
+    known = np.flatnonzero(count[: int(mouth / SLICE_M)] >= FLOOR_POINTS)
+    if len(known) == 0:
+        return np.inf
+    middle = np.full(len(count), np.inf)
+    middle[known] = [np.median(inside[rings == k, 2]) for k in known]
+    above = inside[:, 2] - middle[rings]
+    near = np.abs(above) < CONTENTS_M
+    x, y = inside[near, 0], inside[near, 1]
+    bends = np.stack([x, y, x**2 - y**2, 2 * x * y], axis=1)
+    rise = bends @ np.linalg.lstsq(bends, above[near], rcond=None)[0]
+    lowest = np.full(len(count), np.inf)
+    np.minimum.at(lowest, rings[near], rise)
+    return float((middle[known] + lowest[known]).min()) - votes.bottom
 
 
 def _build_thin_wall(
@@ -128,8 +147,8 @@ def _build_thin_wall(
     cavity: Cells,
     profile: Profile,
     outward: Float64[np.ndarray, " n"],
+    inside: Points | None,
     swelling: float,
-    upright: bool,
 ) -> tuple[CrossSection, CrossSection]:
     """Build the observed outer surface, else a wall around the cavity, with a foot below and the cavity removed."""
     outer = _find_outer_profile(votes, cavity, profile, outward)
@@ -139,21 +158,32 @@ def _build_thin_wall(
     seen = _build_cavity(votes, completed, swelling)
     wall = _measure_wall_across(seen, profile[outward > 0.3], floor_z + LIP_M, rim - LIP_M)
     mouth = votes.cell * float(cavity.sum(axis=0).max())
-    lowest = _measure_inside_height(votes, profile[outward < 0.3], mouth) if upright else np.inf
+    lowest = np.inf if inside is None else _measure_inside_height(votes, inside, mouth)
     wall = max(min(wall, lowest), WALL_RANGE_M[0])
     completed, floor_z = _complete_cavity(votes, cavity, outer, wall, flat)
     hole = _build_cavity(votes, completed, swelling)
     solid = hole.offset(wall, JoinType.Round, circular_segments=24)
+    carved = _build_solid(votes)
     if len(outer) >= 2:
-        solid = solid + _fill_profile(outer)
+        solid = solid + (_fill_profile(outer) - _find_lip_core(votes, carved, rim, wall))
     if lowest - wall > RESTING_M:
         solid = _add_foot(solid, votes, completed, outer, floor_z, wall)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
-    carved = _build_solid(votes)
     thin = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24)
     least = thin ^ _build_rectangle(2.0, votes.bottom, rim)
     sealed = hole - _build_rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
-    return (((solid ^ carved) + least) - sealed).simplify(DETAIL_M), sealed
+    return _fill_voids((((solid ^ carved) + least) - sealed).simplify(DETAIL_M)), sealed
+
+
+def _find_lip_core(votes: RingVotes, carved: CrossSection, rim: float, wall: float) -> CrossSection:
+    """Find what lies deeper than the wall below free space, next to the rim: a lip that turns outward is no thicker."""
+    free = _build_rectangle(2.0, votes.bottom - 1.0, rim + 1.0) - carved
+    return _build_rectangle(2.0, rim - LIP_HEIGHT_M, rim + LIP_M) - free.offset(wall, JoinType.Round, 0.0, 24)
+
+
+def _fill_voids(section: CrossSection) -> CrossSection:
+    """Fill what no way leads out of: the core of a lip thicker than its wall."""
+    return CrossSection([loop for loop in section.to_polygons() if _compute_signed_area(loop) > 0.0], FillRule.NonZero)
 
 
 def _add_foot(
@@ -291,5 +321,10 @@ def _build_rectangle(reach: float, low: float, high: float) -> CrossSection:
 
 
 def _compute_area(loop: Profile) -> float:
+    return abs(_compute_signed_area(loop))
+
+
+def _compute_signed_area(loop: Profile) -> float:
+    """Compute the area of a loop, negative for one that runs clockwise, about a void."""
     x, y = loop[:, 0], loop[:, 1]
-    return abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))) / 2
+    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2

@@ -20,6 +20,7 @@ from tableverse_factory.stages.place.completion.sheet import carve_sheet
 from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing, shows_cavity
 from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
+from tableverse_factory.stages.place.completion.warp import warp_to_depth
 from tableverse_factory.stages.place.interfaces import Completion
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -150,12 +151,24 @@ def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
         return None
     mesh, pose, misfit, hollow = fit
     cost = misfit - (HOLLOW_BONUS_M if hollow else 0.0)
-    return Draft(cost, lambda: (mesh, pose, cost))
+    draft = Draft(cost, lambda: (mesh, pose, cost))
+    # A solid stays round: in so much volume the deviation is little, and others stand on it
+    return _bend(view, draft) if hollow else draft
 
 
 def _draft_sheet(view: ObjectView, rays: RaySample) -> Draft | None:
     carved = carve_sheet(view)
-    return None if carved is None else _draft_carving(carved, rays, lambda _: 0.0)
+    return None if carved is None else _bend(view, _draft_carving(carved, rays, lambda _: 0.0))
+
+
+def _bend(view: ObjectView, draft: Draft) -> Draft:
+    """Let what the draft makes follow the seen surface, at the same cost: all kinds compete as they were fitted."""
+
+    def finish() -> Shape:
+        mesh, pose, cost = draft.finish()
+        return warp_to_depth(mesh, pose, view), pose, cost
+
+    return Draft(draft.least, finish)
 
 
 def _draft_carving(carved: CarvedSurface, rays: RaySample, price: Callable[[TriangleMesh], float]) -> Draft:

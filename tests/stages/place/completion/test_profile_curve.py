@@ -107,3 +107,32 @@ def test_a_foot_is_as_wide_as_the_outside_seen_below_the_floor(elevation):
     whole = complete(from_trimesh(trimesh.creation.revolve(outline, sections=96)), elevation)
     low = whole.vertices[whole.vertices[:, 2] < whole.vertices[:, 2].min() + 0.001]
     assert abs(np.linalg.norm(low[:, :2], axis=1).max() - 0.035) < 0.0025
+
+
+@pytest.mark.parametrize("elevation", [0.61, 0.87])
+def test_under_the_rolled_rim_of_a_plate_nothing_is_filled(elevation):
+    thickness = 0.0012
+    under = np.array([(0, 0), (0.07, 0), (0.085, 0.01), (0.12, 0.0225), (0.1255, 0.0222), (0.1275, 0.0195)])
+    outline = np.vstack([under, under[::-1] + np.array([0.0, thickness])])
+    plate = complete(from_trimesh(trimesh.creation.revolve(outline, sections=96)), elevation)
+    for radius in (0.116, 0.122):
+        starts = [np.array([radius * np.cos(a), radius * np.sin(a), 0.0]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+        found = np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.04) for start in starts])
+        assert abs(found - thickness) < 0.0006, radius
+
+
+@pytest.mark.parametrize("elevation", [0.61, 0.87])
+def test_a_plate_that_rests_on_two_points_is_no_thicker_than_its_lowest(elevation):
+    thickness = 0.0012
+    under = np.array([(0.0, 0.0), (0.07, 0.0), (0.085, 0.01), (0.12, 0.022)])
+    outline = np.vstack([under, under[::-1] + np.array([0.0, thickness])])
+    round_plate = trimesh.creation.revolve(outline, sections=96)
+    x, y, z = round_plate.vertices.T
+    bent = z + 0.2 * (x**2 - y**2)
+    bent -= bent.min()
+    plate = complete(
+        from_trimesh(trimesh.Trimesh(np.stack([x, y, bent], axis=1), round_plate.faces, process=False)), elevation
+    )
+    starts = [np.array([0.05 * np.cos(a), 0.05 * np.sin(a), -0.005]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+    found = np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.05) for start in starts])
+    assert abs(found - thickness) < 0.0005
