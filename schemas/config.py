@@ -369,7 +369,7 @@ class RunConfig(Section):
     """Attempts of a stage that crashes, hangs or runs out of memory on a scene; errors are final."""
     deadline_s: Positive = 300.0
     """Wall time of one stage on one scene, unless its own section sets it [s]."""
-    memory_mb: Annotated[int, Field(ge=256)] = 6144
+    memory_mb: Annotated[int, Field(ge=256, le=4_194_304)] = 6144
     """Limit on the resident memory of the process that runs a stage [MB]."""
 
 

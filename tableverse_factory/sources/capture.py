@@ -103,11 +103,17 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
         sizes = f"{size[0]:g} x {size[1]:g} pixels, the picture is {width} x {height}"
         raise InputError(f"{CAMERA_NAME} is for {sizes}", "bad_intrinsics")
     camera = Camera(fx, fy, cx, cy, width, height)
+    check_field_of_view(camera, CAMERA_NAME)
+    return camera, depth_scale
+
+
+def check_field_of_view(camera: Camera, name: str) -> None:
+    """Raise `bad_intrinsics` unless a camera spans `FIELD_RANGE_DEG`; `name` says where it was given."""
     field, (low, high) = compute_field_of_view_deg(camera), FIELD_RANGE_DEG
     if not low <= field <= high:
-        given = f"fx = {fx:g} and fy = {fy:g} px for {width} x {height} pixels span {field:.4g}°"
-        raise InputError(f"{CAMERA_NAME}: {given}; give pixels, for {low:g}° to {high:g}°", "bad_intrinsics")
-    return camera, depth_scale
+        size = f"{camera.width} x {camera.height} pixels"
+        given = f"fx = {camera.fx:g} and fy = {camera.fy:g} px for {size} span {field:.4g}°"
+        raise InputError(f"{name}: {given}; give pixels, for {low:g}° to {high:g}°", "bad_intrinsics")
 
 
 def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> float:

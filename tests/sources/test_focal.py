@@ -11,6 +11,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from schemas.config import ObserveConfig
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.focal import LONGEST, SHORTEST, read_exif_focal
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.stages.observe.depth.rgb_image import MAX_SIDE_PX, read_rgb_image
@@ -170,6 +171,15 @@ def test_exif_goes_before_what_is_configured_for_all_and_that_before_the_usual_a
     path.write_bytes(jpeg())
     photo = read_rgb_image(str(path), BOUNDS)
     assert (photo.get_focal_px(1234.0), photo.intrinsics_source) == (1234.0, "assumed")
+
+
+@pytest.mark.parametrize("focal_px", [1.0, 1e6])
+def test_a_focal_length_that_no_camera_has_is_refused_by_its_name(tmp_path, focal_px):
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(jpeg())
+    with pytest.raises(InputError, match=r"observe\.focal_px: fx = .* give pixels, for 1° to 160°") as caught:
+        read_rgb_image(str(path), BOUNDS).get_focal_px(focal_px)
+    assert caught.value.reason == "bad_intrinsics"
 
 
 @pytest.mark.parametrize("orientation", [1, 6])

@@ -38,6 +38,7 @@ OPEN_LAYERS = 40
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 DISTANCE_M = 0.7
 NOISE_M = 0.001
+SIZE_RANGE_M = (0.005, 1.0)  # of what a camera at that distance sees whole, and as more than pixels [m]
 TABLE_HALF_M = 1.0
 
 
@@ -68,7 +69,7 @@ def bench_completion(
         raise InputError(f"{sanitize_line(str(folder))} holds no meshes: give a folder with *.obj in it")
     scores: list[CompletionScore] = []
     for index, path in enumerate(paths):
-        truth = stand_on_table(read_mesh(path.read_bytes(), path.name))
+        truth = stand_on_table(_read_scan(path))
         share, cavity = measure_cavity(truth)
         hollow = share >= HOLLOW_SHARE
         for view, (azimuth, elevation) in enumerate(views):
@@ -79,6 +80,16 @@ def bench_completion(
                 kept = 1.0 - float(contains_points(mesh, cavity).mean()) if hollow else float("nan")
                 scores.append(replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s))
     return scores
+
+
+def _read_scan(path: Path) -> TriangleMesh:
+    mesh = read_mesh(path.read_bytes(), path.name)
+    size = np.ptp(mesh.vertices, axis=0)
+    if size.min() <= 0.0 or not SIZE_RANGE_M[0] <= size.max() <= SIZE_RANGE_M[1]:
+        given, (low, high) = " x ".join(f"{side:g}" for side in size), SIZE_RANGE_M
+        name = sanitize_line(path.name)
+        raise InputError(f"{name} is {given} m: give a solid in metres, {low:g} to {high:g} m along its longest side")
+    return mesh
 
 
 def _complete_all(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, float]]:

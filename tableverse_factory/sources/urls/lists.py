@@ -59,6 +59,9 @@ class ListRow:
     problem: tuple[str, str] | None = None
 
 
+MANIFEST_COLUMNS = {"scene_id", "kind", "uri"}  # no list has them all
+
+
 @dataclass(frozen=True, slots=True)
 class UrlList:
     """Rows of a list in order, and the names of the ignored columns."""
@@ -143,6 +146,8 @@ def _parse_parquet(name: str, data: bytes) -> UrlList:
     try:
         with pq.ParquetFile(pa.BufferReader(data)) as file:
             schema = file.schema_arrow
+        if MANIFEST_COLUMNS.issubset(schema.names):
+            raise InputError(f"{name} is a manifest already: give it to tableverse build", "unreadable_list")
         known = _match_columns(name, schema.names)
         for given in known.values():
             if schema.names.count(given) > 1 or pa.types.is_nested(schema.field(given).type):

@@ -52,6 +52,17 @@ def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
     assert "holds no meshes: give a folder with *.obj in it\n" in err
 
 
+@pytest.mark.parametrize("size", [(60.0, 50.0, 40.0), (0.06, 0.05, 0.0)], ids=["millimetres", "flat"])
+def test_what_is_no_solid_in_metres_is_one_line(tmp_path, run, size):
+    box = trimesh.creation.box()
+    box.vertices *= size
+    (tmp_path / "box.obj").write_text(box.export(file_type="obj"))
+    code, out, err = run("bench", "completion", tmp_path)
+    assert (code, out) == (1, "")
+    assert "box.obj is " in err
+    assert "give a solid in metres, 0.005 to 1 m along its longest side" in err
+
+
 @pytest.mark.slow  # figures of a bench
 @pytest.mark.heavy
 def test_views_are_those_that_were_asked_for(tmp_path, run):

@@ -303,6 +303,12 @@ def test_a_column_of_no_text_is_refused(tmp_path, urls):
         read_list(str(tmp_path / "list.parquet"))
 
 
+def test_a_manifest_is_no_list(tmp_path):
+    write_manifest(tmp_path / "m.parquet", make_manifest([], BOUNDS).rows)
+    with pytest.raises(InputError, match="is a manifest already: give it to tableverse build"):
+        read_list(str(tmp_path / "m.parquet"))
+
+
 def test_what_is_no_text_in_a_list_is_a_row(tmp_path):
     path = tmp_path / "list.jsonl"
     path.write_text('{"url": 3}\n[1]\n{"url": "ftp://x", "licence": ["MIT"]}\nnonsense\n{"url": "ftp://x", "b": 1}\n')

@@ -13,7 +13,7 @@ from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.untrusted import parse_finite, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.camera import rescale_camera
-from tableverse_factory.sources.capture import MAX_CAMERA_BYTES, MAX_FOCAL_PX, Capture
+from tableverse_factory.sources.capture import MAX_CAMERA_BYTES, MAX_FOCAL_PX, Capture, check_field_of_view
 from tableverse_factory.sources.content_hash import CAMERA_SUFFIX, DEPTH_SUFFIX, find_sidecars
 from tableverse_factory.stages.observe.depth.estimate import MODEL_BEND, DepthEstimate, build_capture
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
@@ -73,7 +73,9 @@ def read_recorded_camera(uri: str) -> tuple[Camera, float]:
     fx, fy = (_read_number(name, value, key, 1e-3, MAX_FOCAL_PX) for key in ("fx", "fy"))
     cx, cy = _read_number(name, value, "cx", -0.5, width - 0.5), _read_number(name, value, "cy", -0.5, height - 0.5)
     bend = _read_number(name, value, "bend", 0.0, MAX_BEND) if "bend" in value else MODEL_BEND
-    return Camera(fx, fy, cx, cy, width, height), bend
+    camera = Camera(fx, fy, cx, cy, width, height)
+    check_field_of_view(camera, name)
+    return camera, bend
 
 
 def _get_file_name(uri: str) -> str:

@@ -7,9 +7,10 @@ import numpy as np
 from PIL import Image
 
 from schemas.config import ObserveConfig
-from schemas.geometry import Frozen, Picture
+from schemas.geometry import Camera, Frozen, Picture
 from schemas.observation import IntrinsicsSource
 from tableverse_factory.core.storage.untrusted import open_image, read_bytes
+from tableverse_factory.sources.capture import check_field_of_view
 from tableverse_factory.sources.focal import read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
 
@@ -31,11 +32,18 @@ class RgbImage(Frozen):
         return "assumed" if self.exif_px is None else "exif"
 
     def get_focal_px(self, configured: float | None) -> float:
-        """Return the focal length for `color` [px]: from EXIF, as configured for the file's size, or the usual one."""
+        """Return the focal length for `color` [px]: from EXIF, as configured for the file's size, or the usual one.
+
+        Raises:
+            InputError: reason `bad_intrinsics`, if the configured one spans no angle that cameras have.
+        """
         if self.exif_px is not None:
             return self.exif_px
         if configured is not None:
-            return configured * self.scale
+            focal, (height, width) = configured * self.scale, self.color.shape[:2]
+            centered = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+            check_field_of_view(centered, "observe.focal_px")
+            return focal
         return self.get_field_px(USUAL_FIELD_DEG)
 
     def get_field_px(self, field_deg: float) -> float:

@@ -152,7 +152,18 @@ def test_an_array_that_claims_more_than_its_file_holds_is_refused(tmp_path, view
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"fx": -1.0}, {"cx": 9999.0}, {"fy": "525"}, {"width": 0}, {"bend": 5.0}, {"fx": None}], ids=str
+    "wrong",
+    [
+        {"fx": -1.0},
+        {"cx": 9999.0},
+        {"fy": "525"},
+        {"width": 0},
+        {"bend": 5.0},
+        {"fx": None},
+        {"fx": 10.0, "fy": 10.0},
+        {"fx": 1e5, "fy": 1e5},
+    ],
+    ids=str,
 )
 def test_a_recorded_camera_that_cannot_be_is_a_reason(tmp_path, view, wrong):
     as_picture(tmp_path, view, **wrong)

@@ -7,6 +7,7 @@ import trimesh
 from schemas.geometry import TriangleMesh
 from tableverse_factory.evaluation.bench.completion import contains_points, render_noisy_view
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.ray_misfit import sample_rays
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.view.object_view import view_object
@@ -136,3 +137,22 @@ def test_a_plate_that_rests_on_two_points_is_no_thicker_than_its_lowest(elevatio
     starts = [np.array([0.05 * np.cos(a), 0.05 * np.sin(a), -0.005]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
     found = np.mean([measure_solid(plate, start, np.array([0.0, 0.0, 1.0]), 0.05) for start in starts])
     assert abs(found - thickness) < 0.0005
+
+
+@pytest.mark.parametrize("elevation", [0.5, 0.8])
+def test_a_lip_thicker_than_the_wall_is_solid(elevation):
+    outline = np.array([(0, 0), (0.05, 0), (0.06, 0.05), (0.071, 0.05), (0.071, 0.062), (0.057, 0.062), (0.047, 0.004)])
+    bowl = complete(from_trimesh(trimesh.creation.revolve(np.vstack([outline, (0, 0.004)]), sections=96)), elevation)
+    assert len(to_manifold(bowl).decompose()) == 1
+
+
+def test_what_lies_in_a_bowl_does_not_thin_its_wall():
+    wall = 0.005
+    outline = np.array([(0, 0), (0.05, 0), (0.08, 0.05), (0.08 - wall, 0.05), (0.05 - wall, wall), (0, wall)])
+    bowl = trimesh.creation.revolve(outline, sections=96)
+    lump = trimesh.creation.icosphere(radius=0.015)
+    lump.apply_translation([0.02, 0.012, wall + 0.012])
+    whole = complete(from_trimesh(trimesh.util.concatenate([bowl, lump])), elevation=0.9)
+    directions = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
+    found = np.mean([measure_solid(whole, np.array([0.0, 0.0, 0.04]), along, 0.1) for along in directions])
+    assert abs(found - wall) < 0.001

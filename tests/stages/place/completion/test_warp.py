@@ -70,3 +70,20 @@ def test_a_solid_stays_round():
     heights = found.mesh.vertices[away > 0.03, 2]
     rings = [side[np.abs(heights - z) < 1e-6] for z in np.unique(heights.round(6))]
     assert max(float(np.ptp(ring)) for ring in rings) < 1e-5
+
+
+@pytest.mark.parametrize(("wall", "floor"), [(0.002, 0.004), (0.002, 0.012), (0.004, 0.012)])
+@pytest.mark.parametrize("elevation", [0.7, 1.1])
+def test_a_cup_stands_on_the_table(wall, floor, elevation):
+    outline = [(0, 0), (0.04, 0), (0.04, 0.07), (0.04 - wall, 0.07), (0.04 - wall, floor), (0, floor)]
+    scene = render_noisy_view(
+        [from_trimesh(trimesh.creation.revolve(np.array(outline), sections=64))],
+        0.7,
+        elevation,
+        np.random.default_rng(3),
+    )
+    support = find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
+    found = complete_by_carving(scene, view_object(scene, scene.objects[0], support))
+    assert found.pose is not None
+    lowest = place_mesh(found.mesh, found.pose, 1.0).vertices[:, 2].min()
+    assert support.height - 1e-6 < lowest < support.height + 0.001
