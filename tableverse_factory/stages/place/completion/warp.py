@@ -71,9 +71,9 @@ def _smooth_shifts(at: Points, shift: Float64[np.ndarray, "n 3"], vertices: Poin
     The weights fall to zero at the reach, so that neighbouring vertices move alike.
     """
     _, node, count = np.unique(np.floor(at / NODE_M), axis=0, return_inverse=True, return_counts=True)
-    sums = np.zeros((2, len(count), 3))
-    np.add.at(sums, (slice(None), node.ravel()), np.stack([at, shift]))
-    middle, mean = sums / count[:, None]
+    sums = np.zeros((len(count), 6))
+    np.add.at(sums, node.ravel(), np.hstack([at, shift]))
+    middle, mean = np.hsplit(sums / count[:, None], 2)
     pairs = cKDTree(vertices).sparse_distance_matrix(cKDTree(middle), REACH_M, output_type="coo_matrix")
     kernel = pairs.tocsr()
     kernel.data = (1.0 - (kernel.data / REACH_M) ** 2) ** 2
