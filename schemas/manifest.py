@@ -9,6 +9,8 @@ from schemas.cousins import RecipeText
 from schemas.identity import SAFE_ID, SafeId
 from schemas.known_length import KnownLengthText
 
+REQUIRED_COLUMNS = ("scene_id", "kind", "uri")  # of a manifest; other columns may be missing
+
 
 class SceneKind(StrEnum):
     """Kind of input that a manifest row points at (see docs/formats.md)."""

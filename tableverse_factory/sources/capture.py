@@ -23,8 +23,8 @@ from tableverse_factory.core.storage.untrusted import (
     parse_json,
     read_bytes,
 )
-from tableverse_factory.geometry.math.camera import compute_field_of_view_deg
 from tableverse_factory.geometry.mesh.meshes import read_mesh
+from tableverse_factory.sources.focal import check_field_of_view
 
 COLOR_NAMES = ("color.png", "color.jpg", "color.jpeg")
 DEPTH_NAME = "depth.png"
@@ -37,7 +37,6 @@ DEPTH_MODES = ("I;16", "I;16B", "I;16L")
 MAX_CAMERA_BYTES = 1024 * 1024
 MAX_DETECTION_BYTES = 16 * 1024 * 1024
 MAX_FOCAL_PX = 1e6
-FIELD_RANGE_DEG = (1.0, 160.0)  # of a camera without distortion, over the longer side; focal lengths in 0–1 span more
 MAX_DEPTH_SCALE = 10.0
 MAX_RECORDED_MESHES = 1024
 _RECORDED_MESH = re.compile(r"[1-9][0-9]{0,9}\.obj")
@@ -105,15 +104,6 @@ def read_camera(folder: str, width: int, height: int) -> tuple[Camera, float]:
     camera = Camera(fx, fy, cx, cy, width, height)
     check_field_of_view(camera, CAMERA_NAME)
     return camera, depth_scale
-
-
-def check_field_of_view(camera: Camera, name: str) -> None:
-    """Raise `bad_intrinsics` unless a camera spans `FIELD_RANGE_DEG`; `name` says where it was given."""
-    field, (low, high) = compute_field_of_view_deg(camera), FIELD_RANGE_DEG
-    if not low <= field <= high:
-        size = f"{camera.width} x {camera.height} pixels"
-        given = f"fx = {camera.fx:g} and fy = {camera.fy:g} px for {size} span {field:.4g}°"
-        raise InputError(f"{name}: {given}; give pixels, for {low:g}° to {high:g}°", "bad_intrinsics")
 
 
 def _read_number(value: dict[str, Any], key: str, low: float, high: float) -> float:

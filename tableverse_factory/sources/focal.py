@@ -1,4 +1,4 @@
-"""Focal length of a picture from its EXIF data."""
+"""Focal lengths: that of a picture from its EXIF data, and the angles that cameras have."""
 
 import math
 import struct
@@ -8,8 +8,13 @@ from typing import Any
 
 from PIL import Image
 
+from schemas.geometry import Camera
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.geometry.math.camera import compute_field_of_view_deg
+
 DIAGONAL_35MM = math.hypot(36.0, 24.0)  # diagonal of the film of "35 mm equivalent" [mm] (CIPA DCG-001)
 SHORTEST, LONGEST = 0.2, 50.0  # plausible focal lengths, in longer sides: fisheyes and telescopes lie outside
+FIELD_RANGE_DEG = (1.0, 160.0)  # of a camera without distortion, over the longer side; focal lengths in 0–1 span more
 MAX_ASPECT_CHANGE = 0.02
 _EXIF_IFD = 0x8769
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
@@ -46,6 +51,15 @@ def read_exif_focal(image: Image.Image) -> ExifFocal:
         if px is not None and SHORTEST * longer <= px <= LONGEST * longer:
             return ExifFocal(px)
     return ExifFocal(ignored="EXIF focal length that cannot be used")
+
+
+def check_field_of_view(camera: Camera, name: str) -> None:
+    """Raise `bad_intrinsics` unless a camera spans `FIELD_RANGE_DEG`; `name` says where it was given."""
+    field, (low, high) = compute_field_of_view_deg(camera), FIELD_RANGE_DEG
+    if not low <= field <= high:
+        size = f"{camera.width} x {camera.height} pixels"
+        given = f"fx = {camera.fx:g} and fy = {camera.fy:g} px for {size} span {field:.4g}°"
+        raise InputError(f"{name}: {given}; give pixels, for {low:g}° to {high:g}°", "bad_intrinsics")
 
 
 def _read_tags(image: Image.Image) -> dict[int, Any]:

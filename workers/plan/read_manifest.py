@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from schemas.error_text import describe_validation_error
-from schemas.manifest import ImageRow, SceneKind
+from schemas.manifest import REQUIRED_COLUMNS, ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import InputError, StoreError
 from tableverse_factory.core.storage.files import StoragePath
@@ -21,7 +21,6 @@ from tableverse_factory.core.storage.parquet import open_parquet
 from tableverse_factory.dataset.columns import HashIndex, TextColumn
 from tableverse_factory.dataset.image_rows import BATCH_ROWS, ImageRows, find_valid
 
-REQUIRED_COLUMNS = ("scene_id", "kind", "uri")
 _MAX_TEXT = 500
 _DUPLICATE = "duplicate-"
 

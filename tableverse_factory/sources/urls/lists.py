@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from schemas.known_length import MAX_CHARS as MAX_KNOWN_LENGTH_CHARS
+from schemas.manifest import REQUIRED_COLUMNS
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.untrusted import parse_json, read_bytes
@@ -57,9 +58,6 @@ class ListRow:
     licence: str = ""
     known_length: str = ""
     problem: tuple[str, str] | None = None
-
-
-MANIFEST_COLUMNS = {"scene_id", "kind", "uri"}  # no list has them all
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +144,7 @@ def _parse_parquet(name: str, data: bytes) -> UrlList:
     try:
         with pq.ParquetFile(pa.BufferReader(data)) as file:
             schema = file.schema_arrow
-        if MANIFEST_COLUMNS.issubset(schema.names):
+        if set(REQUIRED_COLUMNS).issubset(schema.names):
             raise InputError(f"{name} is a manifest already: give it to tableverse build", "unreadable_list")
         known = _match_columns(name, schema.names)
         for given in known.values():

@@ -13,8 +13,9 @@ from tableverse_factory.core.storage.files import redact_uri
 from tableverse_factory.core.storage.untrusted import parse_finite, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.math.camera import rescale_camera
-from tableverse_factory.sources.capture import MAX_CAMERA_BYTES, MAX_FOCAL_PX, Capture, check_field_of_view
+from tableverse_factory.sources.capture import MAX_CAMERA_BYTES, MAX_FOCAL_PX, Capture
 from tableverse_factory.sources.content_hash import CAMERA_SUFFIX, DEPTH_SUFFIX, find_sidecars
+from tableverse_factory.sources.focal import check_field_of_view
 from tableverse_factory.stages.observe.depth.estimate import MODEL_BEND, DepthEstimate, build_capture
 from tableverse_factory.stages.observe.depth.rgb_image import read_rgb_image
 

@@ -10,8 +10,7 @@ from schemas.config import ObserveConfig
 from schemas.geometry import Camera, Frozen, Picture
 from schemas.observation import IntrinsicsSource
 from tableverse_factory.core.storage.untrusted import open_image, read_bytes
-from tableverse_factory.sources.capture import check_field_of_view
-from tableverse_factory.sources.focal import read_exif_focal
+from tableverse_factory.sources.focal import check_field_of_view, read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
 
 MAX_SIDE_PX = 2048  # larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest

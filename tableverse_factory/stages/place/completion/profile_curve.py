@@ -27,7 +27,7 @@ LIP_HEIGHT_M = 0.008  # next to the rim, over which a lip may turn outward and d
 LIP_M = 0.004  # height next to rim and floor over which a wall is not measured: both are rounded
 # Least height of a floor that the cavity's own wall hid: deep cups stand on a thick one or on a ring.
 HIDDEN_FLOOR_M = 0.004
-INWARD = 0.3  # most part of a normal that points away from the axis on the inside
+OUTWARD = 0.3  # part of a normal that points away from the axis, from which it is one of the outside
 FLAT = 0.2  # most sideways part of the normal of a level floor
 FLOOR_SHARE = 0.9  # part of a cavity's radius within which level points are its floor
 FLOOR_CELLS = 2  # height above the lowest open cell up to which they are
@@ -69,7 +69,7 @@ def fit_profile(view: ObjectView, axis: Pose) -> tuple[CrossSection, CrossSectio
                 body, hole = _build_solid(votes), _build_cavity(swollen, cavity, swelling * votes.band)
                 return body - hole, hole
             if cavity is not None:
-                inside = points[outward < INWARD] if is_upright(axis) else None
+                inside = points[outward < OUTWARD] if is_upright(axis) else None
                 return _build_thin_wall(swollen, cavity, profile, outward, inside, swelling * votes.band)
     section = _build_solid(votes)
     return None if section.is_empty() else (section, CrossSection())
@@ -156,21 +156,20 @@ def _build_thin_wall(
     flat = profile[np.abs(outward) < FLAT]
     completed, floor_z = _complete_cavity(votes, cavity, outer, USUAL_WALL_M, flat)
     seen = _build_cavity(votes, completed, swelling)
-    wall = _measure_wall_across(seen, profile[outward > 0.3], floor_z + LIP_M, rim - LIP_M)
+    wall = _measure_wall_across(seen, profile[outward > OUTWARD], floor_z + LIP_M, rim - LIP_M)
     mouth = votes.cell * float(cavity.sum(axis=0).max())
     lowest = np.inf if inside is None else _measure_inside_height(votes, inside, mouth)
     wall = max(min(wall, lowest), WALL_RANGE_M[0])
     completed, floor_z = _complete_cavity(votes, cavity, outer, wall, flat)
     hole = _build_cavity(votes, completed, swelling)
-    solid = hole.offset(wall, JoinType.Round, circular_segments=24)
+    solid = _swell(hole, wall)
     carved = _build_solid(votes)
     if len(outer) >= 2:
         solid = solid + (_fill_profile(outer) - _find_lip_core(votes, carved, rim, wall))
     if lowest - wall > RESTING_M:
         solid = _add_foot(solid, votes, completed, outer, floor_z, wall)
     # Free space seen from outside limits all guesses; a wall of the least thickness stays whatever the noise.
-    thin = hole.offset(WALL_RANGE_M[0], JoinType.Round, circular_segments=24)
-    least = thin ^ _build_rectangle(2.0, votes.bottom, rim)
+    least = _swell(hole, WALL_RANGE_M[0]) ^ _build_rectangle(2.0, votes.bottom, rim)
     sealed = hole - _build_rectangle(2.0, votes.bottom - 1.0, votes.bottom + WALL_RANGE_M[0])
     return _fill_voids((((solid ^ carved) + least) - sealed).simplify(DETAIL_M)), sealed
 
@@ -178,7 +177,7 @@ def _build_thin_wall(
 def _find_lip_core(votes: RingVotes, carved: CrossSection, rim: float, wall: float) -> CrossSection:
     """Find what lies deeper than the wall below free space, next to the rim: a lip that turns outward is no thicker."""
     free = _build_rectangle(2.0, votes.bottom - 1.0, rim + 1.0) - carved
-    return _build_rectangle(2.0, rim - LIP_HEIGHT_M, rim + LIP_M) - free.offset(wall, JoinType.Round, 0.0, 24)
+    return _build_rectangle(2.0, rim - LIP_HEIGHT_M, rim + LIP_M) - _swell(free, wall)
 
 
 def _fill_voids(section: CrossSection) -> CrossSection:
@@ -227,7 +226,7 @@ def _build_solid(votes: RingVotes) -> CrossSection:
 def _build_cavity(votes: RingVotes, cavity: Cells, swelling: float) -> CrossSection:
     inner = np.where(cavity, np.where(np.isnan(votes.field), -votes.band, np.minimum(votes.field, 0.0)), votes.band)
     inner = np.where(~cavity & (votes.field > 0.0), votes.field, inner)
-    return _trace_outline(inner, votes, open_top=True).offset(swelling, JoinType.Round, circular_segments=24)
+    return _swell(_trace_outline(inner, votes, open_top=True), swelling)
 
 
 def _find_outer_profile(
@@ -243,7 +242,7 @@ def _find_outer_profile(
     lowest = int(np.flatnonzero(reach)[0])
     reach[max(lowest - FLOOR_CELLS, 0) : lowest] = reach[lowest]
     row = np.clip(((profile[:, 1] - votes.bottom) / votes.cell).astype(int), 0, len(reach) - 1)
-    outer = (outward > 0.3) & (profile[:, 0] > reach[row] + votes.cell)
+    outer = (outward > OUTWARD) & (profile[:, 0] > reach[row] + votes.cell)
     rows = [k for k in np.unique(slices[outer]) if (outer & (slices == k)).sum() >= 5]
     return np.array([[np.median(profile[outer & (slices == k), 0]), (k + 0.5) * SLICE_M] for k in rows]).reshape(-1, 2)
 
@@ -313,6 +312,10 @@ def _fill_profile(outer: Profile) -> CrossSection:
         left = right[::-1] * np.array([-1.0, 1.0])
         section = section + CrossSection([np.vstack([right, left])], FillRule.NonZero)
     return section
+
+
+def _swell(section: CrossSection, distance: float) -> CrossSection:
+    return section.offset(distance, JoinType.Round, circular_segments=24)
 
 
 def _build_rectangle(reach: float, low: float, high: float) -> CrossSection:

@@ -152,7 +152,7 @@ def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
     mesh, pose, misfit, hollow = fit
     cost = misfit - (HOLLOW_BONUS_M if hollow else 0.0)
     draft = Draft(cost, lambda: (mesh, pose, cost))
-    # A solid stays round: in so much volume the deviation is little, and others stand on it
+    # Without a cavity it stays round: in so much volume the deviation is little, and others stand on it
     return _bend(view, draft) if hollow else draft
 
 
