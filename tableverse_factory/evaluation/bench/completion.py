@@ -16,12 +16,13 @@ from schemas.identity import make_object_id
 from schemas.objects import PerceivedObject, PerceivedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done
-from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.open3d_import import o3d
 from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.evaluation.bench.decompose import find_meshes
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import place_mesh, read_mesh
+from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, place_mesh, read_mesh
 from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 from tableverse_factory.geometry.mesh.voxel_solids import VoxelGrid, extract_surface, make_grid
 from tableverse_factory.models.services import Services
@@ -40,6 +41,7 @@ DISTANCE_M = 0.7
 NOISE_M = 0.001
 SIZE_RANGE_M = (0.005, 1.0)  # of what a camera at that distance sees whole, and as more than pixels [m]
 TABLE_HALF_M = 1.0
+SHOWN = 5  # bad meshes named in one message
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +66,14 @@ def bench_completion(
 
     A view is the azimuth and elevation of a camera [degrees].
     """
-    paths = sorted(folder.glob("*.obj"))
+    paths = find_meshes(folder, None)
     if not paths:
-        raise InputError(f"{sanitize_line(str(folder))} holds no meshes: give a folder with *.obj in it")
+        raise InputError(
+            f"{sanitize_line(str(folder))} holds no meshes: give a folder of {', '.join(MESH_SUFFIXES)} files"
+        )
     scores: list[CompletionScore] = []
-    for index, path in enumerate(paths):
-        truth = stand_on_table(_read_scan(path))
+    for index, (path, scan) in enumerate(zip(paths, _read_scans(paths), strict=True)):
+        truth = stand_on_table(scan)
         share, cavity = measure_cavity(truth)
         hollow = share >= HOLLOW_SHARE
         for view, (azimuth, elevation) in enumerate(views):
@@ -80,6 +84,20 @@ def bench_completion(
                 kept = 1.0 - float(contains_points(mesh, cavity).mean()) if hollow else float("nan")
                 scores.append(replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s))
     return scores
+
+
+def _read_scans(paths: Sequence[Path]) -> list[TriangleMesh]:
+    """Read all scans; an `InputError` names the bad ones together."""
+    scans, errors = [], []
+    for path in paths:
+        try:
+            scans.append(_read_scan(path))
+        except (InputError, GeometryError) as error:
+            errors.append(str(error))
+    if errors:
+        more = f"; and {len(errors) - SHOWN} more" if len(errors) > SHOWN else ""
+        raise InputError("; ".join(errors[:SHOWN]) + more)
+    return scans
 
 
 def _read_scan(path: Path) -> TriangleMesh:

@@ -49,17 +49,19 @@ def test_a_height_field_fills_all_below_the_points():
 def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
     code, out, err = run("bench", "completion", tmp_path)
     assert (code, out) == (1, "")
-    assert "holds no meshes: give a folder with *.obj in it\n" in err
+    assert "holds no meshes: give a folder of .obj, .ply, .stl, .glb files\n" in err
 
 
 @pytest.mark.parametrize("size", [(60.0, 50.0, 40.0), (0.06, 0.05, 0.0)], ids=["millimetres", "flat"])
 def test_what_is_no_solid_in_metres_is_one_line(tmp_path, run, size):
     box = trimesh.creation.box()
     box.vertices *= size
-    (tmp_path / "box.obj").write_text(box.export(file_type="obj"))
+    (tmp_path / "BOX.OBJ").write_text(box.export(file_type="obj"))
+    (tmp_path / "torn.stl").write_bytes(b"solid")
     code, out, err = run("bench", "completion", tmp_path)
     assert (code, out) == (1, "")
-    assert "box.obj is " in err
+    assert "BOX.OBJ is " in err
+    assert "torn.stl" in err
     assert "give a solid in metres, 0.005 to 1 m along its longest side" in err
 
 

@@ -1,5 +1,7 @@
 """Handles and spouts: parts outside a surface of revolution, as thick as they look wide."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float64
 from manifold3d import Manifold
@@ -34,6 +36,8 @@ from tableverse_factory.stages.place.completion.underside import compute_half_wi
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
 HANDLE_FREEDOM = 0.2  # cost of handles, as a share of the misfit that they remove: they complete only a good body
+MOST_TUNNELS = 5  # through a body with its handles: more are holes
+CLEAR_M = 0.0012  # misfit of all parts together up to which their holes are noise, and the depth is true [m]
 WORTH_HANDLES_M = 0.004  # misfit from which the body is wrong and the rest is no handle [m]
 MAX_FACES = 3200
 TOLERANCE_M = 0.00005
@@ -41,6 +45,7 @@ AWAY_M = 0.004  # distance outside the body from which points belong to another 
 FRAYED_PX = 2  # by which an outline that a net drew is ragged; a handle under twice that width is lost
 MIN_PIXELS = 30
 MIN_SHARE = 0.025
+MIN_REACH = 0.25  # of a part that a silhouette shows: its distance from the body, as a share of its extent
 RADIUS_RANGE_M = (0.002, 0.012)
 CELL_M = 0.0015
 MAX_CELLS = 250_000
@@ -71,11 +76,21 @@ def join_handles(
     mesh, pose = _center(body, axis)
     cost = compute_mesh_misfit(rays, mesh, pose)
     if cost < WORTH_HANDLES_M:
-        whole = _center(simplify_solid(_add_handles(view, body, hole, axis), MAX_FACES, TOLERANCE_M), axis)
+        solid = _add_handles(view, body, hole, axis)
+        whole = _center_simplified(solid, axis)
         better = compute_mesh_misfit(rays, *whole)
         if better < cost:
-            return *whole, better + HANDLE_FREEDOM * (cost - better)
+            explained = better + HANDLE_FREEDOM * (cost - better)
+            if solid.genus() <= MOST_TUNNELS or better < CLEAR_M:
+                return *whole, explained
+            # Errors of the depth tear what is swept along it, and not the silhouette
+            whole = _center_simplified(_add_handles(replace(view, estimated=True), body, hole, axis), axis)
+            return *(whole if compute_mesh_misfit(rays, *whole) < cost else (mesh, pose)), explained
     return mesh, pose, cost
+
+
+def _center_simplified(solid: Manifold, axis: Pose) -> tuple[TriangleMesh, Pose]:
+    return _center(simplify_solid(solid, MAX_FACES, TOLERANCE_M), axis)
 
 
 def _center(solid: Manifold, axis: Pose) -> tuple[TriangleMesh, Pose]:
@@ -119,12 +134,15 @@ def _find_protrusions(view: ObjectView, scene: RaycastingScene) -> IdImage:
 
     A sensor's points tell of them, which go on beside the silhouette where it reads nothing.
     """
-    beside = _find_uncovered(view, scene)
+    beside, from_body = _find_uncovered(view, scene)
     told = beside if view.estimated else _find_away(view, scene)
     labels, count = ndimage.label(told | (beside & view.unread))
     sizes = np.bincount(labels[told], minlength=count + 1)
     least = max(MIN_PIXELS, MIN_SHARE * float(view.own.sum()))
     kept = [k for k in range(1, count + 1) if sizes[k] >= least]
+    if view.estimated:
+        # A strip along the body is an error of its own
+        kept = [k for k in kept if float(from_body[labels == k].max()) > MIN_REACH * _measure_extent(labels == k)]
     number = np.zeros(count + 1, dtype=np.int32)
     number[kept] = np.arange(1, len(kept) + 1)
     return number[labels]
@@ -139,17 +157,24 @@ def _find_away(view: ObjectView, scene: RaycastingScene) -> Mask:
     return ndimage.binary_dilation(ndimage.binary_opening(mask), iterations=2) & view.own
 
 
-def _find_uncovered(view: ObjectView, scene: RaycastingScene) -> Mask:
-    """Find the object's pixels beside the body's silhouette, and those between.
+def _measure_extent(mask: Mask) -> float:
+    return float(np.linalg.norm(np.ptp(np.argwhere(mask), axis=0)))
+
+
+def _find_uncovered(view: ObjectView, scene: RaycastingScene) -> tuple[Mask, Float64[np.ndarray, "h w"]]:
+    """Find the object's pixels beside the body's silhouette, and those between, and how far all are from it [px].
 
     Of estimated depth they alone tell of a handle: it is off by more than that is thick.
     """
     rays, shown = pack_pixel_rays(view.camera, view.camera_to_table), view.own | view.unread
     covered = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
     away_px = AWAY_M * view.camera.fx / float(np.median(np.linalg.norm(view.points - view.eye, axis=1)))
-    beside = shown & (ndimage.distance_transform_edt(~covered) > away_px)
+    from_body = np.asarray(ndimage.distance_transform_edt(~covered))
+    beside = shown & (from_body > away_px)
     core = ndimage.binary_opening(beside, iterations=FRAYED_PX)
-    return ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & shown
+    whole = ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & shown
+    # A net's mask often fills the gap of a handle
+    return whole & ~view.background_colors if view.estimated else whole, from_body
 
 
 def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -171,10 +196,13 @@ def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
     points = view.points[inside]
     if len(points) < MIN_PIXELS:
         return None
-    radius = _measure_radius(view, points, width[row[inside], column[inside]])
-    flat = _move_into_plane(view, points, axis) if view.estimated else None
-    if flat is not None:
-        return _build_balls(view, flat, radius, carve=False)
+    inset_px, width_px = inset[row[inside], column[inside]], width[row[inside], column[inside]]
+    if view.estimated:
+        amid = inset_px > MEDIAL_SHARE * width_px
+        flat = _move_into_plane(view, points[amid], axis)
+        if flat is not None:
+            return _build_balls(view, flat, _measure_radius(view, points[amid], inset_px[amid]), carve=False)
+    radius = _measure_radius(view, points, width_px)
     rays = points - view.eye
     centers = points + rays / np.linalg.norm(rays, axis=1)[:, None] * radius[:, None]
     part = _build_balls(view, centers, radius, carve=True)

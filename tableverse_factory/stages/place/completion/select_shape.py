@@ -1,24 +1,32 @@
 """The mesh model `carved`: the simplest of eight kinds of shape that explains the picture."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
+from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
 from tableverse_factory.stages.place.completion.handle import join_handles
 from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
-from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_mesh_misfit, sample_rays
+from tableverse_factory.stages.place.completion.ray_misfit import (
+    RaySample,
+    compute_mesh_misfit,
+    compute_misfit,
+    sample_rays,
+)
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
 from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing, shows_cavity
-from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid
+from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid, intersect_turned
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.completion.warp import warp_to_depth
 from tableverse_factory.stages.place.interfaces import Completion
@@ -34,6 +42,10 @@ FEW_NUMBERS_M = 1.2e-3  # the same of a turned shape of few numbers, less the bo
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
+
+FREE_KINDS = ("carved/inflation", "carved/columns")  # names of those that follow every reading
+MOST_TUNNELS = 10  # through a shape: more are holes that errors of the depth tear
+MOST_PLAIN_M = 0.003  # misfit, as of estimated depth, up to which a plain shape is better than a torn one [m]
 
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
 
@@ -89,9 +101,28 @@ class _Search:
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
     """Fit boxes, surfaces of revolution, solids of a half turn, sheets, inflation and columns, and select the best."""
-    rays = sample_rays(view)
-    search = _Search()
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
+    search = _try_kinds(kinds, view, unavoidable)
+    if search.best is None:
+        raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
+    _, method, mesh, pose = search.best
+    if not view.estimated and method in FREE_KINDS and to_manifold(mesh).genus() > MOST_TUNNELS:
+        method, mesh, pose = _find_plain(view) or (method, mesh, pose)
+    if view.support.leaning:
+        mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
+    return Completion(mesh, pose, method)
+
+
+def _find_plain(view: ObjectView) -> tuple[str, TriangleMesh, Pose] | None:
+    """Find a shape of few numbers for what a sensor's depth tears, as if a model had estimated it, if one fits."""
+    outlined = replace(view, estimated=True)
+    best = _try_kinds(PLAIN_KINDS, outlined, -np.inf).best
+    return None if best is None or best[0] > MOST_PLAIN_M else best[1:]
+
+
+def _try_kinds(kinds: tuple[Kind, ...], view: ObjectView, unavoidable: float) -> _Search:
+    """Search the best shape of some kinds; `unavoidable` is the misfit of even the true one [m]."""
+    rays, search = sample_rays(view), _Search()
     for kind in kinds:
         if search.is_below(kind.freedom + (kind.unavoidable or unavoidable)):
             continue
@@ -103,12 +134,7 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
         if draft is not None:
             search.add(kind.method, kind.freedom, draft)
     search.finish()
-    if search.best is None:
-        raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
-    _, best_method, mesh, pose = search.best
-    if view.support.leaning:
-        mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
-    return Completion(mesh, pose, best_method)
+    return search
 
 
 def _discount_box(box: SolidBox) -> Draft:
@@ -144,6 +170,17 @@ def _draft_vessel(view: ObjectView, rays: RaySample) -> Draft | None:
         return mesh, pose, cost - HOLLOW_BONUS_M
 
     return Draft(misfit - HOLLOW_BONUS_M - SIMPLER_M, finish)
+
+
+def _draft_plain(view: ObjectView, rays: RaySample) -> Draft | None:
+    """Draft a turned shape by the better of two fits: to depth as estimated, and as measured."""
+    measured = replace(view, estimated=False)
+    shapes = []
+    for profile, _ in (fit_standing(view, rays), fit_standing(measured, sample_rays(measured))):
+        misfit = compute_misfit(rays, intersect_turned(rays, profile))
+        if misfit < MOST_PLAIN_M:
+            shapes.append(TurnedShape(profile, misfit - (HOLLOW_BONUS_M if shows_cavity(rays, profile) else 0.0)))
+    return _draft_turned(view, rays, min(shapes, key=lambda shape: shape.misfit, default=None))
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
@@ -211,4 +248,11 @@ ESTIMATED_KINDS = (
     Kind("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     Kind("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     Kind("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
+)
+
+# What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
+PLAIN_KINDS = (
+    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
+    Kind("carved/turned", 0.0, _draft_plain),
+    Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
 )

@@ -1,6 +1,7 @@
 """Flying pixels: false readings along an object's outline, where sensors and filters smear depth over an edge."""
 
 import numpy as np
+from jaxtyping import Float64
 from scipy import ndimage
 from skimage.color import rgb2lab
 
@@ -26,28 +27,31 @@ CONTINUOUS_M = 0.01
 MOSTLY = 0.6
 
 
-def find_flying_pixels(color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
-    """Find the object's own pixels with the colours of the background beside it, whose readings [m] were smeared.
+def find_background_colors(color: Picture, own: Mask, beside: Mask) -> Mask:
+    """Find the object's own pixels with the colours of the background beside it; none where the two are much alike."""
+    found = np.zeros(own.shape, dtype=bool)
+    inset = _measure_inset(own)
+    core = inset > max(INSET_PX, CORE_SHARE * float(inset.max()))
+    if not core.any() or not beside.any():
+        return found
+    shown = rgb2lab(color)
+    if np.median(np.linalg.norm(shown[beside][:, 1:] - np.median(shown[core][:, 1:], axis=0), axis=1)) < SAME_HUE:
+        return found
+    on, off = compute_color_share(shown[own], shown[core]), compute_color_share(shown[own], shown[beside])
+    found[own] = (off > MIN_OFF) & (RARITY * on < off)
+    return ndimage.binary_opening(found) & own
+
+
+def find_flying_pixels(background_colors: Mask, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
+    """Find those of an object's pixels with background colours whose readings [m] were smeared.
 
     Sensors and their filters interpolate between an object and its background. Such pixels lie near the outline, or in
     whole patches whose readings continue into the background without a step; never more than half of the object.
     """
-    nothing = np.zeros(own.shape, dtype=bool)
-    inset = ndimage.distance_transform_edt(np.pad(own, 1))[1:-1, 1:-1]
-    core = inset > max(INSET_PX, CORE_SHARE * float(inset.max()))
-    if not core.any() or not beside.any():
-        return nothing
-    shown = rgb2lab(color)
-    if np.median(np.linalg.norm(shown[beside][:, 1:] - np.median(shown[core][:, 1:], axis=0), axis=1)) < SAME_HUE:
-        return nothing
-    foreign = nothing.copy()
-    on, off = compute_color_share(shown[own], shown[core]), compute_color_share(shown[own], shown[beside])
-    foreign[own] = (off > MIN_OFF) & (RARITY * on < off)
-    foreign = ndimage.binary_opening(foreign) & own
-    at_edge = foreign & (inset <= SMEARED_PX)
-    smeared = foreign & (at_edge | _find_continuous_patches(foreign, raw, beside))
+    at_edge = background_colors & (_measure_inset(own) <= SMEARED_PX)
+    smeared = background_colors & (at_edge | _find_continuous_patches(background_colors, raw, beside))
     result = ndimage.binary_propagation(at_edge, mask=smeared)
-    return result if result.sum() <= MOST_SMEARED * own.sum() else nothing
+    return result if result.sum() <= MOST_SMEARED * own.sum() else np.zeros_like(own)
 
 
 def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) -> Mask:
@@ -64,6 +68,10 @@ def find_depth_ramps(raw: DepthImage, own: Mask, trusted: Mask, window: Camera) 
     at_edge = steep & ~ndimage.binary_erosion(own, iterations=RAMP_START_PX)
     near = own & ~ndimage.binary_erosion(own, iterations=RAMP_PX)
     return ndimage.binary_propagation(at_edge, mask=steep & near)
+
+
+def _measure_inset(own: Mask) -> Float64[np.ndarray, "h w"]:
+    return np.asarray(ndimage.distance_transform_edt(np.pad(own, 1))[1:-1, 1:-1])
 
 
 def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Mask:

@@ -12,7 +12,11 @@ from schemas.objects import PerceivedObject, PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import compose_poses, invert_pose, rotation_matrix, transform_points
-from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
+from tableverse_factory.stages.place.view.flying_pixels import (
+    find_background_colors,
+    find_depth_ramps,
+    find_flying_pixels,
+)
 from tableverse_factory.stages.place.view.object_pixels import (
     RARITY,
     compute_color_share,
@@ -50,6 +54,7 @@ class ObjectView(Frozen):
         window: Rows and columns of the picture that the window shows.
         own: Pixels of the object, without those whose reading was smeared over its outline.
         unread: Pixels that show the object where a sensor reads nothing, or the support behind it.
+        background_colors: Pixels of `own` with the colours of what lies beside the object, as the gap of a handle has.
         depth: Smoothed depth [m]; 0 where unknown.
         facing: Cosine between the ray and the normal of the surface that ends it, 1 where unknown.
         past: Pixels through which the camera sees past the object; the rest is the object or an occluder.
@@ -66,6 +71,7 @@ class ObjectView(Frozen):
     window: tuple[slice, slice]
     own: Mask
     unread: Mask
+    background_colors: Mask
     depth: DepthImage
     facing: DepthImage
     past: Mask
@@ -94,7 +100,8 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     raw = np.asarray(scene.observation.depth[rows, columns], dtype=np.float64)
     color = scene.observation.color[rows, columns]
     own = ids == item.instance_id
-    false = find_flying_pixels(color, raw, own, ids <= 0)
+    background_colors = find_background_colors(color, own, ids <= 0)
+    false = find_flying_pixels(background_colors, raw, own, ids <= 0)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & find_denoised_pixels(item.points_camera, window, raw)
     bleed = _find_bleed(trusted, raw, window, pose, support.height)
@@ -123,6 +130,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
         window=(rows, columns),
         own=own,
         unread=unread & (not estimated),
+        background_colors=background_colors & own,
         depth=np.where(own, own_depth, np.where(past, end, raw)),
         facing=np.where(seen, np.abs(cosine), 1.0),
         past=past,

@@ -8,7 +8,7 @@ import trimesh
 from scipy import ndimage
 
 from schemas.codec import encode
-from schemas.geometry import Pose, TriangleMesh
+from schemas.geometry import DepthImage, Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.evaluation.bench.completion import render_noisy_view, stand_on_table
 from tableverse_factory.geometry.math.camera import backproject
@@ -16,7 +16,8 @@ from tableverse_factory.geometry.math.transforms import matrix_from_pose, quater
 from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
-from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample
+from tableverse_factory.stages.place.completion.handle import join_handles
+from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample, sample_rays
 from tableverse_factory.stages.place.completion.select_shape import complete_by_carving
 from tableverse_factory.stages.place.completion.turned_profile import (
     TurnedProfile,
@@ -48,16 +49,15 @@ def bend(scene: PerceivedObjects, share: float = 0.012) -> PerceivedObjects:
         size = np.sqrt(own.sum())
         wave = np.sin(columns / size * 2.0 + item.instance_id) * np.cos(rows / size * 2.5)
         depth = np.where(own, depth * (1.0 + share * (wave + (-1) ** item.instance_id)), depth)
-    depth = depth.astype(np.float32)
-    points = backproject(depth, scene.observation.camera)
-    objects = tuple(
-        replace(item, points_camera=points[scene.instance_ids == item.instance_id]) for item in scene.objects
-    )
-    return replace(scene, observation=replace(scene.observation, depth=depth, bend=0.015), objects=objects)
+    bent = _replace_depth(scene, depth)
+    return replace(bent, observation=replace(bent.observation, bend=0.015))
 
 
 def complete(*meshes: TriangleMesh) -> list[Completion]:
-    scene = bend(render_noisy_view(meshes, AZIMUTH, 0.85, np.random.default_rng(3), 0.0005))
+    return complete_all(bend(render_noisy_view(meshes, AZIMUTH, 0.85, np.random.default_rng(3), 0.0005)))
+
+
+def complete_all(scene: PerceivedObjects) -> list[Completion]:
     supports = find_supports(scene.objects, scene.camera_to_table)
     return [complete_by_carving(scene, view_object(scene, item, supports[item.object_id])) for item in scene.objects]
 
@@ -114,15 +114,60 @@ def _build_mug(turned: float = 0.0) -> TriangleMesh:
 def test_a_mug_keeps_its_handle() -> None:
     """Estimated depth is bent by more than the handle is thick: its silhouette tells that it is there."""
     mug, bare = _build_mug(), turn(MUG)
-    for mesh, reach in ((mug, 0.077), (bare, 0.04)):
+    for mesh, reach, off in ((mug, 0.077, 0.004), (bare, 0.04, 0.008)):
         (found,) = complete(mesh)
         assert found.method == "carved/turned"
         vertices = place(found).vertices
         farthest = vertices[np.linalg.norm(vertices[:, :2], axis=1).argmax()]
-        assert np.linalg.norm(farthest[:2]) == pytest.approx(reach, abs=0.008)
+        assert np.linalg.norm(farthest[:2]) == pytest.approx(reach, abs=off)
         if mesh is mug:
             assert np.arctan2(farthest[1], farthest[0]) == pytest.approx(AZIMUTH + np.pi / 2, abs=0.25)
         assert len(to_manifold(found.mesh).decompose()) == 1
+
+
+def test_the_gap_of_a_handle_that_the_mask_fills_is_open_where_it_shows_the_table() -> None:
+    scene = bend(render_noisy_view([_build_mug()], AZIMUTH, 0.85, np.random.default_rng(3), 0.0005))
+    own = scene.instance_ids > 0
+    color = np.where(own[..., None], np.uint8([30, 40, 160]), np.uint8([180, 150, 110]))
+    filled = ndimage.binary_fill_holes(own)
+    assert (filled & ~own).sum() > 100
+    points = backproject(scene.observation.depth, scene.observation.camera)
+    (item,) = scene.objects
+    scene = replace(
+        scene,
+        observation=replace(scene.observation, color=color),
+        instance_ids=np.where(filled, item.instance_id, 0),
+        objects=(replace(item, points_camera=points[filled]),),
+    )
+    (found,) = complete_all(scene)
+    assert to_manifold(found.mesh).genus() == 1
+
+
+def test_a_body_that_is_too_narrow_gets_no_handle_along_its_side() -> None:
+    can = turn([(0.0, 0.0), (0.035, 0.0), (0.035, 0.1), (0.0, 0.1)])
+    scene = bend(render_noisy_view([can], AZIMUTH, 0.85, np.random.default_rng(3), 0.0005), 0.0)
+    view = view_object(scene, scene.objects[0], find_supports(scene.objects, scene.camera_to_table)["obj_000"])
+    aside = Pose(0.006 * np.array([-np.sin(AZIMUTH), np.cos(AZIMUTH), 0.0]), quaternion_about_z(0.0))
+    body = to_manifold(turn([(0.0, 0.0), (0.03, 0.0), (0.03, 0.1), (0.0, 0.1)]))
+    mesh, _, _ = join_handles(view, sample_rays(view), body, None, aside)
+    assert to_manifold(mesh).volume() == pytest.approx(body.volume(), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "kind", "least"),
+    [
+        (turn([(0.0, 0.0), (0.033, 0.0), (0.033, 0.12), (0.0, 0.12)]), "carved/turned", 0.8),
+        (stand_on_table(from_trimesh(trimesh.creation.box((0.12, 0.07, 0.05)))), "carved/box", 0.7),
+    ],
+)
+def test_what_errors_of_a_sensor_tear_becomes_plain(mesh: TriangleMesh, kind: str, least: float) -> None:
+    scene = render_noisy_view([mesh], AZIMUTH, 0.85, np.random.default_rng(3), 0.0005)
+    noise = ndimage.gaussian_filter(np.random.default_rng(4).standard_normal(scene.instance_ids.shape), 3.0)
+    error = np.where(scene.instance_ids > 0, 0.015 * noise / noise.std(), 0.0)
+    (found,) = complete_all(smear(_replace_depth(scene, scene.observation.depth + error), 1))
+    assert found.method == kind
+    one, two = to_manifold(place(found)), to_manifold(mesh)
+    assert (one ^ two).volume() > least * (one + two).volume()
 
 
 @pytest.mark.parametrize("read", ["nothing", "the table behind"])
@@ -164,7 +209,11 @@ BOWL = [
 
 def smear(scene: PerceivedObjects, half_px: int) -> PerceivedObjects:
     """Smooth the depth of a sensor over edges, as its filters do."""
-    depth = ndimage.uniform_filter(scene.observation.depth, 2 * half_px + 1)
+    return _replace_depth(scene, ndimage.uniform_filter(scene.observation.depth, 2 * half_px + 1))
+
+
+def _replace_depth(scene: PerceivedObjects, depth: DepthImage) -> PerceivedObjects:
+    depth = depth.astype(np.float32)
     points = backproject(depth, scene.observation.camera)
     objects = tuple(
         replace(item, points_camera=points[scene.instance_ids == item.instance_id]) for item in scene.objects

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
-from tableverse_factory.stages.place.view.flying_pixels import find_depth_ramps, find_flying_pixels
+from tableverse_factory.stages.place.view.flying_pixels import (
+    find_background_colors,
+    find_depth_ramps,
+    find_flying_pixels,
+)
 from tableverse_factory.stages.place.view.object_pixels import NEAR, compute_color_share, find_foreign_colors
 
 RED, WOOD, BLACK = (190, 40, 45), (150, 115, 80), (12, 12, 14)
@@ -41,14 +45,14 @@ def test_a_patch_of_the_table_that_the_mask_took_along_is_not_the_object():
     ramp = np.linspace(0.8, 1.0, 14)[None, :]
     color, depth, own = picture(patch=(slice(24, 36), slice(60, 74), WOOD, ramp))
     own[24:36, 60:74] = True
-    found = find_flying_pixels(color, depth, own, ~own)
+    found = find_flying_pixels(find_background_colors(color, own, ~own), depth, own, ~own)
     assert found[24:36, 61:73].mean() > 0.7
     assert not found[:, :60].any()
 
 
 def test_a_face_of_the_tables_colour_that_ends_in_a_step_stays():
     color, depth, own = picture(face=(slice(20, 40), slice(45, 60), WOOD, 0.8))
-    found = find_flying_pixels(color, depth, own, ~own)
+    found = find_flying_pixels(find_background_colors(color, own, ~own), depth, own, ~own)
     assert found[20:40, 49:56].sum() == 0, "only a rim may go"
 
 
@@ -57,7 +61,7 @@ def test_where_hue_tells_nothing_nothing_is_taken():
     color[:] = 170
     color[own] = 210
     color[20:40, 50:60] = 172
-    assert not find_flying_pixels(color, depth, own, ~own).any()
+    assert not find_flying_pixels(find_background_colors(color, own, ~own), depth, own, ~own).any()
 
 
 def test_a_ramp_to_what_lies_behind_is_found_and_a_face_is_not():
