@@ -112,7 +112,8 @@ def bench_decompose(
     Example: `tableverse bench decompose meshes --most 8`
     """
     from tableverse_factory.cli.progress_bar import count_progress
-    from tableverse_factory.evaluation.bench.decompose import bench_decompose, find_meshes, summarize_pieces
+    from tableverse_factory.evaluation.bench.decompose import bench_decompose, summarize_pieces
+    from tableverse_factory.evaluation.bench.measurement import find_meshes
 
     names = [name.strip() for name in methods.split(",")]
     files = find_meshes(folder, most)

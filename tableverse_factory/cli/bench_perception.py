@@ -106,6 +106,9 @@ def bench_completion(
         list[str] | None,
         typer.Option(metavar="AZIMUTH,ELEVATION", help="A camera's direction [degrees]; repeat it for more."),
     ] = None,
+    error_mm: Annotated[
+        float, typer.Option(min=0.0, max=50.0, help="Errors on the objects that agree over a few pixels, as gloss has.")
+    ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Compare single-view completions of scanned meshes with the whole meshes, beside hull and height field.
@@ -114,7 +117,7 @@ def bench_completion(
     """
     from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion
 
-    scores = bench_completion(folder, seed, [_parse_view(text) for text in view] if view else VIEWS)
+    scores = bench_completion(folder, seed, [_parse_view(text) for text in view] if view else VIEWS, error_mm / 1e3)
     if as_json:
         print_json(scores)
     else:

@@ -28,7 +28,7 @@ ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
 MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
 GROUND_TRUTH_NAME = "truth.json"
-READ_AS_RECORDED = "camera of a picture, read by observe.depth=recorded"
+CAMERA_BESIDE = "camera of a picture (for observe.depth=recorded, with its depth)"
 _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
 
 
@@ -182,7 +182,7 @@ def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str])
     parts = map(posixpath.splitext, folder.files)
     cameras = {stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES}
     for name in folder.files:
-        kind = READ_AS_RECORDED if name in cameras else _classify_file(folder.uri, name, in_assets)
+        kind = CAMERA_BESIDE if name in cameras else _classify_file(folder.uri, name, in_assets)
         if isinstance(kind, SceneKind):
             yield _make_entry(kind, posixpath.join(folder.uri, name))
         else:

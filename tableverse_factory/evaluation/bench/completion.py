@@ -19,7 +19,7 @@ from schemas.outcome import Done
 from tableverse_factory.core.errors import GeometryError, InputError
 from tableverse_factory.core.open3d_import import o3d
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.evaluation.bench.decompose import find_meshes
+from tableverse_factory.evaluation.bench.measurement import find_meshes
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, place_mesh, read_mesh
@@ -39,9 +39,10 @@ OPEN_LAYERS = 40
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
 DISTANCE_M = 0.7
 NOISE_M = 0.001
+ERROR_PX = 3.0
 SIZE_RANGE_M = (0.005, 1.0)  # of what a camera at that distance sees whole, and as more than pixels [m]
 TABLE_HALF_M = 1.0
-SHOWN = 5  # bad meshes named in one message
+MOST_NAMED = 5  # bad meshes in one message
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +61,13 @@ class CompletionScore:
 
 
 def bench_completion(
-    folder: Path, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS
+    folder: Path, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS, error_m: float = 0.0
 ) -> list[CompletionScore]:
     """Complete every mesh in `folder` from each view by convex hull, height field and the place stage.
 
-    A view is the azimuth and elevation of a camera [degrees].
+    A view is the azimuth and elevation of a camera [degrees]; `error_m` is that of `render_noisy_view`.
     """
-    paths = find_meshes(folder, None)
+    paths = find_meshes(folder)
     if not paths:
         raise InputError(
             f"{sanitize_line(str(folder))} holds no meshes: give a folder of {', '.join(MESH_SUFFIXES)} files"
@@ -78,9 +79,9 @@ def bench_completion(
         hollow = share >= HOLLOW_SHARE
         for view, (azimuth, elevation) in enumerate(views):
             rng = np.random.default_rng([seed, index, view])
-            scene = render_noisy_view([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng)
+            scene = render_noisy_view([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng, error_m=error_m)
             for method, mesh, cpu_s in _complete_all(scene):
-                plain = score_completion(path.stem, view, method, truth, mesh)
+                plain = score_completion(path.name, view, method, truth, mesh)
                 kept = 1.0 - float(contains_points(mesh, cavity).mean()) if hollow else float("nan")
                 scores.append(replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s))
     return scores
@@ -92,18 +93,22 @@ def _read_scans(paths: Sequence[Path]) -> list[TriangleMesh]:
     for path in paths:
         try:
             scans.append(_read_scan(path))
+        except OSError as error:
+            errors.append(f"{sanitize_line(path.name)}: {error.strerror}")
         except (InputError, GeometryError) as error:
             errors.append(str(error))
     if errors:
-        more = f"; and {len(errors) - SHOWN} more" if len(errors) > SHOWN else ""
-        raise InputError("; ".join(errors[:SHOWN]) + more)
+        more = f"; and {len(errors) - MOST_NAMED} more" if len(errors) > MOST_NAMED else ""
+        raise InputError("; ".join(errors[:MOST_NAMED]) + more)
     return scans
 
 
 def _read_scan(path: Path) -> TriangleMesh:
     mesh = read_mesh(path.read_bytes(), path.name)
     size = np.ptp(mesh.vertices, axis=0)
-    if size.min() <= 0.0 or not SIZE_RANGE_M[0] <= size.max() <= SIZE_RANGE_M[1]:
+    if size.min() <= 0.0:
+        raise InputError(f"{sanitize_line(path.name)} is flat: give a solid")
+    if not SIZE_RANGE_M[0] <= size.max() <= SIZE_RANGE_M[1]:
         given, (low, high) = " x ".join(f"{side:g}" for side in size), SIZE_RANGE_M
         name = sanitize_line(path.name)
         raise InputError(f"{name} is {given} m: give a solid in metres, {low:g} to {high:g} m along its longest side")
@@ -129,12 +134,18 @@ def _complete_all(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, 
 
 
 def render_noisy_view(
-    meshes: Sequence[TriangleMesh], azimuth: float, elevation: float, rng: np.random.Generator, noise_m: float = NOISE_M
+    meshes: Sequence[TriangleMesh],
+    azimuth: float,
+    elevation: float,
+    rng: np.random.Generator,
+    noise_m: float = NOISE_M,
+    error_m: float = 0.0,
 ) -> PerceivedObjects:
     """Render meshes (table frame) on a large table with a noisy depth camera; instance ids are 1, 2 and so on.
 
     `azimuth` is the direction of the camera about z from the middle of the objects, `elevation` that above the horizon
-    [rad]; `noise_m` is the standard deviation of the depth.
+    [rad]; `noise_m` is the standard deviation of the depth, `error_m` that of errors on the objects which agree over a
+    few pixels and are smeared over edges, as on gloss, white and black [m].
     """
     every = np.concatenate([mesh.vertices for mesh in meshes])
     target: Vector3 = (every.min(axis=0) + every.max(axis=0)) / 2
@@ -144,7 +155,11 @@ def render_noisy_view(
     table = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     seen = render([table, *meshes], CAMERA, camera_to_table, shadows=False)
     noise = rng.normal(0.0, noise_m, seen.depth.shape)
-    depth = np.where(seen.depth > 0.0, seen.depth + noise, 0.0).astype(np.float32)
+    depth = np.where(seen.depth > 0.0, seen.depth + noise, 0.0)
+    if error_m > 0.0:
+        error = ndimage.gaussian_filter(rng.standard_normal(depth.shape), ERROR_PX)
+        depth = ndimage.uniform_filter(depth + np.where(seen.ids > 0, error_m / error.std() * error, 0.0), 3)
+    depth = depth.astype(np.float32)
     ids = np.where(seen.ids == 0, -1, np.maximum(seen.ids, 0)).astype(np.int32)
     points = backproject(depth, CAMERA)
     objects = tuple(

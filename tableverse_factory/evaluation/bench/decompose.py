@@ -11,7 +11,6 @@ import numpy as np
 from schemas.config import RectifyConfig
 from schemas.geometry import ConvexPieces, Points, TriangleMesh
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.bench.measurement import sample_evenly
 from tableverse_factory.geometry.convex.coacd import load_coacd
 from tableverse_factory.geometry.convex.decompose import decompose_shape
 from tableverse_factory.geometry.convex.metrics import add_metrics
@@ -118,12 +117,6 @@ def summarize_pieces(scores: Sequence[PieceScore], methods: Sequence[str]) -> li
 
 def _over(first_s: float, cpu_s: float) -> float:
     return first_s / max(cpu_s, 1e-6)
-
-
-def find_meshes(folder: Path, most: int | None) -> list[Path]:
-    """Find the meshes of a folder in the order of their names, at most `most`, spread evenly."""
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
-    return sample_evenly(found, most)
 
 
 def _scale_to_unit(mesh: TriangleMesh) -> TriangleMesh:

@@ -1,11 +1,14 @@
-"""Shared by the benches: CPU time by part, and an even sample of their inputs."""
+"""Shared by the benches: CPU time by part, and their inputs or an even sample of them."""
 
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+
+from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES
 
 Item = TypeVar("Item")
 
@@ -22,6 +25,12 @@ class Stopwatch:
         started = time.process_time()
         yield
         self.cpu_s[part] = self.cpu_s.get(part, 0.0) + (time.process_time() - started) / repeats
+
+
+def find_meshes(folder: Path, most: int | None = None) -> list[Path]:
+    """Find the meshes of a folder in the order of their names, at most `most`, spread evenly."""
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in MESH_SUFFIXES and path.is_file())
+    return sample_evenly(found, most)
 
 
 def sample_evenly(items: Sequence[Item], most: int | None) -> list[Item]:

@@ -52,17 +52,23 @@ def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
     assert "holds no meshes: give a folder of .obj, .ply, .stl, .glb files\n" in err
 
 
-@pytest.mark.parametrize("size", [(60.0, 50.0, 40.0), (0.06, 0.05, 0.0)], ids=["millimetres", "flat"])
-def test_what_is_no_solid_in_metres_is_one_line(tmp_path, run, size):
+@pytest.mark.parametrize(
+    ("size", "why"),
+    [((60.0, 50.0, 40.0), "60 x 50 x 40 m: give a solid in metres, 0.005 to 1 m along"), ((0.06, 0.05, 0.0), "flat")],
+    ids=["millimetres", "flat"],
+)
+def test_what_is_no_solid_in_metres_is_one_line(tmp_path, run, size, why):
     box = trimesh.creation.box()
     box.vertices *= size
     (tmp_path / "BOX.OBJ").write_text(box.export(file_type="obj"))
     (tmp_path / "torn.stl").write_bytes(b"solid")
+    (tmp_path / "folder.obj").mkdir()
+    (tmp_path / "gone.obj").symlink_to(tmp_path / "nowhere")
     code, out, err = run("bench", "completion", tmp_path)
     assert (code, out) == (1, "")
-    assert "BOX.OBJ is " in err
+    assert f"BOX.OBJ is {why}" in err
     assert "torn.stl" in err
-    assert "give a solid in metres, 0.005 to 1 m along its longest side" in err
+    assert "folder.obj" not in err
 
 
 @pytest.mark.slow  # figures of a bench
@@ -92,7 +98,7 @@ def test_figures_come_as_strict_json_too(tmp_path, run):
     rows = json.loads(out, parse_constant=pytest.fail)
     assert code == 0
     assert {row["method"] for row in rows} > {"hull", "height field"}
-    assert {(row["mesh"], row["cavity_kept"]) for row in rows} == {("NaN", None)}
+    assert {(row["mesh"], row["cavity_kept"]) for row in rows} == {("NaN.obj", None)}
 
 
 def test_no_name_of_a_table_is_cut_in_a_narrow_place(monkeypatch, capsys):

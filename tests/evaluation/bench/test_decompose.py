@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
 from tableverse_factory.core.errors import InputError
-from tableverse_factory.evaluation.bench.decompose import bench_decompose, find_meshes, summarize_pieces
+from tableverse_factory.evaluation.bench.decompose import bench_decompose, summarize_pieces
+from tableverse_factory.evaluation.bench.measurement import find_meshes
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 
@@ -29,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.heavy
 def test_a_box_is_one_piece_of_its_own_volume_and_a_bowl_stays_open(folder: Path) -> None:
-    bowl, box = bench_decompose(find_meshes(folder, None), ["cut"])
+    bowl, box = bench_decompose(find_meshes(folder), ["cut"])
     assert (bowl.mesh, box.mesh) == ("bowl.obj", "box.obj")
     assert box.pieces == 1
     assert box.volume_ratio == pytest.approx(1.0, abs=1e-6)
@@ -57,10 +58,10 @@ def test_the_command_compares_with_the_first_method(folder: Path) -> None:
 
 def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="unknown method 'magic'"):
-        bench_decompose(find_meshes(folder, None), ["magic"])
+        bench_decompose(find_meshes(folder), ["magic"])
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no mesh found"):
-        bench_decompose(find_meshes(tmp_path / "empty", None), ["cut"])
+        bench_decompose(find_meshes(tmp_path / "empty"), ["cut"])
 
 
 @pytest.mark.heavy

@@ -1,6 +1,6 @@
 """Handles and spouts: parts outside a surface of revolution, as thick as they look wide."""
 
-from dataclasses import replace
+from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -36,8 +36,8 @@ from tableverse_factory.stages.place.completion.underside import compute_half_wi
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
 HANDLE_FREEDOM = 0.2  # cost of handles, as a share of the misfit that they remove: they complete only a good body
-MOST_TUNNELS = 5  # through a body with its handles: more are holes
-CLEAR_M = 0.0012  # misfit of all parts together up to which their holes are noise, and the depth is true [m]
+MOST_TUNNELS = 5  # through a body with its handles; more are torn, where also the misfit of all parts is more [m]:
+CLEAR_M = 0.0012  # of scans, whose handles 1 mm of noise tears as well, it is 0.5 to 0.7 mm, of smeared ones 1.4 to 1.7
 WORTH_HANDLES_M = 0.004  # misfit from which the body is wrong and the rest is no handle [m]
 MAX_FACES = 3200
 TOLERANCE_M = 0.00005
@@ -45,7 +45,7 @@ AWAY_M = 0.004  # distance outside the body from which points belong to another 
 FRAYED_PX = 2  # by which an outline that a net drew is ragged; a handle under twice that width is lost
 MIN_PIXELS = 30
 MIN_SHARE = 0.025
-MIN_REACH = 0.25  # of a part that a silhouette shows: its distance from the body, as a share of its extent
+MIN_REACH = 0.15  # of a handle from the body, as a share of its extent: 0.36 and more of five; strips have under 0.1
 RADIUS_RANGE_M = (0.002, 0.012)
 CELL_M = 0.0015
 MAX_CELLS = 250_000
@@ -68,25 +68,28 @@ def join_handles(
 ) -> tuple[TriangleMesh, Pose, float]:
     """Join a body, in the frame of `axis`, with its handles, if they explain the picture better; its `hole` stays free.
 
+    Where errors of the depth tear the handles, those of the silhouette take their place, if they are better than none.
+
     Returns the mesh about the middle of its box, its pose in the table frame, and its misfit with the cost of handles
-    [m].
+    [m]: of those that follow the depth, as what takes their place says nothing about the body.
     """
     to_table = matrix_from_pose(axis)[:3]
     body, hole = body.transform(to_table), None if hole is None else hole.transform(to_table)
-    mesh, pose = _center(body, axis)
-    cost = compute_mesh_misfit(rays, mesh, pose)
-    if cost < WORTH_HANDLES_M:
-        solid = _add_handles(view, body, hole, axis)
-        whole = _center_simplified(solid, axis)
-        better = compute_mesh_misfit(rays, *whole)
-        if better < cost:
-            explained = better + HANDLE_FREEDOM * (cost - better)
-            if solid.genus() <= MOST_TUNNELS or better < CLEAR_M:
-                return *whole, explained
-            # Errors of the depth tear what is swept along it, and not the silhouette
-            whole = _center_simplified(_add_handles(replace(view, estimated=True), body, hole, axis), axis)
-            return *(whole if compute_mesh_misfit(rays, *whole) < cost else (mesh, pose)), explained
-    return mesh, pose, cost
+    bare = _center(body, axis)
+    cost = compute_mesh_misfit(rays, *bare)
+    if cost >= WORTH_HANDLES_M:
+        return *bare, cost
+    solid = _add_handles(view, body, hole, axis, by_outline=rays.estimated)
+    whole = _center_simplified(solid, axis)
+    better = compute_mesh_misfit(rays, *whole)
+    if better >= cost:
+        return *bare, cost
+    if not rays.estimated and solid.genus() > MOST_TUNNELS and better > CLEAR_M:
+        whole = bare
+        with suppress(GeometryError):  # the body is a shape without them
+            drawn = _center_simplified(_add_handles(view, body, hole, axis, by_outline=True), axis)
+            whole = drawn if compute_mesh_misfit(rays, *drawn) < cost else bare
+    return *whole, better + HANDLE_FREEDOM * (cost - better)
 
 
 def _center_simplified(solid: Manifold, axis: Pose) -> tuple[TriangleMesh, Pose]:
@@ -101,12 +104,12 @@ def _center(solid: Manifold, axis: Pose) -> tuple[TriangleMesh, Pose]:
     return TriangleMesh(vertices - middle, mesh.faces), pose
 
 
-def _add_handles(view: ObjectView, body: Manifold, hole: Manifold | None, axis: Pose) -> Manifold:
+def _add_handles(view: ObjectView, body: Manifold, hole: Manifold | None, axis: Pose, *, by_outline: bool) -> Manifold:
     """Join the body with the protrusions observed, its cavity left free; all in the table frame."""
     scene = make_raycasting_scene(from_manifold(body))
-    mask = _find_protrusions(view, scene)
+    mask = _find_protrusions(view, scene, by_outline=by_outline)
     for label in range(1, int(mask.max(initial=0)) + 1):
-        part = _sweep_part(view, mask == label, axis)
+        part = _sweep_part(view, mask == label, axis, by_outline=by_outline)
         if part is None:
             continue
         joined = _join_part(body, part)
@@ -129,22 +132,27 @@ def _join_part(body: Manifold, part: Manifold) -> Manifold:
     return joined + Manifold.batch_hull([ball.translate(tuple(start)), ball.translate(tuple(end))])
 
 
-def _find_protrusions(view: ObjectView, scene: RaycastingScene) -> IdImage:
+def _find_protrusions(view: ObjectView, scene: RaycastingScene, *, by_outline: bool) -> IdImage:
     """Label the parts of the object that lie outside the body, over the window.
 
-    A sensor's points tell of them, which go on beside the silhouette where it reads nothing.
+    A sensor's points tell of them, which go on beside the silhouette where it reads nothing. Of estimated depth the
+    silhouette alone tells: it is off by more than a handle is thick.
     """
-    beside, from_body = _find_uncovered(view, scene)
-    told = beside if view.estimated else _find_away(view, scene)
-    labels, count = ndimage.label(told | (beside & view.unread))
+    rays = pack_pixel_rays(view.camera, view.camera_to_table)
+    covered = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
+    from_body = np.asarray(ndimage.distance_transform_edt(~covered))
+    beside = _find_uncovered(view, from_body)
+    told = _open_gaps(view, beside, covered) if by_outline else _find_away(view, scene)
+    labels, count = ndimage.label(told | (beside & view.unread & ~by_outline))
     sizes = np.bincount(labels[told], minlength=count + 1)
     least = max(MIN_PIXELS, MIN_SHARE * float(view.own.sum()))
-    kept = [k for k in range(1, count + 1) if sizes[k] >= least]
-    if view.estimated:
-        # A strip along the body is an error of its own
-        kept = [k for k in kept if float(from_body[labels == k].max()) > MIN_REACH * _measure_extent(labels == k)]
     number = np.zeros(count + 1, dtype=np.int32)
-    number[kept] = np.arange(1, len(kept) + 1)
+    for label in range(1, count + 1):
+        part = labels == label
+        # A body that is too narrow leaves a strip along its side
+        is_strip = by_outline and float(from_body[part].max()) < MIN_REACH * _measure_extent(part)
+        if sizes[label] >= least and not is_strip:
+            number[label] = number.max() + 1
     return number[labels]
 
 
@@ -161,20 +169,18 @@ def _measure_extent(mask: Mask) -> float:
     return float(np.linalg.norm(np.ptp(np.argwhere(mask), axis=0)))
 
 
-def _find_uncovered(view: ObjectView, scene: RaycastingScene) -> tuple[Mask, Float64[np.ndarray, "h w"]]:
-    """Find the object's pixels beside the body's silhouette, and those between, and how far all are from it [px].
-
-    Of estimated depth they alone tell of a handle: it is off by more than that is thick.
-    """
-    rays, shown = pack_pixel_rays(view.camera, view.camera_to_table), view.own | view.unread
-    covered = np.isfinite(scene.cast_rays(rays, nthreads=1)["t_hit"].numpy())
+def _find_uncovered(view: ObjectView, from_body: Float64[np.ndarray, "h w"]) -> Mask:
+    """Find the object's pixels beside the body's silhouette, and those between; `from_body` is the distance [px]."""
+    shown = view.own | view.unread
     away_px = AWAY_M * view.camera.fx / float(np.median(np.linalg.norm(view.points - view.eye, axis=1)))
-    from_body = np.asarray(ndimage.distance_transform_edt(~covered))
-    beside = shown & (from_body > away_px)
-    core = ndimage.binary_opening(beside, iterations=FRAYED_PX)
-    whole = ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & shown
-    # A net's mask often fills the gap of a handle
-    return whole & ~view.background_colors if view.estimated else whole, from_body
+    core = ndimage.binary_opening(shown & (from_body > away_px), iterations=FRAYED_PX)
+    return ndimage.binary_dilation(core, iterations=FRAYED_PX + int(np.ceil(away_px))) & shown
+
+
+def _open_gaps(view: ObjectView, beside: Mask, covered: Mask) -> Mask:
+    """Leave out what handles and body enclose in the colours of the background: a net's mask often fills it."""
+    solid = (beside & ~view.background_colors) | covered
+    return beside & ~(ndimage.binary_fill_holes(solid) & ~solid)
 
 
 def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -183,25 +189,25 @@ def _find_pixels(view: ObjectView, points: Points) -> tuple[np.ndarray, np.ndarr
     return pixels[:, 1], pixels[:, 0]
 
 
-def _sweep_part(view: ObjectView, mask: Mask, axis: Pose) -> Manifold | None:
+def _sweep_part(view: ObjectView, mask: Mask, axis: Pose, *, by_outline: bool) -> Manifold | None:
     """Sweep balls along the part, as thick as it looks wide: behind each of its points, carved by free space.
 
-    Where depth is estimated, they lie in a plane through the axis, if the camera does not look along it, and nothing is
-    carved.
+    By its outline they go along the middle of the part, in a plane through the axis, if the camera does not look along
+    it, and nothing is carved.
     """
     inset = ndimage.distance_transform_edt(mask)
     width = compute_half_width(inset)
     row, column = _find_pixels(view, view.points)
-    inside = mask[np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)]
-    points = view.points[inside]
-    if len(points) < MIN_PIXELS:
+    row, column = np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)
+    inside = mask[row, column]
+    if np.count_nonzero(inside) < MIN_PIXELS:
         return None
-    inset_px, width_px = inset[row[inside], column[inside]], width[row[inside], column[inside]]
-    if view.estimated:
-        amid = inset_px > MEDIAL_SHARE * width_px
+    points, inset_px, width_px = (of[inside] for of in (view.points, inset[row, column], width[row, column]))
+    amid = inset_px > MEDIAL_SHARE * width_px
+    if by_outline and np.count_nonzero(amid) >= MIN_PIXELS:
         flat = _move_into_plane(view, points[amid], axis)
         if flat is not None:
-            return _build_balls(view, flat, _measure_radius(view, points[amid], inset_px[amid]), carve=False)
+            return _build_balls(view, flat, _measure_radius(view, flat, inset_px[amid]), carve=False)
     radius = _measure_radius(view, points, width_px)
     rays = points - view.eye
     centers = points + rays / np.linalg.norm(rays, axis=1)[:, None] * radius[:, None]

@@ -34,12 +34,16 @@ class RaySample(Frozen):
     directions: Float64[np.ndarray, "3 n"]  # scaled so that a parameter along a ray is the depth of the point
     end: Depths  # observed depth of the ray's end [m]; 0 where it is unknown
     facing: Float64[np.ndarray, " own"]  # cosine of incidence where the object was seen, 0 where the end is unknown
-    estimated: bool = False  # whether a model estimated the depth
+    estimated: bool = False  # whether the depth is weighed as one that a model estimated
 
 
-def sample_rays(view: ObjectView, count: int | None = None) -> RaySample:
-    """Sample about `count` rays of the window on a regular raster of pixels; those that tell nothing are left out."""
-    count = count or (ESTIMATED_RAYS if view.estimated else RAYS)
+def sample_rays(view: ObjectView, count: int | None = None, *, estimated: bool | None = None) -> RaySample:
+    """Sample about `count` rays of the window on a regular raster of pixels; those that tell nothing are left out.
+
+    `estimated` weighs the depth as if a model had estimated it, or not, whatever it is.
+    """
+    estimated = view.estimated if estimated is None else estimated
+    count = count or (ESTIMATED_RAYS if estimated else RAYS)
     step = max(1, int(np.ceil(np.sqrt(view.own.size / count))))
     raster = (slice(step // 2, None, step), slice(step // 2, None, step))
     own, past, end, facing = (of[raster].ravel() for of in (view.own, view.past, view.depth, view.facing))
@@ -51,7 +55,7 @@ def sample_rays(view: ObjectView, count: int | None = None) -> RaySample:
         directions=rotation_matrix(view.camera_to_table.quaternion_wxyz) @ np.ascontiguousarray(unit.T),
         end=end[told],
         facing=np.where(end[seen] > 0.0, facing[seen], 0.0),
-        estimated=view.estimated,
+        estimated=estimated,
     )
 
 

@@ -1,15 +1,16 @@
-"""The mesh model `carved`: the simplest of eight kinds of shape that explains the picture."""
+"""The mesh model `carved`: the simplest of several kinds of shape that explains the picture."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.math.transforms import transform_points
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_pixel_rays
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
@@ -17,6 +18,7 @@ from tableverse_factory.stages.place.completion.extend_to_floor import extend_to
 from tableverse_factory.stages.place.completion.handle import join_handles
 from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
+from tableverse_factory.stages.place.completion.overlap import FREE
 from tableverse_factory.stages.place.completion.ray_misfit import (
     RaySample,
     compute_mesh_misfit,
@@ -43,9 +45,12 @@ RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of th
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
 
-FREE_KINDS = ("carved/inflation", "carved/columns")  # names of those that follow every reading
-MOST_TUNNELS = 10  # through a shape: more are holes that errors of the depth tear
-MOST_PLAIN_M = 0.003  # misfit, as of estimated depth, up to which a plain shape is better than a torn one [m]
+MOST_TUNNELS = 10  # through a free shape, for each hole that the camera sees through, and one more; torn have 11 to 41
+MIN_FULL = 0.75  # volume of a half-turned solid over its hull's: of scans 0.76 and more, with flaps 0.56 to 0.73
+MOST_PLAIN_M = 0.003  # misfit of a plain shape, as of estimated depth [m]: of eleven that are right 0.8 to 2.9 mm
+# A plain shape may stand before others by so much [m], and by more for this share of its pixels: 0 to 0.004 of those
+# that are right, 0.010 and more of lids on trays
+HIDES_M, MOST_HIDDEN = 0.005, 0.006
 
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
 
@@ -100,29 +105,51 @@ class _Search:
 
 
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
-    """Fit boxes, surfaces of revolution, solids of a half turn, sheets, inflation and columns, and select the best."""
+    """Fit boxes, surfaces of revolution, solids of a half turn, sheets, inflation and columns, and select the best.
+
+    A box or turned shape takes the place of a free one that errors of a sensor's depth tore, if it fits.
+    """
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
-    search = _try_kinds(kinds, view, unavoidable)
+    search = _try_kinds(kinds, view, sample_rays(view), unavoidable)
     if search.best is None:
         raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
     _, method, mesh, pose = search.best
-    if not view.estimated and method in FREE_KINDS and to_manifold(mesh).genus() > MOST_TUNNELS:
+    if _is_torn(view, method, mesh):
         method, mesh, pose = _find_plain(view) or (method, mesh, pose)
     if view.support.leaning:
         mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
     return Completion(mesh, pose, method)
 
 
+def _is_torn(view: ObjectView, method: str, mesh: TriangleMesh) -> bool:
+    """Tell whether errors of a sensor's depth tore a free shape: it has many holes, or flaps far from the rest."""
+    if view.estimated or method not in FREE:
+        return False
+    solid = to_manifold(mesh)
+    _, seen = ndimage.label(ndimage.binary_fill_holes(view.own) & view.past)
+    if method == "carved/half_turn":
+        return bool(not seen and solid.volume() < MIN_FULL * float(ConvexHull(mesh.vertices).volume))
+    return bool(solid.genus() > MOST_TUNNELS * (1 + seen))
+
+
 def _find_plain(view: ObjectView) -> tuple[str, TriangleMesh, Pose] | None:
-    """Find a shape of few numbers for what a sensor's depth tears, as if a model had estimated it, if one fits."""
-    outlined = replace(view, estimated=True)
-    best = _try_kinds(PLAIN_KINDS, outlined, -np.inf).best
-    return None if best is None or best[0] > MOST_PLAIN_M else best[1:]
+    """Find a shape of few numbers that explains the picture as well as one must where a model estimated the depth."""
+    rays = sample_rays(view, estimated=True)
+    best = _try_kinds(PLAIN_KINDS, view, rays, 0.0).best
+    return None if best is None or best[0] > MOST_PLAIN_M or _hides_others(view, *best[2:]) else best[1:]
 
 
-def _try_kinds(kinds: tuple[Kind, ...], view: ObjectView, unavoidable: float) -> _Search:
+def _hides_others(view: ObjectView, mesh: TriangleMesh, pose: Pose) -> bool:
+    """Tell whether a placed shape stands before what the picture shows of others, as a lid on what a tray holds."""
+    scene = make_raycasting_scene(TriangleMesh(transform_points(pose, mesh.vertices), mesh.faces))
+    hit = scene.cast_rays(pack_pixel_rays(view.camera, view.camera_to_table), nthreads=1)["t_hit"].numpy()
+    others = ~view.own & ~view.past & (view.depth > 0.0)
+    return bool((others & (hit < view.depth - HIDES_M)).sum() > MOST_HIDDEN * view.own.sum())
+
+
+def _try_kinds(kinds: tuple[Kind, ...], view: ObjectView, rays: RaySample, unavoidable: float) -> _Search:
     """Search the best shape of some kinds; `unavoidable` is the misfit of even the true one [m]."""
-    rays, search = sample_rays(view), _Search()
+    search = _Search()
     for kind in kinds:
         if search.is_below(kind.freedom + (kind.unavoidable or unavoidable)):
             continue
@@ -172,15 +199,15 @@ def _draft_vessel(view: ObjectView, rays: RaySample) -> Draft | None:
     return Draft(misfit - HOLLOW_BONUS_M - SIMPLER_M, finish)
 
 
-def _draft_plain(view: ObjectView, rays: RaySample) -> Draft | None:
-    """Draft a turned shape by the better of two fits: to depth as estimated, and as measured."""
-    measured = replace(view, estimated=False)
-    shapes = []
-    for profile, _ in (fit_standing(view, rays), fit_standing(measured, sample_rays(measured))):
+def _draft_plain_turned(view: ObjectView, rays: RaySample) -> Draft | None:
+    """Draft a turned shape fitted to the depth as measured; to rays that doubt it, where that misses too much."""
+    for given in (sample_rays(view), rays):
+        profile, _ = fit_standing(view, given)
         misfit = compute_misfit(rays, intersect_turned(rays, profile))
+        hollow = shows_cavity(rays, profile)
         if misfit < MOST_PLAIN_M:
-            shapes.append(TurnedShape(profile, misfit - (HOLLOW_BONUS_M if shows_cavity(rays, profile) else 0.0)))
-    return _draft_turned(view, rays, min(shapes, key=lambda shape: shape.misfit, default=None))
+            return _draft_turned(view, rays, TurnedShape(profile, misfit - (HOLLOW_BONUS_M if hollow else 0.0)))
+    return None
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:
@@ -253,6 +280,6 @@ ESTIMATED_KINDS = (
 # What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
 PLAIN_KINDS = (
     Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
-    Kind("carved/turned", 0.0, _draft_plain),
+    Kind("carved/turned", 0.0, _draft_plain_turned),
     Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
 )

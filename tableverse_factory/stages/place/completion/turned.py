@@ -1,4 +1,4 @@
-"""Turned shapes of few numbers, for depth that a model estimated: a profile of six radii, solid or hollow.
+"""Turned shapes of few numbers, for depth that is wrong or estimated: a profile of six radii, solid or hollow.
 
 Estimated depth is bent by more than a wall is thick, so that nothing can be carved by it. The silhouette is not: a
 shape of few numbers that has it, rests on its support and follows the depth roughly is nearer to the truth than what

@@ -48,6 +48,8 @@ def find_flying_pixels(background_colors: Mask, raw: DepthImage, own: Mask, besi
     Sensors and their filters interpolate between an object and its background. Such pixels lie near the outline, or in
     whole patches whose readings continue into the background without a step; never more than half of the object.
     """
+    if not background_colors.any():
+        return background_colors
     at_edge = background_colors & (_measure_inset(own) <= SMEARED_PX)
     smeared = background_colors & (at_edge | _find_continuous_patches(background_colors, raw, beside))
     result = ndimage.binary_propagation(at_edge, mask=smeared)
