@@ -30,6 +30,7 @@ from tableverse_factory.stages.place.view.support_from_depth import DepthSupport
 
 MIN_POINTS = 30
 MIN_BREADTH_M = 0.001
+MISSED_M = 0.002  # median distance of the readings from a shape, from which their depth is wrong [m]
 LEANING_STD_M, HIDDEN_STD_M = 0.005, 0.03  # of the height on which contents stand: of long ones at the floor, of others
 MAX_MASK_VALUE = 65_535
 
@@ -111,16 +112,19 @@ def _register_object(perceived: PerceivedObject, view: ObjectView, completion: C
         uncertainty = found.uncertainty
     else:
         uncertainty = estimate_uncertainty(mesh, pose, partial)
+    residual_m = measure_median_distance(view.points, place_mesh(mesh, pose))
+    if mesh.vertex_colors is None:
+        mesh = paint_vertices(mesh, pose, view, projected=view.estimated or residual_m > MISSED_M)
     return PlacedObject(
         object_id=perceived.object_id,
         label=perceived.label,
         label_confidence=perceived.score,
-        mesh=mesh if mesh.vertex_colors is not None else paint_vertices(mesh, pose, view),
+        mesh=mesh,
         scale=1.0,
         pose=pose,
         contained_in=perceived.contained_in,
         count=perceived.count,
-        fit_residual_m=measure_median_distance(view.points, place_mesh(mesh, pose)),
+        fit_residual_m=residual_m,
         completion=completion.method,
         uncertainty=uncertainty,
         mesh_licence=completion.licence,

@@ -22,13 +22,15 @@ COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
 
 
-def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> TriangleMesh:
+def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView, *, projected: bool) -> TriangleMesh:
     """Paint each vertex with the colours of the observed points nearest in position and direction.
+
+    `projected` takes the points to where their rays meet the mesh, which their depth misses.
 
     The points also count turned by half and mirrored in the object's own upright frame, a little farther away: so the
     back looks like the front, and the outside of a cup does not run into its inside.
     """
-    seen, towards, shown = _find_sources(mesh, pose, view)
+    seen, towards, shown = _project_sources(mesh, pose, view) if projected else (view.points, view.normals, view.colors)
     step = max(1, len(seen) // SOURCES)
     upright = Pose(pose.position, _extract_heading(pose))
     to_own = invert_pose(upright)
@@ -45,14 +47,11 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> Triangle
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
 
-def _find_sources(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> tuple[Points, Points, Colors]:
-    """Find points, normals and colours: as observed, or of estimated depth, where the picture shows the mesh.
+def _project_sources(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> tuple[Points, Points, Colors]:
+    """Find points, normals and colours where the picture shows the mesh; as observed where it shows too little of it.
 
-    A shape fitted to estimated depth misses the edges in the picture a little: just behind them it shows no colour.
+    A shape that misses the depth misses the edges in the picture a little too: just behind them it shows no colour.
     """
-    observed = view.points, view.normals, view.colors
-    if not view.estimated:
-        return observed
     scene = make_raycasting_scene(place_mesh(mesh, pose))
     rays = view.points - view.eye
     hit = scene.cast_rays(pack_rays(view.eye, rays), nthreads=1)
@@ -62,7 +61,7 @@ def _find_sources(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> tuple[Poi
     column, row = np.clip(pixels.astype(int), 0, np.array(behind.shape[::-1]) - 1).T
     kept = np.isfinite(share) & ~behind[row, column]
     if kept.sum() < LEAST_SHARE * len(kept):
-        return observed
+        return view.points, view.normals, view.colors
     return view.eye + rays[kept] * share[kept, None], normals[kept], view.colors[kept]
 
 

@@ -143,15 +143,14 @@ def _find_protrusions(view: ObjectView, scene: RaycastingScene, *, by_outline: b
     from_body = np.asarray(ndimage.distance_transform_edt(~covered))
     beside = _find_uncovered(view, from_body)
     told = _open_gaps(view, beside, covered) if by_outline else _find_away(view, scene)
-    labels, count = ndimage.label(told | (beside & view.unread & ~by_outline))
-    sizes = np.bincount(labels[told], minlength=count + 1)
+    labels, count = ndimage.label(told if by_outline else told | (beside & view.unread))
+    sizes = np.bincount(labels[told], minlength=count + 1)  # that of no part is 0, as all that is told has a label
     least = max(MIN_PIXELS, MIN_SHARE * float(view.own.sum()))
     number = np.zeros(count + 1, dtype=np.int32)
-    for label in range(1, count + 1):
+    for label in np.flatnonzero(sizes >= least):
         part = labels == label
         # A body that is too narrow leaves a strip along its side
-        is_strip = by_outline and float(from_body[part].max()) < MIN_REACH * _measure_extent(part)
-        if sizes[label] >= least and not is_strip:
+        if not by_outline or float(from_body[part].max()) >= MIN_REACH * _measure_extent(part):
             number[label] = number.max() + 1
     return number[labels]
 
