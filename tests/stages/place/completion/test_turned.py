@@ -146,7 +146,7 @@ def _look_at_mug(mug: TriangleMesh, *, filled: bool, handle: tuple[int, int, int
     return _replace_depth(scene, np.where(mask, depth, scene.observation.depth))
 
 
-@pytest.mark.parametrize("filled", [True, False])
+@pytest.mark.parametrize("filled", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_handle_is_as_thick_as_it_looks_and_its_gap_open_though_the_mask_fills_it(filled: bool) -> None:
     mug = _build_mug(radius=0.032, thickness=0.006)
     scene = _look_at_mug(mug, filled=filled)
@@ -186,7 +186,10 @@ CAN = turn([(0.0, 0.0), (0.033, 0.0), (0.033, 0.12), (0.0, 0.12)])
 BLOCK = stand_on_table(from_trimesh(trimesh.creation.box((0.12, 0.07, 0.05))))
 
 
-@pytest.mark.parametrize(("mesh", "kind", "least"), [(CAN, "carved/turned", 0.75), (BLOCK, "carved/box", 0.75)])
+@pytest.mark.parametrize(
+    ("mesh", "kind", "least"),
+    [(CAN, "carved/turned", 0.75), pytest.param(BLOCK, "carved/box", 0.75, marks=pytest.mark.slow)],
+)
 def test_what_errors_of_a_sensor_tear_becomes_plain(mesh: TriangleMesh, kind: str, least: float) -> None:
     (found,) = complete_all(look_by_wrong_depth(mesh))
     assert found.method == kind
