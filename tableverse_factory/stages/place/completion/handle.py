@@ -36,8 +36,9 @@ from tableverse_factory.stages.place.completion.underside import compute_half_wi
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
 HANDLE_FREEDOM = 0.2  # cost of handles, as a share of the misfit that they remove: they complete only a good body
-MOST_TUNNELS = 5  # through a body with its handles; more are torn, where also the misfit of all parts is more [m]:
-CLEAR_M = 0.0012  # of scans, whose handles 1 mm of noise tears as well, it is 0.5 to 0.7 mm, of smeared ones 1.4 to 1.7
+# A body with its handles has no more tunnels, or all parts together no more misfit [m]: of scans, whose handles 1 mm of
+# noise tears as well, it is 0.5 to 0.7 mm, of smeared ones 1.4 to 1.7
+MOST_HANDLE_TUNNELS, CLEAR_M = 5, 0.0012
 WORTH_HANDLES_M = 0.004  # misfit from which the body is wrong and the rest is no handle [m]
 MAX_FACES = 3200
 TOLERANCE_M = 0.00005
@@ -84,7 +85,7 @@ def join_handles(
     better = compute_mesh_misfit(rays, *whole)
     if better >= cost:
         return *bare, cost
-    if not rays.estimated and solid.genus() > MOST_TUNNELS and better > CLEAR_M:
+    if not rays.estimated and solid.genus() > MOST_HANDLE_TUNNELS and better > CLEAR_M:
         whole = bare
         with suppress(GeometryError):  # the body is a shape without them
             drawn = _center_simplified(_add_handles(view, body, hole, axis, by_outline=True), axis)

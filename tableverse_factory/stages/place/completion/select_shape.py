@@ -3,22 +3,17 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
-from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_pixel_rays
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
-from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
 from tableverse_factory.stages.place.completion.handle import join_handles
 from tableverse_factory.stages.place.completion.inflation import inflate
 from tableverse_factory.stages.place.completion.leaning_box import fit_leaning_box
-from tableverse_factory.stages.place.completion.overlap import FREE
 from tableverse_factory.stages.place.completion.ray_misfit import (
     RaySample,
     compute_mesh_misfit,
@@ -27,6 +22,7 @@ from tableverse_factory.stages.place.completion.ray_misfit import (
 )
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
+from tableverse_factory.stages.place.completion.torn import hides_others, is_torn
 from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing, shows_cavity
 from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid, intersect_turned
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
@@ -45,12 +41,7 @@ RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of th
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
 
-MOST_TUNNELS = 10  # through a free shape, for each hole that the camera sees through, and one more; torn have 11 to 41
-MIN_FULL = 0.75  # volume of a half-turned solid over its hull's: of scans 0.76 and more, with flaps 0.56 to 0.73
 MOST_PLAIN_M = 0.003  # misfit of a plain shape, as of estimated depth [m]: of eleven that are right 0.8 to 2.9 mm
-# A plain shape may stand before others by so much [m], and by more for this share of its pixels: 0 to 0.004 of those
-# that are right, 0.010 and more of lids on trays
-HIDES_M, MOST_HIDDEN = 0.005, 0.006
 
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
 
@@ -114,37 +105,18 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
     if search.best is None:
         raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
     _, method, mesh, pose = search.best
-    if _is_torn(view, method, mesh):
+    if is_torn(view, method, mesh):
         method, mesh, pose = _find_plain(view) or (method, mesh, pose)
     if view.support.leaning:
         mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
     return Completion(mesh, pose, method)
 
 
-def _is_torn(view: ObjectView, method: str, mesh: TriangleMesh) -> bool:
-    """Tell whether errors of a sensor's depth tore a free shape: it has many holes, or flaps far from the rest."""
-    if view.estimated or method not in FREE:
-        return False
-    solid = to_manifold(mesh)
-    _, seen = ndimage.label(ndimage.binary_fill_holes(view.own) & view.past)
-    if method == "carved/half_turn":
-        return bool(not seen and solid.volume() < MIN_FULL * float(ConvexHull(mesh.vertices).volume))
-    return bool(solid.genus() > MOST_TUNNELS * (1 + seen))
-
-
 def _find_plain(view: ObjectView) -> tuple[str, TriangleMesh, Pose] | None:
     """Find a shape of few numbers that explains the picture as well as one must where a model estimated the depth."""
     rays = sample_rays(view, estimated=True)
     best = _try_kinds(PLAIN_KINDS, view, rays, 0.0).best
-    return None if best is None or best[0] > MOST_PLAIN_M or _hides_others(view, *best[2:]) else best[1:]
-
-
-def _hides_others(view: ObjectView, mesh: TriangleMesh, pose: Pose) -> bool:
-    """Tell whether a placed shape stands before what the picture shows of others, as a lid on what a tray holds."""
-    scene = make_raycasting_scene(TriangleMesh(transform_points(pose, mesh.vertices), mesh.faces))
-    hit = scene.cast_rays(pack_pixel_rays(view.camera, view.camera_to_table), nthreads=1)["t_hit"].numpy()
-    others = ~view.own & ~view.past & (view.depth > 0.0)
-    return bool((others & (hit < view.depth - HIDES_M)).sum() > MOST_HIDDEN * view.own.sum())
+    return None if best is None or best[0] > MOST_PLAIN_M or hides_others(view, *best[2:]) else best[1:]
 
 
 def _try_kinds(kinds: tuple[Kind, ...], view: ObjectView, rays: RaySample, unavoidable: float) -> _Search:
@@ -266,11 +238,14 @@ KINDS = (
     Kind("carved/turned", 3e-4, _draft_vessel, FEW_NUMBERS_M),
 )
 
+OUTLINED_BOX = Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays)))
+OUTLINED_LYING = Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays)))
+
 # The same for depth that a model estimated, whose errors a free shape follows.
 ESTIMATED_KINDS = (
-    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
+    OUTLINED_BOX,
     Kind("carved/turned", 0.0, lambda view, rays: _draft_turned(view, rays, fit_standing(view, rays))),
-    Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
+    OUTLINED_LYING,
     Kind("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
     Kind("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     Kind("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
@@ -278,8 +253,4 @@ ESTIMATED_KINDS = (
 )
 
 # What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
-PLAIN_KINDS = (
-    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
-    Kind("carved/turned", 0.0, _draft_plain_turned),
-    Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays))),
-)
+PLAIN_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_turned), OUTLINED_LYING)
