@@ -8,6 +8,8 @@ from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
 from schemas.tables import OBJECTS, SCENES, TASKS, TRAJECTORIES, normalize_row
 
+POORLY_COVERED = 0.5  # less of an object's mask than this is worth a remark, and costs points of quality
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RectifiedLayout(Frozen):
@@ -57,6 +59,11 @@ class Coverage:
 
     whole: float
     of_objects: tuple[float | None, ...]
+
+    @property
+    def poor(self) -> tuple[bool, ...]:
+        """Which objects' masks are covered too little."""
+        return tuple(share is not None and share < POORLY_COVERED for share in self.of_objects)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

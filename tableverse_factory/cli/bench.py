@@ -112,13 +112,14 @@ def bench_decompose(
     Example: `tableverse bench decompose meshes --most 8`
     """
     from tableverse_factory.cli.progress_bar import count_progress
-    from tableverse_factory.evaluation.bench.decompose import bench_decompose, summarize_pieces
-    from tableverse_factory.evaluation.bench.measurement import find_meshes
+    from tableverse_factory.evaluation.bench.decompose import bench_decompose, check_methods, summarize_pieces
+    from tableverse_factory.evaluation.bench.measurement import read_meshes
 
     names = [name.strip() for name in methods.split(",")]
-    files = find_meshes(folder, most)
-    with count_progress("meshes", len(files)) as done:
-        scores = bench_decompose(files, names, done)
+    check_methods(names)
+    meshes = read_meshes(folder, most)
+    with count_progress("meshes", len(meshes)) as done:
+        scores = bench_decompose(meshes, names, done)
     overall = summarize_pieces(scores, names)
     if as_json:
         print_json({"meshes": scores, "together": overall})

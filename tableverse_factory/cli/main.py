@@ -1,5 +1,6 @@
 """The command `tableverse`: the table of its commands, and its text without one."""
 
+import os
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -122,4 +123,6 @@ def _without_a_command(
 
 def main() -> None:
     """Run the command line; docs/command-line.md lists its exit codes."""
+    # Before numpy loads it. Beside other work, its threads for matrices of 3 x 3 made an interpolation of 5 ms last 5 s
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     raise SystemExit(run_command(lambda: app(standalone_mode=False)))

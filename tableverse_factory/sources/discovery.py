@@ -20,7 +20,7 @@ from tableverse_factory.core.storage.untrusted import MAX_JSON_BYTES, find_type,
 from tableverse_factory.core.text import describe_error, sanitize_line
 from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES
 from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES, DEPTH_NAME, DETECTIONS_NAME
-from tableverse_factory.sources.content_hash import CAMERA_SUFFIX
+from tableverse_factory.sources.content_hash import CAMERA_SUFFIX, DEPTH_SUFFIX
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 UNREAD_SUFFIXES = (".avif", ".bmp", ".dng", ".gif", ".heic", ".heif", ".jfif", ".jp2", ".jxl", ".tif", ".tiff")
@@ -28,7 +28,7 @@ ASSET_FOLDERS = ("assets", "materials", "meshes", "textures")
 MAX_URI_CHARS = 4096
 MAX_NAME_CHARS = 200
 GROUND_TRUTH_NAME = "truth.json"
-CAMERA_BESIDE = "camera of a picture (for observe.depth=recorded, with its depth)"
+RECORDED = "recorded depth or camera of a picture (for observe.depth=recorded)"
 _LAYOUT_KEY = re.compile(rb'"(objects(?="\s*:\s*\[)|mesh|frame|pose)"\s*:')
 
 
@@ -180,9 +180,10 @@ def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str])
     named = any(part.lower() in ASSET_FOLDERS for part in folder.uri.split("/")[-2:])
     in_assets = named or any(name.lower().endswith((*MESH_SUFFIXES, ".mtl")) for name in folder.files)
     parts = map(posixpath.splitext, folder.files)
-    cameras = {stem + CAMERA_SUFFIX for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES}
+    pictures = [stem for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES]
+    recorded = {stem + suffix for stem in pictures for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX)}
     for name in folder.files:
-        kind = CAMERA_BESIDE if name in cameras else _classify_file(folder.uri, name, in_assets)
+        kind = RECORDED if name in recorded else _classify_file(folder.uri, name, in_assets)
         if isinstance(kind, SceneKind):
             yield _make_entry(kind, posixpath.join(folder.uri, name))
         else:

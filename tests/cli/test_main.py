@@ -11,7 +11,7 @@ from tableverse_factory.cli.main import COMMANDS, app
 from tableverse_factory.core.version import __version__
 from tests.helpers.paths import ROOT
 
-LAUNCH = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
+LAUNCH = [sys.executable, "-m", "tableverse_factory"]
 
 
 def test_the_version_is_printed(tableverse):
@@ -97,10 +97,19 @@ def test_ctrl_c_is_130_without_a_traceback():
     assert ended.stderr == ""
 
 
+@pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(given, used):
+    code = (
+        "import tableverse_factory.cli.main as m, os\ntry: m.main()\nfinally: print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], env=given, capture_output=True, text=True)
+    assert ended.stdout.splitlines()[-1] == used
+
+
 @pytest.mark.heavy
 def test_a_closed_pipe_is_no_traceback(tmp_path):
     """`tableverse config | head -1`."""
-    shell = f"{sys.executable} -c '{LAUNCH[2]}' config | head -1"
+    shell = f"{' '.join(LAUNCH)} config | head -1"
     ended = subprocess.run(["bash", "-c", shell], capture_output=True, text=True)
     assert ended.returncode == 0
     assert ended.stdout.startswith("# Every key")

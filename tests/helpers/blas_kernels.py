@@ -1,4 +1,4 @@
-"""Kernels of OpenBLAS as the children of builds have them, chosen before numpy loads it.
+"""Kernels and threads of OpenBLAS as the children of builds have them, chosen before numpy loads it.
 
 Results that a test computes in its own process then have the last digits of those of a build, on any processor.
 """
@@ -15,3 +15,4 @@ if "OPENBLAS_CORETYPE" not in os.environ and " avx2 " in Path("/proc/cpuinfo").r
             "a plugin of pytest imports numpy too early: name it in addopts (pyproject.toml) as `-p no:`"
         )
     os.environ["OPENBLAS_CORETYPE"] = "Haswell"
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

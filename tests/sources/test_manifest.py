@@ -16,6 +16,7 @@ from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.sources.discovery import RECORDED
 from tableverse_factory.sources.manifest import make_manifest, write_manifest
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout, write_picture
 
@@ -44,6 +45,13 @@ def test_captures_layouts_and_pictures_are_found(tmp_path):
     ]
     assert [row.scene_id.rpartition("-")[0] for row in made.rows] == ["table-1", "breakfast", "photo"]
     assert made.ignored == {"JSON that is no layout": 1, "mesh": 1, "other file": 1}
+
+
+def test_depth_and_camera_beside_a_picture_are_counted_together(tmp_path):
+    write_picture(tmp_path / "photo.jpg", 2)
+    for name in ("photo.depth.npy", "photo.camera.json", "lone.depth.npy"):
+        (tmp_path / name).write_text("{}")
+    assert make_manifest([str(tmp_path)], BOUNDS).ignored == {RECORDED: 2, "other file": 1}
 
 
 def test_what_lies_in_a_capture_or_beside_meshes_belongs_to_it(tmp_path):

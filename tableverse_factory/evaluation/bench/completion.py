@@ -16,13 +16,12 @@ from schemas.identity import make_object_id
 from schemas.objects import PerceivedObject, PerceivedObjects, Table
 from schemas.observation import Observation
 from schemas.outcome import Done
-from tableverse_factory.core.errors import GeometryError, InputError
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.open3d_import import o3d
-from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.evaluation.bench.measurement import find_meshes
+from tableverse_factory.evaluation.bench.measurement import read_meshes
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points
-from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, place_mesh, read_mesh
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 from tableverse_factory.geometry.mesh.voxel_solids import VoxelGrid, extract_surface, make_grid
 from tableverse_factory.models.services import Services
@@ -42,7 +41,6 @@ NOISE_M = 0.001
 ERROR_PX = 3.0
 SIZE_RANGE_M = (0.005, 1.0)  # of what a camera at that distance sees whole, and as more than pixels [m]
 TABLE_HALF_M = 1.0
-MOST_NAMED = 5  # bad meshes in one message
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +65,8 @@ def bench_completion(
 
     A view is the azimuth and elevation of a camera [degrees]; `error_m` is that of `render_noisy_view`.
     """
-    paths = find_meshes(folder)
-    if not paths:
-        raise InputError(
-            f"{sanitize_line(str(folder))} holds no meshes: give a folder of {', '.join(MESH_SUFFIXES)} files"
-        )
     scores: list[CompletionScore] = []
-    for index, (path, scan) in enumerate(zip(paths, _read_scans(paths), strict=True)):
+    for index, (name, scan) in enumerate(read_meshes(folder, check=_check_size)):
         truth = stand_on_table(scan)
         share, cavity = measure_cavity(truth)
         hollow = share >= HOLLOW_SHARE
@@ -81,38 +74,19 @@ def bench_completion(
             rng = np.random.default_rng([seed, index, view])
             scene = render_noisy_view([truth], np.deg2rad(azimuth), np.deg2rad(elevation), rng, error_m=error_m)
             for method, mesh, cpu_s in _complete_all(scene):
-                plain = score_completion(path.name, view, method, truth, mesh)
+                plain = score_completion(name, view, method, truth, mesh)
                 kept = 1.0 - float(contains_points(mesh, cavity).mean()) if hollow else float("nan")
                 scores.append(replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s))
     return scores
 
 
-def _read_scans(paths: Sequence[Path]) -> list[TriangleMesh]:
-    """Read all scans; an `InputError` names the bad ones together."""
-    scans, errors = [], []
-    for path in paths:
-        try:
-            scans.append(_read_scan(path))
-        except OSError as error:
-            errors.append(f"{sanitize_line(path.name)}: {error.strerror}")
-        except (InputError, GeometryError) as error:
-            errors.append(str(error))
-    if errors:
-        more = f"; and {len(errors) - MOST_NAMED} more" if len(errors) > MOST_NAMED else ""
-        raise InputError("; ".join(errors[:MOST_NAMED]) + more)
-    return scans
-
-
-def _read_scan(path: Path) -> TriangleMesh:
-    mesh = read_mesh(path.read_bytes(), path.name)
+def _check_size(name: str, mesh: TriangleMesh) -> None:
     size = np.ptp(mesh.vertices, axis=0)
     if size.min() <= 0.0:
-        raise InputError(f"{sanitize_line(path.name)} is flat: give a solid")
+        raise InputError(f"{name} is flat: give a solid")
     if not SIZE_RANGE_M[0] <= size.max() <= SIZE_RANGE_M[1]:
         given, (low, high) = " x ".join(f"{side:g}" for side in size), SIZE_RANGE_M
-        name = sanitize_line(path.name)
         raise InputError(f"{name} is {given} m: give a solid in metres, {low:g} to {high:g} m along its longest side")
-    return mesh
 
 
 def _complete_all(scene: PerceivedObjects) -> Iterator[tuple[str, TriangleMesh, float]]:

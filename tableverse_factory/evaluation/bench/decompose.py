@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import mean
 
 import numpy as np
@@ -16,7 +15,6 @@ from tableverse_factory.geometry.convex.decompose import decompose_shape
 from tableverse_factory.geometry.convex.metrics import add_metrics
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.mesh.hulls import make_bounded_hull
-from tableverse_factory.geometry.mesh.meshes import MESH_SUFFIXES, read_mesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid
 
 
@@ -53,36 +51,43 @@ DECOMPOSITIONS: dict[str, Callable[[TriangleMesh], list[Points]]] = {
 }
 
 
+def check_methods(methods: Sequence[str]) -> None:
+    """Check that all methods are keys of `DECOMPOSITIONS`, each named once, else raise `InputError`."""
+    for name in methods:
+        if name not in DECOMPOSITIONS:
+            raise InputError(f"unknown method {name!r}: choose from {', '.join(DECOMPOSITIONS)}")
+        if methods.count(name) > 1:
+            raise InputError(f"method {name!r} is named twice: once is enough")
+
+
 def bench_decompose(
-    files: Sequence[Path], methods: Sequence[str], on_mesh: Callable[[], object] = lambda: None
+    meshes: Sequence[tuple[str, TriangleMesh]],
+    methods: Sequence[str],
+    on_mesh: Callable[[], object] = lambda: None,
 ) -> list[PieceScore]:
-    """Run methods (keys of `DECOMPOSITIONS`) on every mesh and compare the pieces with the repaired solid."""
-    if unknown := [name for name in methods if name not in DECOMPOSITIONS]:
-        raise InputError(f"unknown method {unknown[0]!r}: choose from {', '.join(DECOMPOSITIONS)}")
-    if not files:
-        raise InputError(f"no mesh found: give a folder of {', '.join(MESH_SUFFIXES)} files")
+    """Run methods (keys of `DECOMPOSITIONS`) on every named mesh and compare the pieces with the repaired solid."""
     scores: list[PieceScore] = []
-    for file in files:
-        scores += _measure_mesh(file, methods)
+    for name, mesh in meshes:
+        scores += _measure_mesh(name, mesh, methods)
         on_mesh()
     return scores
 
 
-def _measure_mesh(file: Path, methods: Sequence[str]) -> list[PieceScore]:
-    shape = _scale_to_unit(read_mesh(file.read_bytes(), file.name))
+def _measure_mesh(name: str, mesh: TriangleMesh, methods: Sequence[str]) -> list[PieceScore]:
+    shape = _scale_to_unit(mesh)
     solid, _ = make_closed_solid(shape)
     scores: list[PieceScore] = []
-    for name in methods:
+    for method in methods:
         started = time.process_time()
-        corners = DECOMPOSITIONS[name](shape)
+        corners = DECOMPOSITIONS[method](shape)
         cpu_s = time.process_time() - started
         hulls = tuple(make_bounded_hull(points, len(points), 0.0) for points in corners)
-        pieces = add_metrics(ConvexPieces(hulls, 0.0, 0.0, name), solid)
+        pieces = add_metrics(ConvexPieces(hulls, 0.0, 0.0, method), solid)
         first_s = scores[0].cpu_s if scores else cpu_s
         scores.append(
             PieceScore(
-                mesh=file.name,
-                method=name,
+                mesh=name,
+                method=method,
                 cpu_s=cpu_s,
                 faster=_over(first_s, cpu_s),
                 pieces=len(hulls),

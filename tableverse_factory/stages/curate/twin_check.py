@@ -25,6 +25,7 @@ class TwinCheck:
     coverage: Coverage | None
     n_things: int  # objects, without copies, and those that are left out
     n_lost: int  # those of them that toppled, slid or are left out
+    n_poor: int = 0  # those of them that did not, and of whose masks too little is covered
 
     @property
     def covered(self) -> float | None:
@@ -45,21 +46,25 @@ class TwinCheck:
     @property
     def most_points(self) -> int:
         """Most points of quality, 1 to 10: a scene has no more of them than its twin shows of the photograph."""
+        right = 1.0 - (self.n_lost + self.n_poor) / max(self.n_things, 1)
         known = [share for share in (self.explained_area, self.covered) if share is not None]
-        return int(1.5 + 9 * min(known, default=1.0))
+        return int(1.5 + 9 * min([right, *known]))
 
 
 def check_twin(scene: SettledScene, meshes: tuple[TriangleMesh, ...]) -> TwinCheck:
     """Check a settled scene; `meshes` are those of its objects, in the table frame."""
-    placed = scene.rectified.placed
+    placed, coverage = scene.rectified.placed, _measure_coverage(scene.rectified.placed, meshes)
     moved = [measure_displacement(item, pose) for item, pose in zip(placed.objects, scene.poses, strict=True)]
     own = [displacement for displacement in moved if displacement is not None]
     explanation = placed.explanation
     return TwinCheck(
         None if explanation is None else explanation.measure_shares({o.object_id for o in placed.objects})[1],
-        _measure_coverage(placed, meshes),
+        coverage,
         len(own) + len(placed.left_out),
         sum(bool(displacement.kind) for displacement in own) + len(placed.left_out),
+        0
+        if coverage is None
+        else sum(poor and not (d and d.kind) for poor, d in zip(coverage.poor, moved, strict=True)),
     )
 
 

@@ -8,8 +8,6 @@ from schemas.scene import CuratedScene
 from tableverse_factory.geometry.relations.displacement import measure_displacement
 from tableverse_factory.physics.mjcf.spec import SceneBody
 
-POORLY_COVERED = 0.5  # less of an object's mask than this is worth a remark
-
 
 @dataclass(frozen=True, slots=True)
 class Fidelity:
@@ -27,11 +25,10 @@ def describe_fidelity(scene: CuratedScene, bodies: Sequence[SceneBody]) -> Fidel
     kinds = ["" if displacement is None else displacement.kind for displacement in moved]
     covered: Sequence[float | None] = [None] * len(ids) if coverage is None else coverage.of_objects
     points, area = (None, None) if placed.explanation is None else placed.explanation.measure_shares(ids)
-    known = ((name, share) for name, share in zip(ids, covered, strict=True) if share is not None)
     remarks = [
         *(f"{kind}:{name}" for name, kind in zip(ids, kinds, strict=True) if kind),
         *(f"left_out:{name}" for name, _ in placed.left_out),
-        *(f"poorly_covered:{name}" for name, share in known if share < POORLY_COVERED),
+        *(f"poorly_covered:{name}" for name, poor in zip(ids, coverage.poor if coverage else (), strict=False) if poor),
     ]
     columns = {
         "explained_points": points,

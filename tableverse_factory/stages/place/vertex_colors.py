@@ -1,7 +1,7 @@
 """Vertex colours from the picture: observed where visible, from similar points elsewhere."""
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Colors, Points, Pose, TriangleMesh
@@ -9,15 +9,19 @@ from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import invert_pose, rotation_matrix, transform_points
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.mesh.occluding_edges import find_behind_edges
-from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
-from tableverse_factory.stages.place.view.object_view import ObjectView
+from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene, pack_rays
+from tableverse_factory.stages.place.view.object_view import Distances, ObjectView
 
 NEIGHBOURS = 5
 SOURCES = 8000
-LEAF_SIZE = 64  # points in a leaf of the tree: in seven dimensions half the time of the default
+LEAF_SIZE = 64  # points in a leaf of the tree: in eight dimensions half the time of the default
 NORMAL_M = 0.03  # half the extra distance of a surface that faces the opposite way [m]
 LEAST_SHARE = 0.2  # of the points that must show the mesh, and not behind an edge
 COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
+INSIDE_M = 0.12  # extra distance between the inside of a vessel and its outside, which may have another colour [m]
+OFFSET_M = 0.002  # from a surface to where its surroundings are looked for [m]
+LEVEL_RAYS = 8  # directions in which a vessel surrounds what is inside
+LEAST_MET = 7  # of them: one may leave through a chip or a spout
 # Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame.
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
 
@@ -28,7 +32,7 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView, *, projecte
     `projected` takes the points to where their rays meet the mesh, which their depth misses.
 
     The points also count turned by half and mirrored in the object's own upright frame, a little farther away: so the
-    back looks like the front, and the outside of a cup does not run into its inside.
+    back looks like the front. The inside of a vessel takes its colours from its inside, where any of it was seen.
     """
     seen, towards, shown = _project_sources(mesh, pose, view) if projected else (view.points, view.normals, view.colors)
     step = max(1, len(seen) // SOURCES)
@@ -37,12 +41,15 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView, *, projecte
     turn = rotation_matrix(to_own.quaternion_wxyz)
     points = transform_points(to_own, seen[::step])
     normals = towards[::step] @ turn.T
-    sources = np.concatenate(
-        [_stack_features(points * t, normals * t, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
-    )
     rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
     vertices = mesh.vertices @ rotation.T
-    targets = _stack_features(vertices, _compute_vertex_normals(TriangleMesh(vertices, mesh.faces)), 0.0)
+    own = TriangleMesh(vertices, mesh.faces)
+    scene, outward = make_raycasting_scene(own), _compute_vertex_normals(own)
+    inside = _measure_inside(scene, points, normals)
+    sources = np.concatenate(
+        [_stack_features(points * t, normals * t, inside, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
+    )
+    targets = _stack_features(vertices, outward, _measure_inside(scene, vertices, outward), 0.0)
     colors = _mix_colors(sources, np.tile(shown[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
@@ -82,11 +89,28 @@ def _extract_heading(pose: Pose) -> Float64[np.ndarray, "4"]:
     return np.array([w, 0.0, 0.0, z]) / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def _stack_features(points: Points, normals: Points, offset: float) -> Float64[np.ndarray, "n 7"]:
-    return np.concatenate([points, NORMAL_M * normals, np.full((len(points), 1), offset)], axis=1)
+def _measure_inside(scene: RaycastingScene, points: Points, normals: Points) -> Distances:
+    """Measure how far inside a vessel points count [m]: `INSIDE_M` in it, half at its rim, 0 outside; z is up."""
+    before = points + OFFSET_M * normals
+    inside = _find_surrounded(scene, before)
+    rim = ~inside & _find_surrounded(scene, before - np.array([0.0, 0.0, 2 * OFFSET_M]))
+    return INSIDE_M * inside + INSIDE_M / 2 * rim
 
 
-def _mix_colors(sources: Float64[np.ndarray, "n 7"], colors: Colors, targets: Float64[np.ndarray, "m 7"]) -> Colors:
+def _find_surrounded(scene: RaycastingScene, points: Points) -> Bool[np.ndarray, " n"]:
+    """Find the points that a mesh surrounds to the sides and not above."""
+    angles = 2.0 * np.pi / LEVEL_RAYS * np.arange(LEVEL_RAYS)
+    level = np.stack([np.cos(angles), np.sin(angles), np.zeros(LEVEL_RAYS)], axis=1)
+    rays = pack_rays(points[:, None], np.concatenate([level, [[0.0, 0.0, 1.0]]]))
+    met = scene.test_occlusions(rays, nthreads=1).numpy()
+    return np.asarray((met[:, :-1].sum(axis=1) >= LEAST_MET) & ~met[:, -1])
+
+
+def _stack_features(points: Points, normals: Points, inside: Distances, offset: float) -> Float64[np.ndarray, "n 8"]:
+    return np.column_stack([points, NORMAL_M * normals, inside, np.full(len(points), offset)])
+
+
+def _mix_colors(sources: Float64[np.ndarray, "n 8"], colors: Colors, targets: Float64[np.ndarray, "m 8"]) -> Colors:
     count = min(NEIGHBOURS, len(sources))
     distance, index = cKDTree(sources, LEAF_SIZE).query(targets, k=count)
     distance, index = np.reshape(distance, (-1, count)), np.reshape(index, (-1, count))

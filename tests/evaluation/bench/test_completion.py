@@ -46,8 +46,9 @@ def test_a_height_field_fills_all_below_the_points():
     assert abs(field.volume / (0.1 * 0.06 * 0.05) - 1.0) < 0.08
 
 
-def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run):
-    code, out, err = run("bench", "completion", tmp_path)
+@pytest.mark.parametrize("bench", ["completion", "decompose"])
+def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run, bench):
+    code, out, err = run("bench", bench, tmp_path)
     assert (code, out) == (1, "")
     assert "holds no meshes: give a folder of .obj, .ply, .stl, .glb files\n" in err
 

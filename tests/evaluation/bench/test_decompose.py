@@ -11,9 +11,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from tableverse_factory.cli.main import app
-from tableverse_factory.core.errors import InputError
 from tableverse_factory.evaluation.bench.decompose import bench_decompose, summarize_pieces
-from tableverse_factory.evaluation.bench.measurement import find_meshes
+from tableverse_factory.evaluation.bench.measurement import read_meshes
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj
 
@@ -30,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.heavy
 def test_a_box_is_one_piece_of_its_own_volume_and_a_bowl_stays_open(folder: Path) -> None:
-    bowl, box = bench_decompose(find_meshes(folder), ["cut"])
+    bowl, box = bench_decompose(read_meshes(folder), ["cut"])
     assert (bowl.mesh, box.mesh) == ("bowl.obj", "box.obj")
     assert box.pieces == 1
     assert box.volume_ratio == pytest.approx(1.0, abs=1e-6)
@@ -56,12 +55,20 @@ def test_the_command_compares_with_the_first_method(folder: Path) -> None:
     assert [row["method"] for row in answer["together"]] == ["coacd", "cut"]
 
 
-def test_unknown_methods_and_empty_folders_are_named(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="unknown method 'magic'"):
-        bench_decompose(find_meshes(folder), ["magic"])
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no mesh found"):
-        bench_decompose(find_meshes(tmp_path / "empty"), ["cut"])
+def test_bad_meshes_are_named_together(tmp_path, run):
+    for name in "abcdefg":
+        (tmp_path / f"{name}.stl").write_bytes(b"solid")
+    (tmp_path / "box.stl").write_bytes(trimesh.creation.box().export(file_type="stl"))
+    code, out, err = run("bench", "decompose", tmp_path)
+    assert (code, out) == (1, "")
+    assert [name for name in "abcdefg" if f"{name}.stl" in err] == list("abcde")
+    assert "and 2 more" in err
+
+
+def test_wrong_methods_are_named_before_a_mesh_is_read(tmp_path, run):
+    (tmp_path / "a.stl").write_bytes(b"solid")
+    assert "unknown method 'magic'" in run("bench", "decompose", tmp_path, "--methods", "cut,magic")[2]
+    assert "method 'cut' is named twice" in run("bench", "decompose", tmp_path, "--methods", "cut, cut")[2]
 
 
 @pytest.mark.heavy

@@ -83,6 +83,7 @@ def test_things_that_moved_away_cover_less_and_cost_points():
     assert one.coverage.of_objects[0] == 0.0
     assert one.most_points < whole.most_points == 10
     assert (whole.n_lost, one.n_lost) == (0, 1)
+    assert (whole.n_poor, one.n_poor) == (0, 0), "what is lost counts once"
 
 
 def test_a_quarter_of_the_things_may_topple_slide_or_be_left_out():
@@ -98,3 +99,4 @@ def test_a_quarter_of_the_things_may_topple_slide_or_be_left_out():
 def test_points_follow_the_smaller_share():
     assert TwinCheck(0.5, None, 4, 0).most_points == 6
     assert TwinCheck(None, None, 4, 0).most_points == 10
+    assert TwinCheck(1.0, None, 4, 1, 1).most_points == 6

@@ -185,6 +185,22 @@ def test_visible_vertices_wear_the_picture() -> None:
     assert np.abs(colors.astype(int) - [200, 30, 20]).max() <= 2
 
 
+def test_the_hidden_floor_of_a_red_mug_is_white_as_its_wall_inside() -> None:
+    scene = seen(cup(0.04, 0.1, 0.004), noise_m=0.0003)
+    points = transform_points(scene.camera_to_table, backproject(scene.observation.depth, scene.observation.camera))
+    inside = np.hypot(points[..., 0], points[..., 1]) < 0.038
+    color = np.where(inside[..., None], np.uint8([240, 240, 235]), np.uint8([190, 20, 30]))
+    (item,) = placed(replace(scene, observation=replace(scene.observation, color=color))).objects
+    vertices, colors = standing(item).vertices, item.mesh.vertex_colors
+    assert colors is not None
+    outward = np.asarray(to_trimesh(standing(item)).vertex_normals)
+    floor = (outward[:, 2] > 0.9) & (vertices[:, 2] < 0.02)
+    assert colors[floor].min() > 200
+    rim = (vertices[:, 2] > 0.097) & (np.hypot(vertices[:, 0], vertices[:, 1]) < 0.037)
+    assert np.median(colors[rim], axis=0)[1] > 200
+    assert colors[(vertices[:, 2] < 0.02) & (outward[:, 2] < 0.1)][:, 1].max() < 60
+
+
 def test_equal_input_gives_equal_bytes() -> None:
     scene = seen(cup(0.04, 0.09, 0.004), box(0.06, 0.05, 0.1, x=0.16))
     first = encode(run(scene))

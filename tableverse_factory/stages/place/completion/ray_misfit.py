@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.special import huber
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.camera import backproject
@@ -20,6 +21,7 @@ SILHOUETTE_M = 0.003
 # Of estimated depth: how much errors of an object's relief count, and of its distance, and the most that one counts
 # [m]. It is bent by more than the thickness of a wall, and the silhouette and the support tell the distance better.
 RELIEF, DISTANCE, WORST_RELIEF_M = 0.25, 0.1, 0.008
+COMMON_SHARE = 0.03  # of the distance, by which it is often off: where the Huber loss of the distance becomes linear
 ESTIMATED_RAYS = 1600
 MISS_M = 1e6  # depth at which a ray meets nothing [m]; finite, so that it can be subtracted and weighted
 
@@ -76,12 +78,17 @@ def compute_misfit(rays: RaySample, hit: Depths) -> float:
 
 
 def _weigh_estimated(rays: RaySample, ahead: Depths, hit: Depths) -> Depths:
-    """Weigh the errors of estimated depth [m]: those of the relief, about their median, and the median itself."""
+    """Weigh the errors of estimated depth [m]: those of the relief, about their median, and the median itself.
+
+    The median has a Huber loss: a net shows bowls sunk into the table, and one that must lie so comes out flat.
+    """
     met = (hit != MISS_M) & (rays.facing > 0.0)
     if not met.any():
         return np.abs(ahead)
     middle = float(np.median(ahead[met]))
-    return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle), WORST_RELIEF_M) + DISTANCE * abs(middle))
+    common = COMMON_SHARE * float(rays.end[: len(ahead)][met].mean())
+    off = float(huber(common, middle)) / common
+    return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle), WORST_RELIEF_M) + DISTANCE * off)
 
 
 def compute_mesh_misfit(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> float:

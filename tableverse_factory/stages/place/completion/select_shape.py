@@ -23,7 +23,13 @@ from tableverse_factory.stages.place.completion.ray_misfit import (
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
 from tableverse_factory.stages.place.completion.torn import hides_others, is_torn
-from tableverse_factory.stages.place.completion.turned import TurnedShape, fit_lying, fit_standing, shows_cavity
+from tableverse_factory.stages.place.completion.turned import (
+    TurnedShape,
+    fit_lying,
+    fit_standing,
+    fit_vessel,
+    shows_cavity,
+)
 from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid, intersect_turned
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.completion.warp import warp_to_depth
@@ -160,9 +166,9 @@ def _draft_turned(view: ObjectView, rays: RaySample, shape: TurnedShape | None) 
 
 def _draft_vessel(view: ObjectView, rays: RaySample) -> Draft | None:
     """Draft a turned shape whose cavity was seen: where smeared depth tears a surface of revolution, it stays whole."""
-    profile, misfit = fit_standing(view, rays)
-    if not shows_cavity(rays, profile):
+    if (shape := fit_vessel(view, rays)) is None:
         return None
+    profile, misfit = shape
 
     def finish() -> Shape:
         mesh, pose, cost = join_handles(view, rays, *build_turned_solid(profile), profile.frame)

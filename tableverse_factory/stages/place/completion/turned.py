@@ -55,6 +55,8 @@ FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
 _LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
 
 Kind = Literal["solid", "hollow", "lying"]
+KindTemplates = tuple[Kind, tuple[tuple[float, ...], ...]]
+STANDING_KINDS: tuple[KindTemplates, KindTemplates] = (("solid", STANDING), ("hollow", HOLLOW))
 # Middle x and y, logarithms of height and radii; then the height of a cavity's floor as a share of the whole, or the
 # heading of what lies.
 Numbers = Float64[np.ndarray, " n"]
@@ -73,7 +75,24 @@ def fit_standing(view: ObjectView, rays: RaySample) -> TurnedShape:
     Raises:
         GeometryError: if too little was seen to start from.
     """
-    return _fit_best(view, rays, _measure_footprint(view), (("solid", STANDING), ("hollow", HOLLOW)))
+    return _fit_best(view, rays, _measure_footprint(view), STANDING_KINDS)
+
+
+def fit_vessel(view: ObjectView, rays: RaySample) -> TurnedShape | None:
+    """Fit the best turned vessel that stands on the object's support.
+
+    None where the best solid template fits as well as the best hollow one, at their best sizes, or where the object's
+    rays do not meet the cavity.
+
+    Raises:
+        GeometryError: if too little was seen to start from.
+    """
+    footprint = _measure_footprint(view)
+    (_, solid, _), (kind, hollow, x) = (_find_template(view, rays, footprint, *each) for each in STANDING_KINDS)
+    if solid <= hollow:
+        return None
+    shape = _refine(view, rays, x, kind)
+    return shape if shows_cavity(rays, shape.profile) else None
 
 
 def shows_cavity(rays: RaySample, profile: TurnedProfile) -> bool:
@@ -107,16 +126,21 @@ def _fit_best(
     view: ObjectView,
     rays: RaySample,
     footprint: Rectangle,
-    kinds: tuple[tuple[Kind, tuple[tuple[float, ...], ...]], ...],
+    kinds: tuple[KindTemplates, ...],
 ) -> TurnedShape:
-    found = []
-    for kind, templates in kinds:
-        sized = [_fit_size(view, rays, footprint, np.log(np.array(template)), kind) for template in templates]
-        cost, x = min(sized, key=lambda entry: entry[0])
-        found.append((cost, kind, x))
-    least = min(cost for cost, *_ in found)
-    shapes = [_refine(view, rays, x, kind) for cost, kind, x in found if cost < least + HOPELESS_M]
+    found = [_find_template(view, rays, footprint, *each) for each in kinds]
+    least = min(cost for _, cost, _ in found)
+    shapes = [_refine(view, rays, x, kind) for kind, cost, x in found if cost < least + HOPELESS_M]
     return min(shapes, key=lambda shape: shape.misfit)
+
+
+def _find_template(
+    view: ObjectView, rays: RaySample, footprint: Rectangle, kind: Kind, templates: tuple[tuple[float, ...], ...]
+) -> tuple[Kind, float, Numbers]:
+    """Find the best template of a kind at its best size; returns its cost [m] and all numbers of the shape."""
+    sized = [_fit_size(view, rays, footprint, np.log(np.array(template)), kind) for template in templates]
+    cost, x = min(sized, key=lambda entry: entry[0])
+    return kind, cost, x
 
 
 def _propose_centers(view: ObjectView, footprint: Rectangle) -> list[Float64[np.ndarray, "2"]]:

@@ -57,3 +57,16 @@ def test_a_shape_before_the_background_costs_and_one_behind_it_does_not():
     rays = RaySample(np.zeros(3), np.zeros((3, 3)), np.array([0.5, 1.0, 1.0]), np.array([1.0]))
     assert compute_misfit(rays, np.array([0.5, 0.8, 1.1])) == pytest.approx(WORST_M)
     assert compute_misfit(rays, np.array([0.5, 1.1, MISS_M])) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("off_m", "cost_m"), [(0.01, 0.1 * 0.01**2 / 0.06), (0.03, 0.1 * 0.015), (-0.05, 0.1 * (0.05 - 0.015))]
+)
+def test_the_distance_of_estimated_depth_costs_by_its_square_up_to_three_per_cent_and_then_linearly(off_m, cost_m):
+    rays = RaySample(np.zeros(3), np.zeros((3, 5)), np.ones(5), np.ones(5), estimated=True)
+    assert compute_misfit(rays, np.full(5, 1.0 - off_m)) == pytest.approx(cost_m)
+
+
+def test_an_error_of_the_relief_of_estimated_depth_costs_a_quarter():
+    rays = RaySample(np.zeros(3), np.zeros((3, 5)), np.ones(5), np.ones(5), estimated=True)
+    assert compute_misfit(rays, np.array([1.0, 1.0, 1.0, 1.0, 0.98])) == pytest.approx(0.25 * 0.02 / 5)
