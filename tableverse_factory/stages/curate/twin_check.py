@@ -25,7 +25,7 @@ class TwinCheck:
     coverage: Coverage | None
     n_things: int  # objects, without copies, and those that are left out
     n_lost: int  # those of them that toppled, slid or are left out
-    n_poor: int = 0  # those of them that did not, and of whose masks too little is covered
+    n_poor: int  # those of them that did not, and of whose masks too little is covered
 
     @property
     def covered(self) -> float | None:
@@ -55,16 +55,15 @@ def check_twin(scene: SettledScene, meshes: tuple[TriangleMesh, ...]) -> TwinChe
     """Check a settled scene; `meshes` are those of its objects, in the table frame."""
     placed, coverage = scene.rectified.placed, _measure_coverage(scene.rectified.placed, meshes)
     moved = [measure_displacement(item, pose) for item, pose in zip(placed.objects, scene.poses, strict=True)]
-    own = [displacement for displacement in moved if displacement is not None]
+    fallen = [displacement is not None and bool(displacement.kind) for displacement in moved]
+    poor = coverage.poor if coverage else (False,) * len(moved)
     explanation = placed.explanation
     return TwinCheck(
         None if explanation is None else explanation.measure_shares({o.object_id for o in placed.objects})[1],
         coverage,
-        len(own) + len(placed.left_out),
-        sum(bool(displacement.kind) for displacement in own) + len(placed.left_out),
-        0
-        if coverage is None
-        else sum(poor and not (d and d.kind) for poor, d in zip(coverage.poor, moved, strict=True)),
+        sum(displacement is not None for displacement in moved) + len(placed.left_out),
+        sum(fallen) + len(placed.left_out),
+        sum(one and not lost for one, lost in zip(poor, fallen, strict=True)),
     )
 
 

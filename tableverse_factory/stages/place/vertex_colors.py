@@ -14,7 +14,7 @@ from tableverse_factory.stages.place.view.object_view import Distances, ObjectVi
 
 NEIGHBOURS = 5
 SOURCES = 8000
-LEAF_SIZE = 64  # points in a leaf of the tree: in eight dimensions half the time of the default
+LEAF_SIZE = 64  # points in a leaf of the tree: in so many dimensions half the time of the default
 NORMAL_M = 0.03  # half the extra distance of a surface that faces the opposite way [m]
 LEAST_SHARE = 0.2  # of the points that must show the mesh, and not behind an edge
 COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]

@@ -86,6 +86,16 @@ def test_things_that_moved_away_cover_less_and_cost_points():
     assert (whole.n_poor, one.n_poor) == (0, 0), "what is lost counts once"
 
 
+def test_things_that_the_twin_shows_elsewhere_cost_points_though_they_stayed():
+    scene = photographed(kitchen())
+    evidence = scene.rectified.placed.evidence
+    assert evidence is not None
+    first, second, *others = evidence.object_pixels
+    swapped = check(with_placed(scene, evidence=replace(evidence, object_pixels=(second, first, *others))))
+    assert (swapped.n_lost, swapped.n_poor, swapped.n_things) == (0, 2, 7)
+    assert swapped.most_points <= int(1.5 + 9 * 5 / 7) < check(scene).most_points
+
+
 def test_a_quarter_of_the_things_may_topple_slide_or_be_left_out():
     scene = kitchen()
     left_out = (("obj_901", "too few points"),)
@@ -97,6 +107,6 @@ def test_a_quarter_of_the_things_may_topple_slide_or_be_left_out():
 
 
 def test_points_follow_the_smaller_share():
-    assert TwinCheck(0.5, None, 4, 0).most_points == 6
-    assert TwinCheck(None, None, 4, 0).most_points == 10
+    assert TwinCheck(0.5, None, 4, 0, 0).most_points == 6
+    assert TwinCheck(None, None, 4, 0, 0).most_points == 10
     assert TwinCheck(1.0, None, 4, 1, 1).most_points == 6
