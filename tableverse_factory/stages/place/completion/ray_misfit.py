@@ -21,7 +21,7 @@ SILHOUETTE_M = 0.003
 # Of estimated depth: how much errors of an object's relief count, and of its distance, and the most that one counts
 # [m]. It is bent by more than the thickness of a wall, and the silhouette and the support tell the distance better.
 RELIEF, DISTANCE, WORST_RELIEF_M = 0.25, 0.1, 0.008
-COMMON_SHARE = 0.03  # of the distance, by which it is often off: where the Huber loss of the distance becomes linear
+OFTEN_OFF = 0.03  # share of the distance by which a model's is often off: where its Huber loss becomes linear
 ESTIMATED_RAYS = 1600
 MISS_M = 1e6  # depth at which a ray meets nothing [m]; finite, so that it can be subtracted and weighted
 
@@ -37,6 +37,7 @@ class RaySample(Frozen):
     end: Depths  # observed depth of the ray's end [m]; 0 where it is unknown
     facing: Float64[np.ndarray, " own"]  # cosine of incidence where the object was seen, 0 where the end is unknown
     estimated: bool = False  # whether the depth is weighed as one that a model estimated
+    often_off_m: float = 0.0  # by which a model's distance is often off, below which it has a quadratic loss [m]
 
 
 def sample_rays(view: ObjectView, count: int | None = None, *, estimated: bool | None = None) -> RaySample:
@@ -51,6 +52,7 @@ def sample_rays(view: ObjectView, count: int | None = None, *, estimated: bool |
     own, past, end, facing = (of[raster].ravel() for of in (view.own, view.past, view.depth, view.facing))
     seen = np.flatnonzero(own)
     told = np.concatenate([seen, np.flatnonzero(past & ~own)])
+    known = end[seen][end[seen] > 0.0]
     unit = backproject(np.ones(view.own.shape), view.camera)[raster].reshape(-1, 3)[told]
     return RaySample(
         eye=view.eye,
@@ -58,6 +60,7 @@ def sample_rays(view: ObjectView, count: int | None = None, *, estimated: bool |
         end=end[told],
         facing=np.where(end[seen] > 0.0, facing[seen], 0.0),
         estimated=estimated,
+        often_off_m=OFTEN_OFF * float(known.mean()) if view.estimated and len(known) else 0.0,
     )
 
 
@@ -80,14 +83,13 @@ def compute_misfit(rays: RaySample, hit: Depths) -> float:
 def _weigh_estimated(rays: RaySample, ahead: Depths, hit: Depths) -> Depths:
     """Weigh the errors of estimated depth [m]: those of the relief, about their median, and the median itself.
 
-    The median has a Huber loss: a net shows bowls sunk into the table, and one that must lie so comes out flat.
+    A model's median has a Huber loss: a net shows bowls sunk into the table, and one that must lie so comes out flat.
     """
     met = (hit != MISS_M) & (rays.facing > 0.0)
     if not met.any():
         return np.abs(ahead)
     middle = float(np.median(ahead[met]))
-    common = COMMON_SHARE * float(rays.end[: len(ahead)][met].mean())
-    off = float(huber(common, middle)) / common
+    off = float(huber(rays.often_off_m, middle)) / rays.often_off_m if rays.often_off_m > 0.0 else abs(middle)
     return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle), WORST_RELIEF_M) + DISTANCE * off)
 
 

@@ -1,5 +1,7 @@
 """Rays against boxes: analytic intersections agree with ray casting, and misfits with what was rendered."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,7 +66,8 @@ def test_a_shape_before_the_background_costs_and_one_behind_it_does_not():
 )
 def test_the_distance_of_estimated_depth_costs_by_its_square_up_to_three_per_cent_and_then_linearly(off_m, cost_m):
     rays = RaySample(np.zeros(3), np.zeros((3, 5)), np.ones(5), np.ones(5), estimated=True)
-    assert compute_misfit(rays, np.full(5, 1.0 - off_m)) == pytest.approx(cost_m)
+    assert compute_misfit(replace(rays, often_off_m=0.03), np.full(5, 1.0 - off_m)) == pytest.approx(cost_m)
+    assert compute_misfit(rays, np.full(5, 1.0 - off_m)) == pytest.approx(0.1 * abs(off_m)), "of a sensor"
 
 
 def test_an_error_of_the_relief_of_estimated_depth_costs_a_quarter():
