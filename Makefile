@@ -7,7 +7,6 @@ DEMO ?= demo
 SCENES ?= 6
 TASKS ?= 3
 export OMP_NUM_THREADS ?= 1
-export OPENBLAS_NUM_THREADS ?= 1
 # Hundreds of processes import us in the tests: none of them compiles what another has compiled.
 unexport PYTHONDONTWRITEBYTECODE
 

@@ -61,9 +61,11 @@ class Coverage:
     of_objects: tuple[float | None, ...]
 
     @property
-    def poor(self) -> tuple[bool, ...]:
-        """Which objects' masks are covered too little."""
-        return tuple(share is not None and share < POORLY_COVERED for share in self.of_objects)
+    def poor(self) -> tuple[int, ...]:
+        """Indices of the objects whose masks are covered too little."""
+        return tuple(
+            index for index, share in enumerate(self.of_objects) if share is not None and share < POORLY_COVERED
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,15 +55,14 @@ def check_twin(scene: SettledScene, meshes: tuple[TriangleMesh, ...]) -> TwinChe
     """Check a settled scene; `meshes` are those of its objects, in the table frame."""
     placed, coverage = scene.rectified.placed, _measure_coverage(scene.rectified.placed, meshes)
     moved = [measure_displacement(item, pose) for item, pose in zip(placed.objects, scene.poses, strict=True)]
-    fallen = [displacement is not None and bool(displacement.kind) for displacement in moved]
-    poor = coverage.poor if coverage else (False,) * len(moved)
+    lost = [displacement is not None and bool(displacement.kind) for displacement in moved]
     explanation = placed.explanation
     return TwinCheck(
         None if explanation is None else explanation.measure_shares({o.object_id for o in placed.objects})[1],
         coverage,
         sum(displacement is not None for displacement in moved) + len(placed.left_out),
-        sum(fallen) + len(placed.left_out),
-        sum(one and not lost for one, lost in zip(poor, fallen, strict=True)),
+        sum(lost) + len(placed.left_out),
+        sum(not lost[index] for index in (coverage.poor if coverage else ())),
     )
 
 

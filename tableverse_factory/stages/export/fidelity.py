@@ -28,7 +28,7 @@ def describe_fidelity(scene: CuratedScene, bodies: Sequence[SceneBody]) -> Fidel
     remarks = [
         *(f"{kind}:{name}" for name, kind in zip(ids, kinds, strict=True) if kind),
         *(f"left_out:{name}" for name, _ in placed.left_out),
-        *(f"poorly_covered:{name}" for name, poor in zip(ids, coverage.poor if coverage else (), strict=False) if poor),
+        *(f"poorly_covered:{ids[index]}" for index in (coverage.poor if coverage else ())),
     ]
     columns = {
         "explained_points": points,

@@ -20,8 +20,10 @@ LEAST_SHARE = 0.2  # of the points that must show the mesh, and not behind an ed
 COPY_M = 0.008  # extra distance of a colour borrowed from the opposite side [m]
 INSIDE_M = 0.12  # extra distance between the inside of a vessel and its outside, which may have another colour [m]
 OFFSET_M = 0.002  # from a surface to where its surroundings are looked for [m]
-LEVEL_RAYS = 8  # directions in which a vessel surrounds what is inside
-LEAST_MET = 7  # of them: one may leave through a chip or a spout
+LEAST_MET = 7  # of the level directions, in which a vessel surrounds what is inside: one may be a chip or a spout
+_ANGLES = np.arange(8) * np.pi / 4
+_LEVEL = np.stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)], axis=1)
+_UP = np.array([0.0, 0.0, 1.0])
 # Identity, half a turn about the vertical, and reflections in the two upright planes of the object's own frame.
 _TURNS = np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]])
 
@@ -93,15 +95,13 @@ def _measure_inside(scene: RaycastingScene, points: Points, normals: Points) -> 
     """Measure how far inside a vessel points count [m]: `INSIDE_M` in it, half at its rim, 0 outside; z is up."""
     before = points + OFFSET_M * normals
     inside = _find_surrounded(scene, before)
-    rim = ~inside & _find_surrounded(scene, before - np.array([0.0, 0.0, 2 * OFFSET_M]))
+    rim = ~inside & _find_surrounded(scene, before - 2 * OFFSET_M * _UP)
     return INSIDE_M * inside + INSIDE_M / 2 * rim
 
 
 def _find_surrounded(scene: RaycastingScene, points: Points) -> Bool[np.ndarray, " n"]:
     """Find the points that a mesh surrounds to the sides and not above."""
-    angles = 2.0 * np.pi / LEVEL_RAYS * np.arange(LEVEL_RAYS)
-    level = np.stack([np.cos(angles), np.sin(angles), np.zeros(LEVEL_RAYS)], axis=1)
-    rays = pack_rays(points[:, None], np.concatenate([level, [[0.0, 0.0, 1.0]]]))
+    rays = pack_rays(points[:, None], np.vstack([_LEVEL, _UP]))
     met = scene.test_occlusions(rays, nthreads=1).numpy()
     return np.asarray((met[:, :-1].sum(axis=1) >= LEAST_MET) & ~met[:, -1])
 
