@@ -28,6 +28,9 @@ def bench_picture(
         Path | None, typer.Option(help="Folder of pictures that show no table-top.", exists=True, file_okay=False)
     ] = None,
     focal: Annotated[bool, typer.Option("--focal", help="Give the net the focal length of camera.json too.")] = False,
+    shapes: Annotated[
+        bool, typer.Option("--shapes", help="Compare the proportions of the shapes with those of the sensor's too.")
+    ] = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
@@ -35,7 +38,8 @@ def bench_picture(
     """Compare depth, table, scale and objects found in the colour of captures with their depth and masks.
 
     One scale is taken out of the depth error; measured, it is that of one distance which the sensor tells. Masks are
-    compared where there is a seg.png or masks.png. Of the folder --other the pictures are listed that are not dropped.
+    compared where there is a seg.png or masks.png, shapes by their height over their width. Of the folder --other the
+    pictures are listed that are not dropped.
 
     Example: `tableverse bench picture captures`
     """
@@ -46,7 +50,7 @@ def bench_picture(
 
     settings = load_config(config, overrides or [])
     with count_progress("pictures") as done:
-        scores = list(bench_pictures(folder, settings, focal, done.update))
+        scores = list(bench_pictures(folder, settings, focal, shapes, done.update))
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     total = summarize_pictures(scores)
@@ -77,6 +81,9 @@ def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
     print_figures(columns, rows, f"{note}, angle, scale and CPU s")
     if total.unread:
         print(f"{total.unread} captures could not be read: their rows say why")
+    if things := [thing for score in scores for thing in score.proportions]:
+        error = _format(100 * total.proportion_error)
+        print(f"height over width off by {error} % in the median of {len(things)} things; --json lists each")
     print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")
 
 

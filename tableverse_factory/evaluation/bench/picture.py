@@ -26,6 +26,7 @@ from tableverse_factory.evaluation.bench.perception import (
     read_true_masks,
     remove_unlabelled,
 )
+from tableverse_factory.evaluation.bench.picture_shapes import ProportionError, compare_proportions
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES
@@ -51,6 +52,7 @@ class PictureScore:
     masks: MaskScore | None = None  # None without true masks
     reason: str = ""  # why the picture was dropped, or the capture could not be read, or empty
     unread: bool = False
+    proportions: tuple[ProportionError, ...] = ()  # none unless they were asked for
 
     @property
     def is_within_sigma(self) -> bool:
@@ -72,25 +74,28 @@ class PictureSummary:
     within_sigma: float  # share of pictures whose scale is within the stated standard deviation
     cpu_s: float  # median [s]
     masks: MaskScore | None
+    proportion_error: float = float("nan")  # median over the things of all pictures
 
 
 def bench_pictures(
     folder: Path,
     config: Config,
     with_focal: bool = False,
+    with_shapes: bool = False,
     on_picture: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Iterator[PictureScore]:
     """Score the colour of every capture in `folder`, or of `folder` itself, by name; what cannot be read says so.
 
     What lies on the table, and where the table is, tells the sensor through the detector `geometric`; objects are those
-    of `seg.png` or `masks.png` where there is one. `with_focal` gives the net the capture's focal length.
+    of `seg.png` or `masks.png` where there is one. `with_focal` gives the net the capture's focal length. `with_shapes`
+    compares the proportions of the shapes too.
     """
     captures = list_captures(folder, [CAMERA_NAME])
     if not captures:
         raise InputError(f"{str(folder)!r} holds no capture: a folder with color.png, depth.png and camera.json")
     for done, capture in enumerate(captures, 1):
         try:
-            yield score_picture(capture, config, with_focal)
+            yield score_picture(capture, config, with_focal, with_shapes)
         except InputError as error:
             nothing = float("nan")
             figures = (nothing,) * 5
@@ -108,8 +113,8 @@ def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, st
         yield name, getattr(_perceive_picture(folder / name, config), "reason", "")
 
 
-def score_picture(capture: Path, config: Config, with_focal: bool = False) -> PictureScore:
-    """Run `observe` and `perceive` on the colour of a capture and compare with its depth and masks."""
+def score_picture(capture: Path, config: Config, with_focal: bool = False, with_shapes: bool = False) -> PictureScore:
+    """Run `observe` and `perceive` on the colour of a capture and compare with its depth and masks, and the shapes."""
     sensor, truth = _perceive_truth(capture, config)
     if with_focal:
         focal = config.observe.model_copy(update={"focal_px": sensor.camera.fx})
@@ -136,7 +141,11 @@ def score_picture(capture: Path, config: Config, with_focal: bool = False) -> Pi
     measured = compare_measured_depth(found.observation, sensor, wanted)
     plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))
     sigma = found.observation.scale_sigma
-    return PictureScore(capture.name, error, log_scale, sigma, measured, plane, cpu_s, masks)
+    shapes: tuple[ProportionError, ...] = ()
+    if with_shapes:
+        found_ids = resize_nearest(found.instance_ids, truth.instance_ids.shape)
+        shapes = compare_proportions(found, found_ids, truth, config)
+    return PictureScore(capture.name, error, log_scale, sigma, measured, plane, cpu_s, masks, proportions=shapes)
 
 
 def compare_depth(depth: DepthImage, true: DepthImage, wanted: np.ndarray) -> tuple[float, float]:
@@ -205,6 +214,7 @@ def summarize_pictures(scores: Sequence[PictureScore]) -> PictureSummary:
         _average(score.is_within_sigma for score in known),
         _find_median(score.cpu_s for score in scores),
         merge_scores(masks) if masks else None,
+        _find_median(thing.share for score in scores for thing in score.proportions),
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 import skimage
 from PIL import Image
 
+from schemas.config import Config
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.bench.picture import (
     PictureScore,
     compare_depth,
@@ -16,7 +19,12 @@ from tableverse_factory.evaluation.bench.picture import (
     resize_nearest,
     summarize_pictures,
 )
+from tableverse_factory.evaluation.bench.picture_shapes import ProportionError, compare_proportions
+from tableverse_factory.models.services import Services
+from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
+from tableverse_factory.stages.observe.observe import observe
+from tableverse_factory.stages.perceive.perceive import perceive
 
 DATA = Path(skimage.__file__).parent / "data"
 
@@ -91,6 +99,9 @@ def test_the_table_of_a_real_capture(tmp_path, run, shared_dir) -> None:
     for word in ("osd_test14", "depth %", "scale %", "mean IoU", "CPU s", "within one stated standard deviation"):
         assert word in said
     assert "without a table: 1 of 1 dropped; kept: none" in said
+    code, said, errors = run("bench", "picture", captures, "--shapes")
+    assert code == 0, errors
+    assert "height over width off by" in said
     code, said, errors = run("bench", "picture", captures, "--json")
     assert code == 0, errors
     (score,) = json.loads(said)["pictures"]
@@ -119,6 +130,31 @@ def test_a_folder_without_other_pictures_is_refused(tmp_path, run) -> None:
     code, _, errors = run("bench", "picture", tmp_path / "captures", "--other", tmp_path / "others")
     assert code != 0
     assert "notes.txt" in errors
+
+
+@pytest.mark.heavy
+def test_the_proportions_of_the_same_scene_at_another_scale_are_the_same(tmp_path) -> None:
+    capture = synthesize_captures(tmp_path, 1, 5)[0]
+    config = Config()
+    row = make_manifest([str(capture)], config.observe).rows[0]
+    seen = observe(row, config, make_rng(0, "a", "observe"), Services(Path())).value
+    sensed, larger = (
+        perceive(replace(seen, depth=seen.depth * scale), config, make_rng(0, "a", "perceive"), Services(Path())).value
+        for scale in (1.0, np.float32(1.25))
+    )
+    errors = compare_proportions(larger, larger.instance_ids, sensed, config)
+    assert errors
+    assert np.median([thing.share for thing in errors]) < 0.05
+    moved = np.roll(larger.instance_ids, larger.instance_ids.shape[1] // 2, axis=1)
+    assert len(compare_proportions(larger, moved, sensed, config)) < len(errors), "masks tell which thing it is"
+
+
+def test_too_flat_and_too_high_count_alike() -> None:
+    flat, high = (ProportionError("a", "b", "carved", math.log(ratio)) for ratio in (0.5, 2.0))
+    assert flat.share == pytest.approx(high.share) == pytest.approx(1.0)
+    total = summarize_pictures([make_score(proportions=(flat,)), make_score(proportions=(high, high))])
+    assert total.proportion_error == pytest.approx(1.0)
+    assert math.isnan(summarize_pictures([make_score()]).proportion_error)
 
 
 @pytest.mark.slow  # figures of a bench
