@@ -78,6 +78,11 @@ def fit_standing(view: ObjectView, rays: RaySample) -> TurnedShape:
     return _fit_best(view, rays, _measure_footprint(view), STANDING_KINDS)
 
 
+def fit_solid(view: ObjectView, rays: RaySample) -> TurnedShape:
+    """Fit the best turned solid that stands on the object's support; errors as of `fit_standing`."""
+    return _fit_best(view, rays, _measure_footprint(view), STANDING_KINDS[:1])
+
+
 def fit_vessel(view: ObjectView, rays: RaySample) -> TurnedShape | None:
     """Fit the best turned vessel that stands on the object's support.
 
