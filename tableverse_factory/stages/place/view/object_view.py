@@ -101,7 +101,7 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     color = scene.observation.color[rows, columns]
     own = ids == item.instance_id
     background_colors = find_background_colors(color, own, ids <= 0)
-    false = find_flying_pixels(background_colors, raw, own, ids <= 0)
+    false = find_flying_pixels(background_colors, color, raw, own, ids <= 0)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & find_denoised_pixels(item.points_camera, window, raw)
     bleed = _find_bleed(trusted, raw, window, pose, support.height)

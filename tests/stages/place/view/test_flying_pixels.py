@@ -12,6 +12,7 @@ from tableverse_factory.stages.place.view.flying_pixels import (
 from tableverse_factory.stages.place.view.object_pixels import NEAR, compute_color_share, find_foreign_colors
 
 RED, WOOD, BLACK = (190, 40, 45), (150, 115, 80), (12, 12, 14)
+PALE_WOOD = (164, 128, 93)  # within what counts as the table's colour, but with an edge
 CAMERA = Camera(300.0, 300.0, 40.0, 30.0, 80, 60)
 
 
@@ -45,14 +46,23 @@ def test_a_patch_of_the_table_that_the_mask_took_along_is_not_the_object():
     ramp = np.linspace(0.8, 1.0, 14)[None, :]
     color, depth, own = picture(patch=(slice(24, 36), slice(60, 74), WOOD, ramp))
     own[24:36, 60:74] = True
-    found = find_flying_pixels(find_background_colors(color, own, ~own), depth, own, ~own)
+    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own)
     assert found[24:36, 61:73].mean() > 0.7
     assert not found[:, :60].any()
 
 
-def test_a_face_of_the_tables_colour_that_ends_in_a_step_stays():
-    color, depth, own = picture(face=(slice(20, 40), slice(45, 60), WOOD, 0.8))
-    found = find_flying_pixels(find_background_colors(color, own, ~own), depth, own, ~own)
+def test_a_wide_patch_that_stands_out_in_depth_but_not_in_the_picture_is_not_the_object():
+    """As gloss makes them: the filter of a sensor fills what it could not read with the object's depth."""
+    color, depth, own = picture(patch=(slice(22, 38), slice(60, 76), WOOD, 0.8))
+    own[22:38, 60:76] = True
+    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own)
+    assert found[24:36, 62:75].mean() > 0.95
+    assert not found[:, :59].any()
+
+
+def test_a_face_much_like_the_table_that_the_picture_shows_to_end_stays():
+    color, depth, own = picture(face=(slice(20, 40), slice(45, 60), PALE_WOOD, 0.8))
+    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own)
     assert found[20:40, 49:56].sum() == 0, "only a rim may go"
 
 
@@ -61,7 +71,7 @@ def test_where_hue_tells_nothing_nothing_is_taken():
     color[:] = 170
     color[own] = 210
     color[20:40, 50:60] = 172
-    assert not find_flying_pixels(find_background_colors(color, own, ~own), depth, own, ~own).any()
+    assert not find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own).any()
 
 
 def test_a_ramp_to_what_lies_behind_is_found_and_a_face_is_not():
