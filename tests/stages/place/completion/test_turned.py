@@ -18,6 +18,7 @@ from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_pixel_rays, pack_rays
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
 from tableverse_factory.stages.place.completion.handle import join_handles
+from tableverse_factory.stages.place.completion.overlap import FREE
 from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample, sample_rays
 from tableverse_factory.stages.place.completion.select_shape import complete_by_carving
 from tableverse_factory.stages.place.completion.turned_profile import (
@@ -199,6 +200,18 @@ def test_what_errors_of_a_sensor_tear_becomes_plain(mesh: TriangleMesh, kind: st
     assert found.method == kind
     one, two = to_manifold(place(found)), to_manifold(mesh)
     assert (one ^ two).volume() > least * (one + two).volume()
+
+
+BOTTLE = stand_on_table(from_trimesh(trimesh.creation.icosphere(4).apply_scale((0.055, 0.025, 0.09))))
+
+
+@pytest.mark.parametrize(("mesh", "kinds"), [(CAN, ("carved/turned",)), (BOTTLE, FREE)])
+def test_what_a_shape_of_few_numbers_explains_as_well_is_one(mesh: TriangleMesh, kinds: tuple[str, ...]) -> None:
+    """A can by a sensor's usual errors is a can, not its dented front turned; what is not round stays free."""
+    (found,) = complete_all(look_by_wrong_depth(mesh, error_m=0.004))
+    assert found.method in kinds
+    one, two = to_manifold(place(found)), to_manifold(mesh)
+    assert (one ^ two).volume() > 0.75 * (one + two).volume()
 
 
 def _build_rack() -> TriangleMesh:
