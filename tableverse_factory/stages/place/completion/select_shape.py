@@ -49,8 +49,8 @@ RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of th
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
 
-# Misfit of a plain shape in place of a free one, as of estimated depth [m]. Where errors tore the free one 0.8 to 2.9 mm
-# of eleven that are right; else, over that of the free one, -0.4 to 0.7 mm of 19 that are right, 1.0 of wrong ones
+# Misfit of a plain shape in place of a free one, as of estimated depth [m]. Where errors tore the free one 0.8 to 2.9
+# mm of eleven that are right; else, over that of the free one, -0.4 to 0.7 mm of 19 that are right, 1.0 of wrong ones
 MOST_PLAIN_M, PLAINER_M = 0.003, 8e-4
 
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
