@@ -1,12 +1,13 @@
 """Flying pixels: false readings along an object's outline, where sensors and filters smear depth over an edge."""
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from scipy import ndimage
 from skimage.color import rgb2lab
 
 from schemas.geometry import Camera, DepthImage, Mask, Picture
 from tableverse_factory.geometry.math.camera import backproject
+from tableverse_factory.geometry.math.color_edges import convert_to_lab, measure_color_edges
 from tableverse_factory.stages.place.view.object_pixels import (
     INSET_PX,
     RARITY,
@@ -28,7 +29,6 @@ MOSTLY = 0.6
 # Median differences of colour over the border of a patch with the background, in CIELAB and as a share of that over its
 # border with the object: 1.0 to 2.5 of smears on real captures, 4 and more of parts
 MAX_EDGE, MAX_EDGE_SHARE = 3.0, 0.25
-BLUR_PX = 1.0  # of the noise in colours
 
 
 def find_background_colors(color: Picture, own: Mask, beside: Mask) -> Mask:
@@ -99,27 +99,7 @@ def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Ma
 def _find_edgeless_patches(patches: Mask, color: Picture, own: Mask, beside: Mask) -> Mask:
     """Find patches of which the picture shows no edge along their border with the background, but one to the object."""
     labels, count = ndimage.label(patches)
-    shown = ndimage.gaussian_filter(rgb2lab(color), (BLUR_PX, BLUR_PX, 0.0))
-    outer, inner = (_measure_edges(labels, count, shown, other) for other in (beside, own & ~patches))
+    shown = convert_to_lab(color)
+    outer, inner = (measure_color_edges(labels, count, shown, other) for other in (beside, own & ~patches))
     edgeless = (outer <= MAX_EDGE) & (outer <= MAX_EDGE_SHARE * inner)
     return np.concatenate([[False], edgeless])[labels]
-
-
-def _measure_edges(
-    labels: Int64[np.ndarray, "h w"], count: int, shown: Float64[np.ndarray, "h w 3"], other: Mask
-) -> Float64[np.ndarray, " count"]:
-    """Measure the median difference of colour of each label across its border with other pixels; infinite without one.
-
-    It is that between the nearest pixels that lie within either side by more than one pixel.
-    """
-    sides = ndimage.binary_erosion(labels > 0), ndimage.binary_erosion(other)
-    border = (labels > 0) & ndimage.binary_dilation(other)
-    if not border.any() or not all(side.any() for side in sides):
-        return np.full(count, np.inf)
-    within, beyond = (
-        shown[tuple(ndimage.distance_transform_edt(~side, return_distances=False, return_indices=True)[:, border])]
-        for side in sides
-    )
-    differences = np.linalg.norm(within - beyond, axis=1)
-    found = ndimage.median(differences, labels[border], np.arange(1, count + 1))
-    return np.where(np.isin(np.arange(1, count + 1), labels[border]), found, np.inf)
