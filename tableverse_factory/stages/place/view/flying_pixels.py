@@ -29,6 +29,7 @@ MOSTLY = 0.6
 # Median differences of colour over the border of a patch with the background, in CIELAB and as a share of that over its
 # border with the object: 1.0 to 2.5 of smears on real captures, 4 and more of parts
 MAX_EDGE, MAX_EDGE_SHARE = 3.0, 0.25
+MIN_ALONG = 0.5  # least border with the object over that with the background: 0.8 and more of smears
 
 
 def find_background_colors(color: Picture, own: Mask, beside: Mask) -> Mask:
@@ -97,9 +98,15 @@ def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Ma
 
 
 def _find_edgeless_patches(patches: Mask, color: Picture, own: Mask, beside: Mask) -> Mask:
-    """Find patches of which the picture shows no edge along their border with the background, but one to the object."""
+    """Find patches of which the picture shows no edge along their border with the background, but one to the object.
+
+    Smeared depth lies along the object; a handle in the colours of the background touches it with its ends alone.
+    """
     labels, count = ndimage.label(patches)
-    shown = convert_to_lab(color)
-    outer, inner = (measure_color_edges(labels, count, shown, other) for other in (beside, own & ~patches))
-    edgeless = (outer <= MAX_EDGE) & (outer <= MAX_EDGE_SHARE * inner)
+    shown, body = convert_to_lab(color), own & ~patches
+    outer, inner = (measure_color_edges(labels, count, shown, other) for other in (beside, body))
+    away, along = (
+        np.bincount(labels[ndimage.binary_dilation(other)], minlength=count + 1)[1:] for other in (beside, body)
+    )
+    edgeless = (outer <= MAX_EDGE) & (outer <= MAX_EDGE_SHARE * inner) & (along >= MIN_ALONG * away)
     return np.concatenate([[False], edgeless])[labels]
