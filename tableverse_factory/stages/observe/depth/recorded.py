@@ -1,6 +1,7 @@
 """Depth and camera recorded in files beside the picture, by any other model or sensor."""
 
 import io
+import json
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def read_depth_array(uri: str, bounds: ObserveConfig) -> DepthImage:
     try:
         values = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, OSError, EOFError, SyntaxError, TypeError, MemoryError, OverflowError) as error:
-        raise InputError(f"{name} is no array of numbers: {type(error).__name__}", "unreadable_depth") from error
+        raise InputError(f"{name} is no array of numbers as numpy.save writes it", "unreadable_depth") from error
     if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f" or values.size == 0:
         raise InputError(
             f"{name}: give metres as floats, one for each pixel, shape (height, width)", "unreadable_depth"
@@ -86,8 +87,8 @@ def _get_file_name(uri: str) -> str:
 def _read_number(name: str, value: dict[str, Any], key: str, low: float, high: float) -> float:
     number = parse_finite(value.get(key))
     if number is None or not low <= number <= high:
-        said = str(value.get(key))[:80]
-        raise InputError(f"{name}: {key} is {said!r}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
+        said = f"is {json.dumps(value[key])[:80]}" if key in value else "is missing"
+        raise InputError(f"{name}: {key} {said}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
     return number
 
 
