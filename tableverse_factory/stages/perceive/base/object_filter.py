@@ -3,10 +3,11 @@
 from collections.abc import Collection
 
 import numpy as np
+from scipy import ndimage
 
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.math.camera import project
-from tableverse_factory.geometry.math.color_edges import convert_to_lab, measure_color_edges
+from tableverse_factory.geometry.math.color_edges import FAINT_EDGE, blur_to_lab, measure_color_edges
 from tableverse_factory.geometry.math.planes import is_inside_outline
 from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise, expand_window
 
@@ -22,10 +23,10 @@ MIN_CARRIED = 0.1
 FLAT_M = 0.02
 RAGGED_AREA_M2 = 0.003
 RAGGED_EDGE_M = 0.03
-# Colours of a small region, in CIELAB: median change over its outline, 1.8 to 2.8 of three crumbs
-# of smeared depth and 4.2 of the faintest thing, and median difference of hue from what lies beside it
-MAX_FAINT_EDGE, SAME_HUE = 3.0, 6.0
-BESIDE_PX = 20
+SMALL_AREA_M2 = 0.003
+UNSEEN_COLOR = 5.0  # median colour of a region that is that beside it, in CIELAB: 0.9 to 3.7 of three false objects
+SATURATED = 98.0  # lightness from which the picture tells nothing
+SURROUNDINGS_PX = 12
 
 
 def keep_regions_over_table(ids: IdImage, view: TableView) -> IdImage:
@@ -42,7 +43,7 @@ def find_over_table(view: TableView) -> Mask:
 
 
 def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = (), *, by_depth: bool = True) -> IdImage:
-    """Keep the regions that are large enough, supported, and seen in the picture too, renumbered from 1.
+    """Keep the regions that are large enough and supported, renumbered from 1.
 
     `contents`, which stand in the opening of a vessel, may be smaller: no table is there for noise to raise. Far
     regions found `by_depth` must be larger, as the noise of a sensor grows; those that a net sees need not.
@@ -56,10 +57,31 @@ def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = (), 
             _is_large_enough(mask, view, least, by_depth=by_depth)
             and _is_carried(mask, ids, view)
             and not _is_ragged_edge(mask, inner, view)
-            and not _is_invisible(ids == k, ids <= 0, view)
         ):
             kept.append(k)
     return renumber_regions(ids, kept)
+
+
+def drop_unseen_regions(ids: IdImage, view: TableView) -> IdImage:
+    """Drop small regions that only the depth tells of, renumbered from 1: gloss makes a sensor read what is not there.
+
+    The picture shows no edge along their whole border, and their colour is that of what lies around them.
+    """
+    count = int(ids.max(initial=0))
+    return renumber_regions(ids, [k for k in range(1, count + 1) if not _is_unseen(ids == k, view)])
+
+
+def _is_unseen(region: Mask, view: TableView) -> bool:
+    if not region.any() or _measure_area(region & view.valid, view) >= SMALL_AREA_M2:
+        return False
+    window = expand_window(region, SURROUNDINGS_PX)
+    own = region[window]
+    lab = blur_to_lab(view.observation.color[window])
+    (edge,) = measure_color_edges(own.astype(np.int32), 1, lab, ~own)
+    around = ~own & ndimage.binary_dilation(own, iterations=SURROUNDINGS_PX)
+    shown, beside = (np.median(lab[pixels], axis=0) for pixels in (own, around))
+    unlike = float(np.linalg.norm(shown - beside))
+    return bool(edge <= FAINT_EDGE and unlike <= UNSEEN_COLOR and shown[0] < SATURATED)  # an unknown edge may be one
 
 
 def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:
@@ -111,19 +133,6 @@ def _is_carried(mask: Mask, ids: IdImage, view: TableView) -> bool:
     seen = view.valid[below, columns] & ((ids[below, columns] > 0) | ~view.raised[below, columns])
     carried = at_border | (seen & (touches | view.on_plane[below, columns] | (under[:, 2] < points[:, 2])))
     return float(carried.mean()) >= MIN_CARRIED
-
-
-def _is_invisible(mask: Mask, beside: Mask, view: TableView) -> bool:
-    """Whether the picture shows nothing where a small region rises: smeared depth, as gloss makes it."""
-    if _measure_area(mask & view.valid, view) >= RAGGED_AREA_M2:
-        return False
-    window = expand_window(mask, BESIDE_PX)
-    region, around = mask[window], beside[window]
-    shown = convert_to_lab(view.observation.color[window])
-    if not around.any() or measure_color_edges(region.astype(np.int32), 1, shown, around)[0] > MAX_FAINT_EDGE:
-        return False
-    hues = shown[..., 1:]
-    return float(np.median(np.linalg.norm(hues[around] - np.median(hues[region], axis=0), axis=1))) < SAME_HUE
 
 
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:

@@ -11,6 +11,7 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.box_overlap import compute_area
 from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult, PixelBox
 from tableverse_factory.stages.perceive.base.object_filter import (
+    drop_unseen_regions,
     keep_objects,
     keep_regions_over_table,
     renumber_regions,
@@ -94,6 +95,7 @@ def segment_depth(view: TableView) -> tuple[IdImage, dict[int, int]]:
     openings = find_rims(regions, part)
     regions = merge_vessel_walls(regions, openings, surface, part, least)
     regions = keep_objects(regions, part, find_rising_contents(regions, openings, part))
+    regions = drop_unseen_regions(regions, part)
     regions = add_insides(regions, openings, part)
     sizes = np.bincount(regions.ravel())[1:]
     regions = renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")])

@@ -13,6 +13,7 @@ from tableverse_factory.models.picture.instances import sum_affinities
 from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction, take_nearest
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
 from tableverse_factory.stages.perceive.base.object_filter import (
+    drop_unseen_regions,
     keep_objects,
     keep_regions_over_table,
     renumber_regions,
@@ -78,7 +79,7 @@ def _detect(view: TableView, seen: PicturePrediction, standing: Mask) -> Detecti
     attached = attach_border_pixels(whole, surface, own, compute_least_pixels(pitch))
     regions = keep_regions_over_table(np.where(part.valid, attached, 0), part)
     regions = merge_occluded_parts(regions, surface, part, with_vessels=False)
-    regions = keep_objects(regions, part, by_depth=False)
+    regions = drop_unseen_regions(keep_objects(regions, part, by_depth=False), part)
     # Holders come before their contents: by the pixels with a reading, as those of containers are compared.
     sizes = np.bincount(regions[part.valid], minlength=int(regions.max(initial=0)) + 1)[1:]
     regions = _add_unmeasured(regions, attached, part.valid)

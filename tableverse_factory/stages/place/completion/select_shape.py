@@ -1,14 +1,18 @@
 """The mesh model `carved`: the simplest of several kinds of shape that explains the picture."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Pose, TriangleMesh
 from schemas.objects import PerceivedObjects
 from tableverse_factory.core.errors import GeometryError
+from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
+from tableverse_factory.geometry.registration.register import measure_median_distance
 from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
 from tableverse_factory.stages.place.completion.handle import join_handles
@@ -23,7 +27,7 @@ from tableverse_factory.stages.place.completion.ray_misfit import (
 )
 from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
-from tableverse_factory.stages.place.completion.torn import hides_others, is_torn
+from tableverse_factory.stages.place.completion.torn import hides_others, is_torn, measure_fullness
 from tableverse_factory.stages.place.completion.turned import (
     TurnedShape,
     fit_lying,
@@ -49,9 +53,13 @@ RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of th
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
 
-# Misfit of a plain shape in place of a free one, as of estimated depth [m]. Where errors tore the free one 0.8 to 2.9
-# mm of eleven that are right; else, over that of the free one, -0.4 to 0.7 mm of 19 that are right, 1.0 of wrong ones
-MOST_PLAIN_M, PLAINER_M = 0.003, 8e-4
+MOST_PLAIN_M = 0.003  # misfit of a plain shape, as of estimated depth [m]: of eleven that are right 0.8 to 2.9 mm
+# By how much more than a free shape's that misfit may be [m]: at most, and by how much the free shape is dented, as the
+# share of its hull that it leaves empty. What is smooth follows no errors
+MOST_EXTRA_M, DENTED_M = 1e-3, 5e-3
+# Median distance of the readings from a shape that is not what the picture shows, over that from the camera: 0.036 to
+# 0.072 of five such in bare pictures, at most 0.031 of 380 others
+MAX_RESIDUAL_SHARE = 0.035
 
 Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement with the picture [m]
 
@@ -108,31 +116,51 @@ class _Search:
 def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion:  # noqa: ARG001
     """Fit boxes, surfaces of revolution, solids of a half turn, sheets, inflation and columns, and select the best.
 
-    A box or turned shape takes the place of a free one that errors of a sensor's depth tore, if it fits.
+    A box or turned shape takes the place of a free one that follows errors of a sensor's depth, if it fits.
+
+    Raises:
+        GeometryError: if no shape explains the points, or the best one lies far from them.
     """
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
-    search = _try_kinds(kinds, view, sample_rays(view), unavoidable)
+    rays = sample_rays(view)
+    search = _try_kinds(kinds, view, rays, unavoidable)
     if search.best is None:
         raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
     _, method, mesh, pose = search.best
     if method in FREE and not view.estimated:
-        method, mesh, pose = _find_plain(view, method, mesh, pose) or (method, mesh, pose)
+        method, mesh, pose = _find_plain(view, rays, method, mesh, pose) or (method, mesh, pose)
     if view.support.leaning:
         mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
+    _check_distance(view, mesh, pose)
     return Completion(mesh, pose, method)
 
 
-def _find_plain(view: ObjectView, method: str, mesh: TriangleMesh, pose: Pose) -> tuple[str, TriangleMesh, Pose] | None:
-    """Find a shape of few numbers in place of a free one.
+def _check_distance(view: ObjectView, mesh: TriangleMesh, pose: Pose) -> None:
+    """Refuse a shape far from the readings, before it cuts into its neighbours."""
+    residual_m = measure_median_distance(view.points, place_mesh(mesh, pose))
+    distance_m = float(np.median(np.linalg.norm(view.points - view.eye, axis=1)))
+    if residual_m > MAX_RESIDUAL_SHARE * distance_m:
+        raise GeometryError(
+            f"the best shape lies {1e3 * residual_m:.0f} mm from what was read {distance_m:.2f} m away, in the median; "
+            f"at most {1e3 * MAX_RESIDUAL_SHARE * distance_m:.0f} mm are allowed"
+        )
+
+
+def _find_plain(
+    view: ObjectView, measured: RaySample, method: str, mesh: TriangleMesh, pose: Pose
+) -> tuple[str, TriangleMesh, Pose] | None:
+    """Find a shape of few numbers in place of a free one; `measured` are the rays with the depth as measured.
 
     It explains the picture nearly as well, the depth weighed as if a model had estimated it; where errors of the depth
     tore the free shape, as well as one must there.
     """
     rays = sample_rays(view, estimated=True)
+    extra = min(MOST_EXTRA_M, DENTED_M * (1.0 - measure_fullness(mesh)))
+    most = compute_mesh_misfit(rays, mesh, pose) + extra
     if is_torn(view, method, mesh):
-        kinds, most = PLAIN_KINDS, MOST_PLAIN_M
+        kinds, most = PLAIN_KINDS, max(most, MOST_PLAIN_M)
     else:
-        kinds, most = SOLID_KINDS, compute_mesh_misfit(rays, mesh, pose) + PLAINER_M
+        kinds = (OUTLINED_BOX, Kind("carved/turned", 0.0, partial(_draft_turned_solid, measured)), OUTLINED_LYING)
     best = _try_kinds(kinds, view, rays, 0.0).best
     return None if best is None or best[0] > most or hides_others(view, *best[2:]) else best[1:]
 
@@ -200,9 +228,9 @@ def _draft_plain_turned(view: ObjectView, rays: RaySample) -> Draft | None:
     return None
 
 
-def _draft_plain_solid(view: ObjectView, rays: RaySample) -> Draft | None:
-    """Draft a turned solid fitted to the depth as measured."""
-    profile, _ = fit_solid(view, sample_rays(view))
+def _draft_turned_solid(measured: RaySample, view: ObjectView, rays: RaySample) -> Draft | None:
+    """Draft a turned solid fitted to the depth as measured; what has a cavity was a vessel before."""
+    profile, _ = fit_solid(view, measured)
     return _draft_turned(view, rays, TurnedShape(profile, compute_misfit(rays, intersect_turned(rays, profile))))
 
 
@@ -278,6 +306,3 @@ ESTIMATED_KINDS = (
 
 # What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
 PLAIN_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_turned), OUTLINED_LYING)
-
-# And for what lost nothing: what has a cavity was a vessel before.
-SOLID_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_solid), OUTLINED_LYING)

@@ -7,7 +7,6 @@ from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_pixel_rays
 from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
-from tableverse_factory.stages.place.completion.overlap import FREE
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MOST_TUNNELS = 10  # through a free shape, for each hole that the camera sees through, and one more; torn have 11 to 41
@@ -23,13 +22,19 @@ def is_torn(view: ObjectView, method: str, mesh: TriangleMesh) -> bool:
     Raises:
         GeometryError: if the mesh bounds no solid.
     """
-    if view.estimated or method not in FREE:
-        return False
-    solid = to_manifold(mesh)
     _, seen = ndimage.label(ndimage.binary_fill_holes(view.own) & view.past)
     if method == "carved/half_turn":
-        return bool(not seen and solid.volume() < MIN_FULL * float(ConvexHull(mesh.vertices).volume))
-    return bool(solid.genus() > MOST_TUNNELS * (1 + seen))
+        return bool(not seen and measure_fullness(mesh) < MIN_FULL)
+    return bool(to_manifold(mesh).genus() > MOST_TUNNELS * (1 + seen))
+
+
+def measure_fullness(mesh: TriangleMesh) -> float:
+    """Measure the share of its convex hull that a closed mesh fills: dents and flaps leave the rest.
+
+    Raises:
+        GeometryError: if the mesh bounds no solid.
+    """
+    return float(to_manifold(mesh).volume() / ConvexHull(mesh.vertices).volume)
 
 
 def hides_others(view: ObjectView, mesh: TriangleMesh, pose: Pose) -> bool:

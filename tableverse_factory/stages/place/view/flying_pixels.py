@@ -1,13 +1,13 @@
 """Flying pixels: false readings along an object's outline, where sensors and filters smear depth over an edge."""
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy import ndimage
 from skimage.color import rgb2lab
 
 from schemas.geometry import Camera, DepthImage, Mask, Picture
 from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.geometry.math.color_edges import convert_to_lab, measure_color_edges
+from tableverse_factory.geometry.math.color_edges import FAINT_EDGE, blur_to_lab, measure_color_edges
 from tableverse_factory.stages.place.view.object_pixels import (
     INSET_PX,
     RARITY,
@@ -26,10 +26,8 @@ RAMP_START_PX = 3
 RAMP_PX = 12
 CONTINUOUS_M = 0.01
 MOSTLY = 0.6
-# Median differences of colour over the border of a patch with the background, in CIELAB and as a share of that over its
-# border with the object: 1.0 to 2.5 of smears on real captures, 4 and more of parts
-MAX_EDGE, MAX_EDGE_SHARE = 3.0, 0.25
-MIN_ALONG = 0.5  # least border with the object over that with the background: 0.8 and more of smears
+FAINT_SHARE = 0.25  # most of the edge to the background, as a share of that to the object
+MIN_TOUCHING = 0.5  # least border with the object over the rest of the outline: 0.8 and more of smears
 
 
 def find_background_colors(color: Picture, own: Mask, beside: Mask) -> Mask:
@@ -47,18 +45,21 @@ def find_background_colors(color: Picture, own: Mask, beside: Mask) -> Mask:
     return ndimage.binary_opening(found) & own
 
 
-def find_flying_pixels(background_colors: Mask, color: Picture, raw: DepthImage, own: Mask, beside: Mask) -> Mask:
+def find_flying_pixels(
+    background_colors: Mask, color: Picture, raw: DepthImage, own: Mask, beside: Mask, *, measured: bool
+) -> Mask:
     """Find those of an object's pixels with background colours whose readings [m] were smeared.
 
     Sensors and their filters interpolate between an object and its background. Such pixels lie near the outline, or in
-    whole patches that continue into the background: their readings without a step, or the picture without an edge.
-    They are never more than half of the object.
+    whole patches that continue into the background: their readings without a step or, of `measured` depth, the picture
+    without an edge. They are never more than half of the object.
     """
     if not background_colors.any():
         return background_colors
     at_edge = background_colors & (_measure_inset(own) <= SMEARED_PX)
     smeared = at_edge | _find_continuous_patches(background_colors, raw, beside)
-    smeared |= _find_edgeless_patches(background_colors, color, own, beside)
+    if measured:
+        smeared |= _find_edgeless_patches(background_colors, color, own, beside)
     result = ndimage.binary_propagation(at_edge, mask=smeared)
     return result if result.sum() <= MOST_SMEARED * own.sum() else np.zeros_like(own)
 
@@ -98,15 +99,20 @@ def _find_continuous_patches(patches: Mask, raw: DepthImage, beside: Mask) -> Ma
 
 
 def _find_edgeless_patches(patches: Mask, color: Picture, own: Mask, beside: Mask) -> Mask:
-    """Find patches of which the picture shows no edge along their border with the background, but one to the object.
+    """Find patches of which the picture shows no edge to the background, but one to the object.
 
     Smeared depth lies along the object; a handle in the colours of the background touches it with its ends alone.
     """
     labels, count = ndimage.label(patches)
-    shown, body = convert_to_lab(color), own & ~patches
-    outer, inner = (measure_color_edges(labels, count, shown, other) for other in (beside, body))
-    away, along = (
-        np.bincount(labels[ndimage.binary_dilation(other)], minlength=count + 1)[1:] for other in (beside, body)
-    )
-    edgeless = (outer <= MAX_EDGE) & (outer <= MAX_EDGE_SHARE * inner) & (along >= MIN_ALONG * away)
-    return np.concatenate([[False], edgeless])[labels]
+    lab, body = blur_to_lab(color), own & ~patches
+    outer, inner = (measure_color_edges(labels, count, lab, other) for other in (beside, body))
+    touching = _count_border(labels, count, body)
+    outline = touching + _count_border(labels, count, ~own)
+    faint = (outer <= FAINT_EDGE) & (outer <= FAINT_SHARE * inner)  # false where either is not known
+    return np.concatenate([[False], faint & (touching >= MIN_TOUCHING * (outline - touching))])[labels]
+
+
+def _count_border(labels: Int64[np.ndarray, "h w"], count: int, other: Mask) -> Int64[np.ndarray, " count"]:
+    """Count the pixels of each label that border on others; the picture's border counts as one of the others."""
+    near = ndimage.binary_dilation(np.pad(other, 1, mode="edge"))[1:-1, 1:-1]
+    return np.bincount(labels[near], minlength=count + 1)[1:]

@@ -101,14 +101,14 @@ def view_object(scene: PerceivedObjects, item: PerceivedObject, support: DepthSu
     color = scene.observation.color[rows, columns]
     own = ids == item.instance_id
     background_colors = find_background_colors(color, own, ids <= 0)
-    false = find_flying_pixels(background_colors, color, raw, own, ids <= 0)
+    estimated = scene.observation.bend > 0.0
+    false = find_flying_pixels(background_colors, color, raw, own, ids <= 0, measured=not estimated)
     own, raw, ids = own & ~false, np.where(false, 0.0, raw), np.where(false, 0, ids)
     trusted = own & find_denoised_pixels(item.points_camera, window, raw)
     bleed = _find_bleed(trusted, raw, window, pose, support.height)
     own, trusted = own & ~bleed, trusted & ~bleed
     unread = (own & (raw <= 0.0)) | _find_own_colors(color, bleed, trusted, ids <= 0)
     trusted &= ~find_depth_ramps(raw, own, trusted, window)
-    estimated = scene.observation.bend > 0.0
     if estimated:
         trusted = drop_outline(own, trusted)
     own_depth = smooth_depth(raw, trusted) if estimated else filter_depth(raw, trusted)
