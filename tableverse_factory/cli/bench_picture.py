@@ -50,7 +50,7 @@ def bench_picture(
 
     settings = load_config(config, overrides or [])
     with count_progress("pictures") as done:
-        scores = list(bench_pictures(folder, settings, focal, shapes, done.update))
+        scores = list(bench_pictures(folder, settings, focal, done.update, with_shapes=shapes))
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     total = summarize_pictures(scores)
@@ -81,9 +81,12 @@ def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
     print_figures(columns, rows, f"{note}, angle, scale and CPU s")
     if total.unread:
         print(f"{total.unread} captures could not be read: their rows say why")
-    if things := [thing for score in scores for thing in score.proportions]:
+    if shapes := [score.shapes for score in scores if score.shapes is not None]:
+        compared, objects = (
+            sum(counts) for counts in zip(*((len(s.proportions), s.objects) for s in shapes), strict=True)
+        )
         error = _format(100 * total.proportion_error)
-        print(f"height over width off by {error} % in the median of {len(things)} things; --json lists each")
+        print(f"height over width off by {error} % in the median of {compared} of the sensor's {objects} objects")
     print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")
 
 

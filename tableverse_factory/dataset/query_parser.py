@@ -197,10 +197,14 @@ class _Parser:
             return _Operand(pc.scalar(token.text == "true"), "truth", False, token)
         if token.kind == "word":
             if token.text not in self._schema.names:
-                hint = _suggest_column(token.text, self._schema)
+                # Nothing but a text is likely to stand alone behind a comparison
                 compared = self._next > 1 and self._tokens[self._next - 2].text in _COMPARE
-                quotes = "; a text stands in quotes" if compared else ""
-                raise self._make_error(f"no column {token.text!r}; {hint}{quotes}", token)
+                hint = (
+                    f"write a text in quotes: '{token.text[:80]}'"
+                    if compared
+                    else _suggest_column(token.text, self._schema)
+                )
+                raise self._make_error(f"no column {token.text!r}; {hint}", token)
             kind = _classify_type(self._schema.field(token.text).type)
             return _Operand(pc.field(token.text), kind, True, token)
         hint = "; write: column is null" if token.text == "null" else ""

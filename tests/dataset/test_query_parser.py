@@ -164,7 +164,7 @@ ERRORS = [
     ("i < 'a'", 4, "i holds numbers, not texts"),
     ("'a' < i", 0, "i holds numbers, not texts"),
     ("s = 1", 4, "s holds texts, not numbers"),
-    ("s = mug", 4, "a text stands in quotes"),
+    ("s = mug", 4, "no column 'mug'; write a text in quotes: 'mug'"),
     ("b < true", 2, "does not order"),
     ("b = 1", 4, "true or false"),
     ("l = 'a'", 4, "lists"),

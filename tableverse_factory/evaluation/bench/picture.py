@@ -26,7 +26,7 @@ from tableverse_factory.evaluation.bench.perception import (
     read_true_masks,
     remove_unlabelled,
 )
-from tableverse_factory.evaluation.bench.picture_shapes import ProportionError, compare_proportions
+from tableverse_factory.evaluation.bench.picture_shapes import ShapeScore, compare_proportions
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import CAMERA_NAME, COLOR_NAMES
@@ -52,7 +52,7 @@ class PictureScore:
     masks: MaskScore | None = None  # None without true masks
     reason: str = ""  # why the picture was dropped, or the capture could not be read, or empty
     unread: bool = False
-    proportions: tuple[ProportionError, ...] = ()  # none unless they were asked for
+    shapes: ShapeScore | None = None  # None unless it was asked for, or for a dropped picture
 
     @property
     def is_within_sigma(self) -> bool:
@@ -74,15 +74,16 @@ class PictureSummary:
     within_sigma: float  # share of pictures whose scale is within the stated standard deviation
     cpu_s: float  # median [s]
     masks: MaskScore | None
-    proportion_error: float = float("nan")  # median over the things of all pictures
+    proportion_error: float = float("nan")  # median over the things of all pictures, alike for too flat and too high
 
 
 def bench_pictures(
     folder: Path,
     config: Config,
     with_focal: bool = False,
-    with_shapes: bool = False,
     on_picture: Callable[[int, int], object] = lambda _done, _total: None,
+    *,
+    with_shapes: bool = False,
 ) -> Iterator[PictureScore]:
     """Score the colour of every capture in `folder`, or of `folder` itself, by name; what cannot be read says so.
 
@@ -95,7 +96,7 @@ def bench_pictures(
         raise InputError(f"{str(folder)!r} holds no capture: a folder with color.png, depth.png and camera.json")
     for done, capture in enumerate(captures, 1):
         try:
-            yield score_picture(capture, config, with_focal, with_shapes)
+            yield score_picture(capture, config, with_focal, with_shapes=with_shapes)
         except InputError as error:
             nothing = float("nan")
             figures = (nothing,) * 5
@@ -113,8 +114,13 @@ def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, st
         yield name, getattr(_perceive_picture(folder / name, config), "reason", "")
 
 
-def score_picture(capture: Path, config: Config, with_focal: bool = False, with_shapes: bool = False) -> PictureScore:
-    """Run `observe` and `perceive` on the colour of a capture and compare with its depth and masks, and the shapes."""
+def score_picture(
+    capture: Path, config: Config, with_focal: bool = False, *, with_shapes: bool = False
+) -> PictureScore:
+    """Run `observe` and `perceive` on the colour of a capture and compare with its depth and masks.
+
+    `with_shapes` runs `place` on both too, and compares the shapes; the CPU time does not count it.
+    """
     sensor, truth = _perceive_truth(capture, config)
     if with_focal:
         focal = config.observe.model_copy(update={"focal_px": sensor.camera.fx})
@@ -141,11 +147,11 @@ def score_picture(capture: Path, config: Config, with_focal: bool = False, with_
     measured = compare_measured_depth(found.observation, sensor, wanted)
     plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))
     sigma = found.observation.scale_sigma
-    shapes: tuple[ProportionError, ...] = ()
+    shapes = None
     if with_shapes:
         found_ids = resize_nearest(found.instance_ids, truth.instance_ids.shape)
         shapes = compare_proportions(found, found_ids, truth, config)
-    return PictureScore(capture.name, error, log_scale, sigma, measured, plane, cpu_s, masks, proportions=shapes)
+    return PictureScore(capture.name, error, log_scale, sigma, measured, plane, cpu_s, masks, shapes=shapes)
 
 
 def compare_depth(depth: DepthImage, true: DepthImage, wanted: np.ndarray) -> tuple[float, float]:
@@ -214,7 +220,12 @@ def summarize_pictures(scores: Sequence[PictureScore]) -> PictureSummary:
         _average(score.is_within_sigma for score in known),
         _find_median(score.cpu_s for score in scores),
         merge_scores(masks) if masks else None,
-        _find_median(thing.share for score in scores for thing in score.proportions),
+        _find_median(
+            float(np.expm1(abs(thing.log_ratio)))
+            for score in scores
+            if score.shapes is not None
+            for thing in score.shapes.proportions
+        ),
     )
 
 

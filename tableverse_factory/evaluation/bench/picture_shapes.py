@@ -1,4 +1,4 @@
-"""Proportions of the shapes that bare pictures give, against those that the sensor's depth gives."""
+"""Proportions of shapes from bare pictures, against those of the same things from the sensor's depth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +10,7 @@ from schemas.geometry import IdImage
 from schemas.objects import PerceivedObjects, PlacedObject
 from schemas.outcome import Done
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.place import place
@@ -19,41 +20,46 @@ LEAST_SHARED = 0.6  # IoU of two masks from which they show the same thing
 
 @dataclass(frozen=True, slots=True)
 class ProportionError:
-    """Height over mean width of a thing from a bare picture, against that from the sensor."""
+    """Height over width of an object of a bare picture, against that of the same thing from the sensor.
 
-    found: str  # its object of the bare picture
-    sensed: str  # its object of the sensor
-    completion: str  # of the bare picture's
-    log_ratio: float  # logarithm of the ratio of both proportions; below 0 the bare picture's is too flat
+    The width is the mean of the sides of the least rectangle around the shape, seen from above.
+    """
 
-    @property
-    def share(self) -> float:
-        """Relative error of the proportion, the same for twice too high and twice too flat."""
-        return float(np.expm1(abs(self.log_ratio)))
+    object_id: str
+    sensor_object_id: str
+    completion: str  # of the bare picture's shape
+    log_ratio: float  # logarithm of the ratio of both proportions; below 0 the bare picture's shape is too flat
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeScore:
+    """Proportions in one bare picture."""
+
+    objects: int  # that the sensor gives, of which only some are found in the picture
+    proportions: tuple[ProportionError, ...]
 
 
 def compare_proportions(
     found: PerceivedObjects, found_ids: IdImage, sensed: PerceivedObjects, config: Config
-) -> tuple[ProportionError, ...]:
+) -> ShapeScore:
     """Place the objects of a bare picture and those of the sensor; compare those whose masks show the same thing.
 
-    `found_ids` are the instance ids of the bare picture at the size of the sensor's. Proportions know no scale, so
-    its error does not count. A scene that `place` drops has none to compare.
+    `found_ids` are the instance ids of the bare picture at the size of the sensor's. Proportions have no scale, so its
+    error does not count. A scene that `place` drops has no objects.
     """
-    true = _place(sensed, config)
+    true = _place_objects(sensed, config)
     errors = []
-    for value, item in _place(found, config).items():
+    for value, item in _place_objects(found, config).items():
         mask = found_ids == value
         shared = {other: _measure_iou(mask, sensed.instance_ids == other) for other in true}
         best = max(shared, key=lambda other: shared[other], default=None)
         if best is not None and shared[best] >= LEAST_SHARED:
-            like = true[best]
-            ratio = float(np.log(_measure_proportion(item) / _measure_proportion(like)))
-            errors.append(ProportionError(item.object_id, like.object_id, item.completion, ratio))
-    return tuple(errors)
+            ratio = float(np.log(_measure_proportion(item) / _measure_proportion(true[best])))
+            errors.append(ProportionError(item.object_id, true[best].object_id, item.completion, ratio))
+    return ShapeScore(len(true), tuple(errors))
 
 
-def _place(perceived: PerceivedObjects, config: Config) -> dict[int, PlacedObject]:
+def _place_objects(perceived: PerceivedObjects, config: Config) -> dict[int, PlacedObject]:
     """Place the objects; give them by their instance ids."""
     outcome = place(perceived, config, make_rng(config.run.seed, "picture", "place"), Services(Path()))
     placed = outcome.value if isinstance(outcome, Done) else None
@@ -67,5 +73,6 @@ def _measure_iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _measure_proportion(item: PlacedObject) -> float:
-    sides = np.ptp(place_mesh(item.mesh, item.pose, item.scale).vertices, axis=0)
-    return float(sides[2] / sides[:2].mean())
+    vertices = place_mesh(item.mesh, item.pose, item.scale).vertices
+    width = 2.0 * float(fit_min_rectangle(vertices[:, :2]).half_size.mean())
+    return float(np.ptp(vertices[:, 2])) / width

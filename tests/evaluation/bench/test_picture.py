@@ -19,7 +19,7 @@ from tableverse_factory.evaluation.bench.picture import (
     resize_nearest,
     summarize_pictures,
 )
-from tableverse_factory.evaluation.bench.picture_shapes import ProportionError, compare_proportions
+from tableverse_factory.evaluation.bench.picture_shapes import ProportionError, ShapeScore, compare_proportions
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
@@ -142,17 +142,19 @@ def test_the_proportions_of_the_same_scene_at_another_scale_are_the_same(tmp_pat
         perceive(replace(seen, depth=seen.depth * scale), config, make_rng(0, "a", "perceive"), Services(Path())).value
         for scale in (1.0, np.float32(1.25))
     )
-    errors = compare_proportions(larger, larger.instance_ids, sensed, config)
-    assert errors
-    assert np.median([thing.share for thing in errors]) < 0.05
+    score = compare_proportions(larger, larger.instance_ids, sensed, config)
+    errors = score.proportions
+    assert 0 < len(errors) <= score.objects
+    assert np.median([abs(thing.log_ratio) for thing in errors]) < 0.05
     moved = np.roll(larger.instance_ids, larger.instance_ids.shape[1] // 2, axis=1)
-    assert len(compare_proportions(larger, moved, sensed, config)) < len(errors), "masks tell which thing it is"
+    other = compare_proportions(larger, moved, sensed, config)
+    assert len(other.proportions) < len(errors), "masks tell which thing it is"
 
 
 def test_too_flat_and_too_high_count_alike() -> None:
-    flat, high = (ProportionError("a", "b", "carved", math.log(ratio)) for ratio in (0.5, 2.0))
-    assert flat.share == pytest.approx(high.share) == pytest.approx(1.0)
-    total = summarize_pictures([make_score(proportions=(flat,)), make_score(proportions=(high, high))])
+    flat, high = (ProportionError("a", "b", "carved/box", math.log(ratio)) for ratio in (0.5, 2.0))
+    scores = [make_score(shapes=ShapeScore(3, things)) for things in ((flat,), (high, high), ())]
+    total = summarize_pictures([*scores, make_score()])
     assert total.proportion_error == pytest.approx(1.0)
     assert math.isnan(summarize_pictures([make_score()]).proportion_error)
 

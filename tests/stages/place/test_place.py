@@ -311,18 +311,6 @@ def test_a_recorded_mesh_is_registered_with_its_heading_and_size() -> None:
     np.testing.assert_allclose(mesh.vertices.max(axis=0), expected.max(axis=0), atol=4e-3)
 
 
-def test_a_mesh_that_is_not_what_the_picture_shows_is_left_out_with_its_distance() -> None:
-    scene = seen(box(0.05, 0.05, 0.05, x=0.3), box(0.2, 0.2, 0.1, x=-0.05))
-    recorded = ((1, box(1.0, 1.0, 1.0)), (2, box(1.0, 0.02, 0.02)))  # a rod for a block
-    observation = replace(scene.observation, recorded_ids=np.maximum(scene.instance_ids, 0), recorded_meshes=recorded)
-    outcome = run(replace(scene, observation=observation), Config(place=PlaceConfig(mesh_model="replay")))
-    assert isinstance(outcome, Done), outcome
-    assert [item.object_id for item in outcome.value.objects] == ["obj_000"]
-    ((name, reason),) = outcome.value.left_out
-    assert name == "obj_001"
-    assert "mm from what was read 0.7" in reason
-
-
 def test_replay_without_a_recorded_mesh_says_what_is_missing() -> None:
     outcome = run(seen(box(0.06, 0.05, 0.1)), Config(place=PlaceConfig(mesh_model="replay")))
     assert isinstance(outcome, Dropped)

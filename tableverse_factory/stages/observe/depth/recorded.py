@@ -32,7 +32,7 @@ def read_recorded_depth(item: ImageRow, config: Config) -> Capture:
     missing = [suffix for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX) if suffix not in there]
     if missing:
         stem = _get_file_name(item.uri).rpartition(".")[0]
-        lacking = " and ".join(stem + suffix for suffix in missing)
+        lacking = " and no ".join(stem + suffix for suffix in missing)
         raise InputError(
             f"observe.depth is 'recorded', and beside the picture there is no {lacking}", "no_recorded_depth"
         )
@@ -87,7 +87,7 @@ def _get_file_name(uri: str) -> str:
 def _read_number(name: str, value: dict[str, Any], key: str, low: float, high: float) -> float:
     number = parse_finite(value.get(key))
     if number is None or not low <= number <= high:
-        said = f"is {json.dumps(value[key])[:80]}" if key in value else "is missing"
+        said = f"is {sanitize_line(json.dumps(value[key]), 80)}" if key in value else "is missing"
         raise InputError(f"{name}: {key} {said}; give a finite number from {low:g} to {high:g}", "bad_intrinsics")
     return number
 

@@ -65,23 +65,25 @@ def keep_objects(ids: IdImage, view: TableView, contents: Collection[int] = (), 
 def drop_unseen_regions(ids: IdImage, view: TableView) -> IdImage:
     """Drop small regions that only the depth tells of, renumbered from 1: gloss makes a sensor read what is not there.
 
-    The picture shows no edge along their whole border, and their colour is that of what lies around them.
+    The picture shows no edge to what they border on, and their colour is that of what lies around them.
     """
     count = int(ids.max(initial=0))
-    return renumber_regions(ids, [k for k in range(1, count + 1) if not _is_unseen(ids == k, view)])
+    return renumber_regions(ids, [k for k in range(1, count + 1) if not _is_unseen(ids, k, view)])
 
 
-def _is_unseen(region: Mask, view: TableView) -> bool:
+def _is_unseen(ids: IdImage, k: int, view: TableView) -> bool:
+    region = ids == k
     if not region.any() or _measure_area(region & view.valid, view) >= SMALL_AREA_M2:
         return False
     window = expand_window(region, SURROUNDINGS_PX)
-    own = region[window]
+    own, others = region[window], ids[window] > 0
     lab = blur_to_lab(view.observation.color[window])
-    (edge,) = measure_color_edges(own.astype(np.int32), 1, lab, ~own)
+    edges = [measure_color_edges(own.astype(np.int32), 1, lab, side)[0] for side in (~others, others & ~own)]
+    known = [edge for edge in edges if np.isfinite(edge)]
     around = ~own & ndimage.binary_dilation(own, iterations=SURROUNDINGS_PX)
     shown, beside = (np.median(lab[pixels], axis=0) for pixels in (own, around))
-    unlike = float(np.linalg.norm(shown - beside))
-    return bool(edge <= FAINT_EDGE and unlike <= UNSEEN_COLOR and shown[0] < SATURATED)  # an unknown edge may be one
+    alike = bool(np.linalg.norm(shown - beside) <= UNSEEN_COLOR and shown[0] < SATURATED)
+    return alike and bool(known) and max(known) <= FAINT_EDGE  # an edge that is not known may be one
 
 
 def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:

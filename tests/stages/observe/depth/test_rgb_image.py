@@ -172,6 +172,20 @@ def test_a_recorded_camera_that_cannot_be_is_a_reason(tmp_path, view, wrong):
     assert outcome.detail.startswith("table.camera.json: ")
 
 
+def test_a_camera_without_a_number_and_an_array_that_is_none_say_so(tmp_path, view):
+    as_picture(tmp_path, view)
+    file = tmp_path / "table.camera.json"
+    said = json.loads(file.read_text())
+    for key, words in (("fx", "fx is missing; give a finite number"), ("cy", 'cy is "wide"; give')):
+        file.write_text(
+            json.dumps({k: v for k, v in said.items() if k != key} | ({key: "wide"} if key == "cy" else {}))
+        )
+        assert words in observed(tmp_path).detail
+    file.write_text(json.dumps(said))
+    (tmp_path / "table.depth.npy").write_bytes(b"no array")
+    assert "table.depth.npy is no array of numbers as numpy.save writes it" in observed(tmp_path).detail
+
+
 def test_what_lies_beside_the_picture_belongs_to_its_content(tmp_path, view):
     path = as_picture(tmp_path, view)
     (row,) = rows_of(tmp_path)

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from schemas.outcome import Dropped
-from tableverse_factory.stages.perceive.base.object_filter import keep_objects
+from tableverse_factory.stages.perceive.base.object_filter import drop_unseen_regions, keep_objects
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import Box, camera_above, look
 
@@ -36,3 +37,46 @@ def test_what_stands_on_the_floor_is_no_object_of_the_table(bend, beyond):
     assert (floor == 1).sum() > 500
     view = replace(view, observation=replace(view.observation, bend=bend))
     assert keep_objects(np.where(ids == 2, 2, floor), view, by_depth=False).max() == 1 + beyond
+
+
+CLOTH, WHITE, BLACK, RED = (150, 150, 150), (255, 255, 255), (20, 20, 20), (190, 40, 45)
+
+
+@pytest.mark.parametrize(
+    ("tint", "cloth", "margin", "kept"),
+    [
+        pytest.param(CLOTH, CLOTH, 0, 0, id="depth alone"),
+        pytest.param(BLACK, CLOTH, 0, 1, id="black"),
+        pytest.param(BLACK, CLOTH, 4, 1, id="black, in a mask that is too wide"),
+        pytest.param((168, 168, 168), CLOTH, 0, 1, id="a little lighter"),
+        pytest.param(WHITE, WHITE, 0, 1, id="white on white, where the picture tells nothing"),
+    ],
+)
+def test_a_small_region_that_the_picture_does_not_show_is_no_object(tint, cloth, margin, kept):
+    seen, ids = look([Box(0.0, 0.0, (0.03, 0.03, 0.03))], camera_above(0.6, 0.7))
+    mask = ids == 2
+    color = np.full(seen.color.shape, cloth, np.uint8)
+    color[mask] = tint
+    view = find_table(replace(seen, color=color), np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    region = ndimage.binary_dilation(mask, iterations=margin) if margin else mask
+    assert drop_unseen_regions(region.astype(np.int32), view).max() == kept
+
+
+def test_a_cap_in_the_colour_of_what_lies_behind_is_seen_by_its_edge_to_what_it_closes():
+    seen, ids = look([Box(0.0, 0.0, (0.03, 0.03, 0.03))], camera_above(0.6, 0.7))
+    rows, _ = np.nonzero(ids == 2)
+    cap = (ids == 2) & (np.arange(ids.shape[0])[:, None] < np.median(rows))
+    color = np.full(seen.color.shape, CLOTH, np.uint8)
+    color[(ids == 2) & ~cap] = RED
+    view = find_table(replace(seen, color=color), np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    regions = np.where(cap, 1, np.where(ids == 2, 2, 0)).astype(np.int32)
+    assert drop_unseen_regions(regions, view).max() == 2
+
+
+def test_a_large_region_is_kept_whatever_the_picture_shows():
+    seen, ids = look([Box(0.0, 0.0, (0.12, 0.12, 0.05))], camera_above(0.6, 0.7))
+    view = find_table(replace(seen, color=np.full(seen.color.shape, CLOTH, np.uint8)), np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    assert drop_unseen_regions((ids == 2).astype(np.int32), view).max() == 1

@@ -46,7 +46,7 @@ def test_a_patch_of_the_table_that_the_mask_took_along_is_not_the_object():
     ramp = np.linspace(0.8, 1.0, 14)[None, :]
     color, depth, own = picture(patch=(slice(24, 36), slice(60, 74), WOOD, ramp))
     own[24:36, 60:74] = True
-    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own)
+    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own, measured=True)
     assert found[24:36, 61:73].mean() > 0.7
     assert not found[:, :60].any()
 
@@ -55,15 +55,25 @@ def test_a_wide_patch_that_stands_out_in_depth_but_not_in_the_picture_is_not_the
     """As gloss makes them: the filter of a sensor fills what it could not read with the object's depth."""
     color, depth, own = picture(patch=(slice(12, 20), slice(20, 60), WOOD, 0.8))
     own[12:20, 20:60] = True
-    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own)
+    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own, measured=True)
     assert found[13:19, 22:58].mean() > 0.95
     assert not found[21:].any()
 
 
-def test_a_face_much_like_the_table_that_the_picture_shows_to_end_stays():
-    color, depth, own = picture(face=(slice(20, 40), slice(45, 60), PALE_WOOD, 0.8))
-    found = find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own)
-    assert found[20:40, 49:56].sum() == 0, "only a rim may go"
+def test_only_measured_depth_is_smeared_so_widely():
+    color, depth, own = picture(patch=(slice(12, 20), slice(20, 60), WOOD, 0.8))
+    own[12:20, 20:60] = True
+    background = find_background_colors(color, own, ~own)
+    assert not find_flying_pixels(background, color, depth, own, ~own, measured=False)[17:19, 24:56].any()
+
+
+def test_a_lid_much_like_the_table_that_the_picture_shows_to_end_stays():
+    color, depth, own = picture(lid=(slice(12, 20), slice(20, 60), PALE_WOOD, 0.8))
+    own[12:20, 20:60] = True
+    background = find_background_colors(color, own, ~own)
+    assert background[13:19, 22:58].all()
+    found = find_flying_pixels(background, color, depth, own, ~own, measured=True)
+    assert not found[17:19, 24:56].any(), "only a rim may go"
 
 
 def test_where_hue_tells_nothing_nothing_is_taken():
@@ -71,7 +81,9 @@ def test_where_hue_tells_nothing_nothing_is_taken():
     color[:] = 170
     color[own] = 210
     color[20:40, 50:60] = 172
-    assert not find_flying_pixels(find_background_colors(color, own, ~own), color, depth, own, ~own).any()
+    assert not find_flying_pixels(
+        find_background_colors(color, own, ~own), color, depth, own, ~own, measured=True
+    ).any()
 
 
 def test_a_ramp_to_what_lies_behind_is_found_and_a_face_is_not():
