@@ -1,7 +1,6 @@
 """Torn shapes: what errors of a sensor's depth make of a free shape, and when a plain one must not take its place."""
 
 from scipy import ndimage
-from scipy.spatial import ConvexHull
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.geometry.mesh.meshes import place_mesh
@@ -34,7 +33,8 @@ def measure_fullness(mesh: TriangleMesh) -> float:
     Raises:
         GeometryError: if the mesh bounds no solid.
     """
-    return float(to_manifold(mesh).volume() / ConvexHull(mesh.vertices).volume)
+    solid = to_manifold(mesh)
+    return float(solid.volume() / solid.hull().volume())
 
 
 def hides_others(view: ObjectView, mesh: TriangleMesh, pose: Pose) -> bool:
