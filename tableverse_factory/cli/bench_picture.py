@@ -82,9 +82,7 @@ def _show_scores(scores: list["PictureScore"], total: "PictureSummary") -> None:
     if total.unread:
         print(f"{total.unread} captures could not be read: their rows say why")
     if shapes := [score.shapes for score in scores if score.shapes is not None]:
-        compared, objects = (
-            sum(counts) for counts in zip(*((len(s.proportions), s.objects) for s in shapes), strict=True)
-        )
+        compared, objects = sum(len(s.proportions) for s in shapes), sum(s.objects for s in shapes)
         error = _format(100 * total.proportion_error)
         print(f"height over width off by {error} % in the median of {compared} of the sensor's {objects} objects")
     print(f"scale within one stated standard deviation: {_format(100 * total.within_sigma)} % of pictures")

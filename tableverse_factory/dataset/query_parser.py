@@ -197,13 +197,9 @@ class _Parser:
             return _Operand(pc.scalar(token.text == "true"), "truth", False, token)
         if token.kind == "word":
             if token.text not in self._schema.names:
-                # Nothing but a text is likely to stand alone behind a comparison
-                compared = self._next > 1 and self._tokens[self._next - 2].text in _COMPARE
-                hint = (
-                    f"write a text in quotes: '{token.text[:80]}'"
-                    if compared
-                    else _suggest_column(token.text, self._schema)
-                )
+                hint = _suggest_column(token.text, self._schema)
+                if self._next > 1 and self._tokens[self._next - 2].text in _COMPARE:  # on the right a text is meant
+                    hint = f"write a text in quotes: '{token.text[:80]}'"
                 raise self._make_error(f"no column {token.text!r}; {hint}", token)
             kind = _classify_type(self._schema.field(token.text).type)
             return _Operand(pc.field(token.text), kind, True, token)

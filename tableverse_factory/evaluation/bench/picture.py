@@ -74,7 +74,7 @@ class PictureSummary:
     within_sigma: float  # share of pictures whose scale is within the stated standard deviation
     cpu_s: float  # median [s]
     masks: MaskScore | None
-    proportion_error: float = float("nan")  # median over the things of all pictures, alike for too flat and too high
+    proportion_error: float  # median over the things of all pictures, alike for too flat and too high
 
 
 def bench_pictures(
@@ -147,10 +147,8 @@ def score_picture(
     measured = compare_measured_depth(found.observation, sensor, wanted)
     plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))
     sigma = found.observation.scale_sigma
-    shapes = None
-    if with_shapes:
-        found_ids = resize_nearest(found.instance_ids, truth.instance_ids.shape)
-        shapes = compare_proportions(found, found_ids, truth, config)
+    found_ids = resize_nearest(found.instance_ids, truth.instance_ids.shape)
+    shapes = compare_proportions(found, found_ids, truth, config) if with_shapes else None
     return PictureScore(capture.name, error, log_scale, sigma, measured, plane, cpu_s, masks, shapes=shapes)
 
 

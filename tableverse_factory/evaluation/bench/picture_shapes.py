@@ -10,6 +10,7 @@ from schemas.geometry import IdImage
 from schemas.objects import PerceivedObjects, PlacedObject
 from schemas.outcome import Done
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.perception import match_ids
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.models.services import Services
@@ -47,15 +48,14 @@ def compare_proportions(
     `found_ids` are the instance ids of the bare picture at the size of the sensor's. Proportions have no scale, so its
     error does not count. A scene that `place` drops has no objects.
     """
-    true = _place_objects(sensed, config)
-    errors = []
+    true, errors = _place_objects(sensed, config), []
+    same = match_ids(sensed.instance_ids, found_ids)
     for value, item in _place_objects(found, config).items():
-        mask = found_ids == value
-        shared = {other: _measure_iou(mask, sensed.instance_ids == other) for other in true}
-        best = max(shared, key=lambda other: shared[other], default=None)
-        if best is not None and shared[best] >= LEAST_SHARED:
-            ratio = float(np.log(_measure_proportion(item) / _measure_proportion(true[best])))
-            errors.append(ProportionError(item.object_id, true[best].object_id, item.completion, ratio))
+        like = true.get(same.get(value, 0))
+        if like is None or _measure_iou(found_ids == value, sensed.instance_ids == same[value]) < LEAST_SHARED:
+            continue
+        ratio = float(np.log(_measure_proportion(item) / _measure_proportion(like)))
+        errors.append(ProportionError(item.object_id, like.object_id, item.completion, ratio))
     return ShapeScore(len(true), tuple(errors))
 
 

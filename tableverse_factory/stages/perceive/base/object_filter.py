@@ -21,9 +21,8 @@ BELOW_PX = 4
 CONTACT_M = 0.025
 MIN_CARRIED = 0.1
 FLAT_M = 0.02
-RAGGED_AREA_M2 = 0.003
 RAGGED_EDGE_M = 0.03
-SMALL_AREA_M2 = 0.003
+SMALL_AREA_M2 = 0.003  # of a region that may be an error of the depth [m²]
 UNSEEN_COLOR = 5.0  # median colour of a region that is that beside it, in CIELAB: 0.9 to 3.7 of three false objects
 SATURATED = 98.0  # lightness from which the picture tells nothing
 SURROUNDINGS_PX = 12
@@ -140,4 +139,4 @@ def _is_carried(mask: Mask, ids: IdImage, view: TableView) -> bool:
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:
     """Whether the region is a small flat piece at the table's edge, where sensors bend the plane."""
     flat = float(np.percentile(view.heights[mask], 95)) < FLAT_M
-    return flat and _measure_area(mask, view) < RAGGED_AREA_M2 and float(inner[mask].mean()) < 0.5
+    return flat and _measure_area(mask, view) < SMALL_AREA_M2 and float(inner[mask].mean()) < 0.5

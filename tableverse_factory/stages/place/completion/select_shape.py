@@ -1,7 +1,6 @@
 """The mesh model `carved`: the simplest of several kinds of shape that explains the picture."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -122,13 +121,12 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
         GeometryError: if no shape explains the points, or the best one lies far from them.
     """
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
-    rays = sample_rays(view)
-    search = _try_kinds(kinds, view, rays, unavoidable)
+    search = _try_kinds(kinds, view, sample_rays(view), unavoidable)
     if search.best is None:
         raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
     _, method, mesh, pose = search.best
     if method in FREE and not view.estimated:
-        method, mesh, pose = _find_plain(view, rays, method, mesh, pose) or (method, mesh, pose)
+        method, mesh, pose = _find_plain(view, method, mesh, pose) or (method, mesh, pose)
     if view.support.leaning:
         mesh = extend_to_floor(mesh, pose, view.points, view.support_z)
     _check_distance(view, mesh, pose)
@@ -146,21 +144,17 @@ def _check_distance(view: ObjectView, mesh: TriangleMesh, pose: Pose) -> None:
         )
 
 
-def _find_plain(
-    view: ObjectView, measured: RaySample, method: str, mesh: TriangleMesh, pose: Pose
-) -> tuple[str, TriangleMesh, Pose] | None:
-    """Find a shape of few numbers in place of a free one; `measured` are the rays with the depth as measured.
+def _find_plain(view: ObjectView, method: str, mesh: TriangleMesh, pose: Pose) -> tuple[str, TriangleMesh, Pose] | None:
+    """Find a shape of few numbers in place of a free one.
 
     It explains the picture nearly as well, the depth weighed as if a model had estimated it; where errors of the depth
     tore the free shape, as well as one must there.
     """
     rays = sample_rays(view, estimated=True)
     extra = min(MOST_EXTRA_M, DENTED_M * (1.0 - measure_fullness(mesh)))
-    most = compute_mesh_misfit(rays, mesh, pose) + extra
+    kinds, most = SOLID_KINDS, compute_mesh_misfit(rays, mesh, pose) + extra
     if is_torn(view, method, mesh):
         kinds, most = PLAIN_KINDS, max(most, MOST_PLAIN_M)
-    else:
-        kinds = (OUTLINED_BOX, Kind("carved/turned", 0.0, partial(_draft_turned_solid, measured)), OUTLINED_LYING)
     best = _try_kinds(kinds, view, rays, 0.0).best
     return None if best is None or best[0] > most or hides_others(view, *best[2:]) else best[1:]
 
@@ -228,9 +222,9 @@ def _draft_plain_turned(view: ObjectView, rays: RaySample) -> Draft | None:
     return None
 
 
-def _draft_turned_solid(measured: RaySample, view: ObjectView, rays: RaySample) -> Draft | None:
-    """Draft a turned solid fitted to the depth as measured; what has a cavity was a vessel before."""
-    profile, _ = fit_solid(view, measured)
+def _draft_plain_solid(view: ObjectView, rays: RaySample) -> Draft | None:
+    """Draft a turned solid fitted to the depth as measured."""
+    profile, _ = fit_solid(view, sample_rays(view))
     return _draft_turned(view, rays, TurnedShape(profile, compute_misfit(rays, intersect_turned(rays, profile))))
 
 
@@ -306,3 +300,6 @@ ESTIMATED_KINDS = (
 
 # What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
 PLAIN_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_turned), OUTLINED_LYING)
+
+# And where they dent it: what has a cavity became a vessel before.
+SOLID_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_solid), OUTLINED_LYING)
