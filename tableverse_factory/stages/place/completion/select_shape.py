@@ -1,6 +1,7 @@
 """The mesh model `carved`: the simplest of several kinds of shape that explains the picture."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -28,14 +29,18 @@ from tableverse_factory.stages.place.completion.revolution import fit_revolution
 from tableverse_factory.stages.place.completion.sheet import carve_sheet
 from tableverse_factory.stages.place.completion.torn import hides_others, is_torn, measure_fullness
 from tableverse_factory.stages.place.completion.turned import (
-    TurnedShape,
+    TurnedFit,
     fit_lying,
     fit_solid,
     fit_standing,
     fit_vessel,
     shows_cavity,
 )
-from tableverse_factory.stages.place.completion.turned_profile import build_turned_solid, intersect_turned
+from tableverse_factory.stages.place.completion.turned_profile import (
+    TurnedProfile,
+    build_turned_solid,
+    intersect_turned,
+)
 from tableverse_factory.stages.place.completion.voxel_carving import CarvedSurface, carve_columns, carve_half_turn
 from tableverse_factory.stages.place.completion.warp import warp_to_depth
 from tableverse_factory.stages.place.interfaces import Completion
@@ -80,9 +85,13 @@ class Kind(NamedTuple):
 
 
 class _Search:
-    """Drafts of several kinds, which are finished as late as possible, and the best shape so far."""
+    """Drafts of several kinds, which are finished as late as possible, and the best shape so far.
 
-    def __init__(self) -> None:
+    Drafts that must cost more than `most` [m] are not finished.
+    """
+
+    def __init__(self, most: float) -> None:
+        self.most = most
         self.best: tuple[float, str, TriangleMesh, Pose] | None = None
         self.reasons: list[str] = []
         self._drafts: list[tuple[float, float, str, Draft]] = []
@@ -100,7 +109,7 @@ class _Search:
     def finish(self) -> None:
         """Finish the drafts that may be the best."""
         for least, freedom, method, draft in sorted(self._drafts, key=lambda entry: entry[0]):
-            if self.best is not None and self.best[0] <= least:
+            if least > self.most or (self.best is not None and self.best[0] <= least):
                 break
             try:
                 mesh, pose, cost = draft.finish()
@@ -155,13 +164,15 @@ def _find_plain(view: ObjectView, method: str, mesh: TriangleMesh, pose: Pose) -
     kinds, most = SOLID_KINDS, compute_mesh_misfit(rays, mesh, pose) + extra
     if is_torn(view, method, mesh):
         kinds, most = PLAIN_KINDS, max(most, MOST_PLAIN_M)
-    best = _try_kinds(kinds, view, rays, 0.0).best
+    best = _try_kinds(kinds, view, rays, 0.0, most).best
     return None if best is None or best[0] > most or hides_others(view, *best[2:]) else best[1:]
 
 
-def _try_kinds(kinds: tuple[Kind, ...], view: ObjectView, rays: RaySample, unavoidable: float) -> _Search:
+def _try_kinds(
+    kinds: tuple[Kind, ...], view: ObjectView, rays: RaySample, unavoidable: float, most: float = np.inf
+) -> _Search:
     """Search the best shape of some kinds; `unavoidable` is the misfit of even the true one [m]."""
-    search = _Search()
+    search = _Search(most)
     for kind in kinds:
         if search.is_below(kind.freedom + (kind.unavoidable or unavoidable)):
             continue
@@ -185,47 +196,45 @@ def _draft_box(box: SolidBox) -> Draft:
     return Draft(box.misfit, lambda: (build_box_mesh(box), box.pose, box.misfit))
 
 
-def _draft_turned(view: ObjectView, rays: RaySample, shape: TurnedShape | None) -> Draft | None:
-    if shape is None:
-        return None
-    profile, misfit = shape
+def _draft_turned(view: ObjectView, rays: RaySample, fit: TurnedFit | None) -> Draft | None:
+    return None if fit is None else Draft(fit.least, lambda: _build_turned(view, rays, *fit.finish()))
 
-    def finish() -> Shape:
-        # The cost stays that of the body: handles decide nothing between kinds, as their own depth is a guess
-        mesh, pose, _ = join_handles(view, rays, *build_turned_solid(profile), profile.frame)
-        return mesh, pose, misfit
 
-    return Draft(misfit, finish)
+def _build_turned(view: ObjectView, rays: RaySample, profile: TurnedProfile, cost: float) -> Shape:
+    # The cost stays that of the body: handles decide nothing between kinds, as their own depth is a guess
+    mesh, pose, _ = join_handles(view, rays, *build_turned_solid(profile), profile.frame)
+    return mesh, pose, cost
 
 
 def _draft_vessel(view: ObjectView, rays: RaySample) -> Draft | None:
     """Draft a turned shape whose cavity was seen: where smeared depth tears a surface of revolution, it stays whole."""
-    if (shape := fit_vessel(view, rays)) is None:
+    if (fit := fit_vessel(view, rays)) is None:
         return None
-    profile, misfit = shape
 
     def finish() -> Shape:
+        profile, _ = fit.finish()
         mesh, pose, cost = join_handles(view, rays, *build_turned_solid(profile), profile.frame)
         return mesh, pose, cost - HOLLOW_BONUS_M
 
-    return Draft(misfit - HOLLOW_BONUS_M - SIMPLER_M, finish)
+    return Draft(fit.least - HOLLOW_BONUS_M - SIMPLER_M, finish)
 
 
 def _draft_plain_turned(view: ObjectView, rays: RaySample) -> Draft | None:
     """Draft a turned shape fitted to the depth as measured; to rays that doubt it, where that misses too much."""
     for given in (sample_rays(view), rays):
-        profile, _ = fit_standing(view, given)
+        profile, _ = fit_standing(view, given).finish()
         misfit = compute_misfit(rays, intersect_turned(rays, profile))
-        hollow = shows_cavity(rays, profile)
         if misfit < MOST_PLAIN_M:
-            return _draft_turned(view, rays, TurnedShape(profile, misfit - (HOLLOW_BONUS_M if hollow else 0.0)))
+            cost = misfit - (HOLLOW_BONUS_M if shows_cavity(rays, profile) else 0.0)
+            return Draft(cost, partial(_build_turned, view, rays, profile, cost))
     return None
 
 
 def _draft_plain_solid(view: ObjectView, rays: RaySample) -> Draft | None:
     """Draft a turned solid fitted to the depth as measured."""
-    profile, _ = fit_solid(view, sample_rays(view))
-    return _draft_turned(view, rays, TurnedShape(profile, compute_misfit(rays, intersect_turned(rays, profile))))
+    profile, _ = fit_solid(view, sample_rays(view)).finish()
+    cost = compute_misfit(rays, intersect_turned(rays, profile))
+    return Draft(cost, lambda: _build_turned(view, rays, profile, cost))
 
 
 def _draft_revolution(view: ObjectView, rays: RaySample) -> Draft | None:

@@ -48,51 +48,46 @@ def build_turned_solid(profile: TurnedProfile) -> tuple[Manifold, Manifold | Non
 
 
 def intersect_turned(rays: RaySample, profile: TurnedProfile) -> Depths:
-    """Intersect the rays with a turned shape: the depths [m], `MISS_M` for a miss."""
+    """Intersect the rays with a turned shape, seen from outside: the depths [m], `MISS_M` for a miss."""
     axes = rotation_matrix(profile.frame.quaternion_wxyz)
     origin, directions = (rays.eye - profile.frame.position) @ axes, axes.T @ rays.directions
-    hit = _intersect_cones(origin, directions, profile.heights, profile.radii)
-    discs = [(0.0, 0.0, profile.radii[0]), (float(profile.heights[-1]), 0.0, profile.radii[-1])]
-    if len(profile.inner_heights):
-        hit = np.minimum(hit, _intersect_cones(origin, directions, profile.inner_heights, profile.inner_radii))
-        discs[1] = (discs[1][0], profile.inner_radii[-1], profile.radii[-1])
-        discs.append((float(profile.inner_heights[0]), 0.0, profile.inner_radii[0]))
-    for height, least, most in discs:
-        hit = np.minimum(hit, _intersect_ring(origin, directions, height, float(least), float(most)))
-    return hit
+    return np.minimum(_intersect_sides(origin, directions, profile), _intersect_levels(origin, directions, profile))
 
 
-def _intersect_cones(origin: Vector3, directions: Float64[np.ndarray, "3 n"], heights: Radii, radii: Radii) -> Depths:
-    """Intersect rays with the sides of a profile of straight pieces."""
-    slope = np.diff(radii) / np.diff(heights)
-    base = (radii[:-1] - slope * heights[:-1])[:, None]
-    slope = slope[:, None]
+def _intersect_sides(origin: Vector3, directions: Float64[np.ndarray, "3 n"], profile: TurnedProfile) -> Depths:
+    """Intersect rays with the cones of a profile's straight pieces: where they enter the body or leave the cavity."""
+    heights, radii = profile.heights, profile.radii
+    inner_heights, inner_radii = profile.inner_heights, profile.inner_radii
+    low, high = (np.concatenate([heights[of], inner_heights[of]])[:, None] for of in (slice(None, -1), slice(1, None)))
+    start, end = (np.concatenate([radii[of], inner_radii[of]])[:, None] for of in (slice(None, -1), slice(1, None)))
+    # Of the two roots of a cone, where the ray comes from outside, and where it comes from inside
+    side = np.full(low.shape, -1.0)
+    side[len(heights) - 1 :] = 1.0
+    slope = (end - start) / (high - low)
+    here = start + slope * (origin[2] - low)
     dx, dy, dz = directions
-    ox, oy, oz = (float(v) for v in origin)
-    here = base + slope * oz
-    a = dx * dx + dy * dy - (slope * dz) ** 2
-    b = ox * dx + oy * dy - slope * dz * here
-    c = ox * ox + oy * oy - here * here
-    a = np.where(np.abs(a) < 1e-12, 1e-12, a)
-    inside = b * b - a * c
-    root = np.sqrt(np.maximum(inside, 0.0))
-    hit = np.full(directions.shape[1], MISS_M)
-    for t in ((-b - root) / a, (-b + root) / a):
-        z = oz + t * dz
-        on = (
-            (inside >= 0.0) & (t > 0.0) & (z >= heights[:-1, None]) & (z <= heights[1:, None]) & (base + slope * z >= 0)
-        )
-        hit = np.minimum(hit, np.where(on, t, MISS_M).min(axis=0))
-    return hit
+    narrowing = slope * dz
+    a = dx * dx + dy * dy - narrowing * narrowing
+    b = origin[0] * dx + origin[1] * dy - narrowing * here
+    c = origin[0] ** 2 + origin[1] ** 2 - here * here
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray that misses a cone, or runs along it, is not below
+        t = (side * np.sqrt(b * b - a * c) - b) / a
+        z = origin[2] + t * dz
+    return np.where((t > 0.0) & (z >= low) & (z <= high), t, MISS_M).min(axis=0)
 
 
-def _intersect_ring(
-    origin: Vector3, directions: Float64[np.ndarray, "3 n"], height: float, least: float, most: float
-) -> Depths:
-    dz = np.where(np.abs(directions[2]) < 1e-12, 1e-12, directions[2])
-    t = (height - origin[2]) / dz
-    across = np.hypot(origin[0] + t * directions[0], origin[1] + t * directions[1])
-    return np.where((t > 0.0) & (across >= least) & (across <= most), t, MISS_M)
+def _intersect_levels(origin: Vector3, directions: Float64[np.ndarray, "3 n"], profile: TurnedProfile) -> Depths:
+    """Intersect rays with the base, the lid or rim, and the floor of a cavity."""
+    rings = [(0.0, 0.0, profile.radii[0]), (profile.heights[-1], 0.0, profile.radii[-1])]
+    if len(profile.inner_heights):
+        rings[1] = (profile.heights[-1], profile.inner_radii[-1], profile.radii[-1])
+        rings.append((profile.inner_heights[0], 0.0, profile.inner_radii[0]))
+    height, least, most = np.array(rings).T[:, :, None]
+    dx, dy, dz = directions
+    t = (height - origin[2]) / np.where(np.abs(dz) < 1e-12, 1e-12, dz)
+    x, y = origin[0] + t * dx, origin[1] + t * dy
+    across = x * x + y * y
+    return np.where((t > 0.0) & (across >= least * least) & (across <= most * most), t, MISS_M).min(axis=0)
 
 
 def _build_mouth(radius: float, height: float) -> CrossSection:
