@@ -1,10 +1,10 @@
-"""Fit of a box that stands upright on the object's support."""
+"""Fit of a box that stands upright on the object's support, and of the rounding of its upright edges."""
 
 from dataclasses import dataclass
 
-import manifold3d
 import numpy as np
 from jaxtyping import Float64
+from manifold3d import CrossSection, JoinType, Manifold
 from scipy.optimize import minimize
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
@@ -12,22 +12,36 @@ from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
 from tableverse_factory.geometry.registration.symmetry import rotation_about_axis
-from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
+from tableverse_factory.stages.place.completion.ray_misfit import (
+    RaySample,
+    compute_misfit,
+    intersect_box,
+    intersect_rounded_box,
+)
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 MIN_SIDE_M, MAX_SIDE_M = 0.003, 2.0
 CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
+STEPS, CALLS = (0.006, 0.006, 0.06, 0.06, 0.04, 0.06), 240  # of the search: middle [m], logarithms of sides, yaw [rad]
+# Radius of rounded edges, as a share of half the shorter side: at the start, at least, and at most, as what is rounder is
+# turned
+ROUND_START, LEAST_ROUND, MOST_ROUND = 0.5, 0.3, 0.8
+SEGMENTS = 48  # of a whole turn
 PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolidBox(Frozen):
-    """A box: its frame at the centre, along its sides, in the table frame; half sizes and misfit to the picture [m]."""
+    """A box: its frame at the centre, along its sides, in the table frame; half sizes and misfit to the picture [m].
+
+    `radius` is that of its edges along z [m], 0 of sharp ones.
+    """
 
     pose: Pose
     half_size: Vector3
     misfit: float
+    radius: float = 0.0
 
 
 def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
@@ -35,10 +49,39 @@ def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
     return min((_fit_upright(view, rays, yaw) for yaw in _propose_yaws(view)), key=lambda box: box.misfit)
 
 
+def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | None:
+    """Fit the best box with rounded upright edges, started from the best one with sharp edges; None if it stays so."""
+    sides, yaw = 2 * box.half_size, 2 * float(np.arctan2(box.pose.quaternion_wxyz[3], box.pose.quaternion_wxyz[0]))
+    start = np.array([*box.pose.position[:2], *np.log(sides), yaw, ROUND_START])
+
+    def decode(x: Float64[np.ndarray, "7"]) -> tuple[Vector3, Matrix3, Vector3, float]:
+        position, rotation, half = _decode_box(x[:6], view.support_z)
+        return position, rotation, half, float(min(max(x[6], 0.0), MOST_ROUND) * half[:2].min())
+
+    def cost(x: Float64[np.ndarray, "7"]) -> float:
+        position, rotation, half, radius = decode(x)
+        misfit = compute_misfit(rays, intersect_rounded_box(rays, position, rotation, half, radius))
+        return misfit + _penalize_uncarried(view, position, rotation, half)
+
+    for scale in (1.0, -0.5):  # the second search leaves where the first one stuck
+        simplex = np.vstack([start, start + scale * np.diag([*STEPS, -ROUND_START])])
+        options = {"initial_simplex": simplex, "maxfev": CALLS, "xatol": 2e-4, "fatol": 1e-6}
+        start = minimize(cost, start, method="Nelder-Mead", options=options).x
+    position, rotation, half, radius = decode(start)
+    if radius < LEAST_ROUND * half[:2].min():
+        return None
+    misfit = compute_misfit(rays, intersect_rounded_box(rays, position, rotation, half, radius))
+    return SolidBox(Pose(position, quaternion_about_z(float(start[5]))), half, misfit, radius)
+
+
 def build_box_mesh(box: SolidBox) -> TriangleMesh:
     """Build the box in its own frame, its faces divided so that vertex colours can show the picture."""
     size = 2 * box.half_size
-    solid = manifold3d.Manifold.cube(tuple(float(s) for s in size), True)
+    core = size[:2] - 2 * box.radius
+    section = CrossSection.square((float(core[0]), float(core[1])), True)
+    if box.radius > 0.0:
+        section = section.offset(box.radius, JoinType.Round, circular_segments=SEGMENTS)
+    solid = Manifold.extrude(section, float(size[2])).translate((0.0, 0.0, -float(box.half_size[2])))
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
 
 
@@ -66,9 +109,8 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
         misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
         return misfit + prior + _penalize_uncarried(view, position, rotation, half)
 
-    steps = np.diag([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])
-    simplex = np.vstack([start, start + steps])
-    options = {"initial_simplex": simplex, "maxfev": 240, "xatol": 2e-4, "fatol": 1e-6}
+    simplex = np.vstack([start, start + np.diag(STEPS)])
+    options = {"initial_simplex": simplex, "maxfev": CALLS, "xatol": 2e-4, "fatol": 1e-6}
     found = minimize(cost, start, method="Nelder-Mead", options=options)
     position, rotation, half = _decode_box(found.x, view.support_z)
     misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))

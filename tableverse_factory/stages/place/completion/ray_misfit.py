@@ -110,3 +110,30 @@ def intersect_box(rays: RaySample, position: Vector3, rotation: Matrix3, half_si
         enter = np.minimum(one, two).max(axis=0)
         leave = np.maximum(one, two).min(axis=0)
         return np.where((enter <= leave) & (enter > 0.0), enter, MISS_M)
+
+
+def intersect_rounded_box(
+    rays: RaySample, position: Vector3, rotation: Matrix3, half_size: Vector3, radius: float
+) -> Depths:
+    """Intersect the rays with a box whose edges along z have a radius [m]: the depths [m], `MISS_M` for a miss.
+
+    Seen along z it is the union of two rectangles and four circles, and convex: what a ray has in common with it is one
+    interval, from the first of those that it enters to the last that it leaves.
+    """
+    origin, directions = (rays.eye - position) @ rotation, rotation.T @ rays.directions
+    corners = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]) * (half_size[:2] - radius)
+    away = origin[:2] - corners
+    a = (directions[:2] ** 2).sum(axis=0)
+    b = away @ directions[:2]
+    c = (away**2).sum(axis=1)[:, None] - radius * radius
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face or past a circle
+        one, two = (-half_size - origin)[:, None] / directions, (half_size - origin)[:, None] / directions
+        enter, leave = np.minimum(one, two), np.maximum(one, two)
+        inset = radius / np.abs(directions[:2])
+        first, last = np.maximum(enter[:2] + inset, enter[1::-1]), np.minimum(leave[:2] - inset, leave[1::-1])
+        met = first <= last
+        root = np.sqrt(b * b - a * c)
+        first = np.fmin(np.where(met, first, np.inf).min(axis=0), np.fmin.reduce((-b - root) / a))
+        last = np.fmax(np.where(met, last, -np.inf).max(axis=0), np.fmax.reduce((-b + root) / a))
+    first, last = np.maximum(first, enter[2]), np.minimum(last, leave[2])
+    return np.where((first <= last) & (first > 0.0), first, MISS_M)

@@ -13,7 +13,7 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.mesh.surface_samples import compute_surface_area
 from tableverse_factory.geometry.registration.register import measure_median_distance
-from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box
+from tableverse_factory.stages.place.completion.box import SolidBox, build_box_mesh, fit_upright_box, round_edges
 from tableverse_factory.stages.place.completion.extend_to_floor import extend_to_floor
 from tableverse_factory.stages.place.completion.handle import join_handles
 from tableverse_factory.stages.place.completion.inflation import inflate
@@ -53,6 +53,10 @@ UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedo
 ESTIMATED_UNAVOIDABLE_M = 7e-4  # the same where a model estimated the depth
 FEW_NUMBERS_M = 1.2e-3  # the same of a turned shape of few numbers, less the bonus of its cavity
 
+# By how much rounded edges make a misfit smaller, at least and at most [m]: of six tins and food boxes by 0.3 to 1.45 mm,
+# of 49 boxes with sharp ones by 0 to 0.17. A net's masks round all corners
+LEAST_ROUNDED_M, MOST_ROUNDED_M = 2.5e-4, 1.5e-3
+ROUNDED_M = 2e-4  # cost of rounded edges [m]: much rounded, a box is nearly a cylinder
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
 SMOOTH = 1.03  # surface over that of the hull: 0.98 to 1.03 for fully visible half-turned solids, 1.15 for torn ones
@@ -187,13 +191,26 @@ def _try_kinds(
     return search
 
 
-def _discount_box(box: SolidBox) -> Draft:
-    cost = box.misfit - min(BOX_DISCOUNT * box.misfit, BOX_DISCOUNT_M)
+def _draft_upright(view: ObjectView, rays: RaySample, price: Callable[[float], float]) -> Draft:
+    """Draft a box that stands, whose upright edges are rounded where that explains the picture better."""
+    sharp = fit_upright_box(view, rays)
+
+    def finish() -> Shape:
+        rounded = round_edges(view, rays, sharp)
+        if rounded is None or rounded.misfit + LEAST_ROUNDED_M > sharp.misfit:
+            return build_box_mesh(sharp), sharp.pose, price(sharp.misfit)
+        return build_box_mesh(rounded), rounded.pose, min(rounded.misfit + ROUNDED_M, price(sharp.misfit))
+
+    return Draft(min(sharp.misfit - MOST_ROUNDED_M, price(sharp.misfit)), finish)
+
+
+def _draft_box(box: SolidBox, price: Callable[[float], float]) -> Draft:
+    cost = price(box.misfit)
     return Draft(cost, lambda: (build_box_mesh(box), box.pose, cost))
 
 
-def _draft_box(box: SolidBox) -> Draft:
-    return Draft(box.misfit, lambda: (build_box_mesh(box), box.pose, box.misfit))
+def _discount(misfit: float) -> float:
+    return misfit - min(BOX_DISCOUNT * misfit, BOX_DISCOUNT_M)
 
 
 def _draft_turned(view: ObjectView, rays: RaySample, fit: TurnedFit | None) -> Draft | None:
@@ -283,9 +300,9 @@ def _price_raggedness(mesh: TriangleMesh) -> float:
 
 # In the order of trial: the fewer freedoms a kind has, the earlier and the cheaper, but for the dearest.
 KINDS = (
-    Kind("carved/box", 0.0, lambda view, rays: _discount_box(fit_upright_box(view, rays))),
+    Kind("carved/box", 0.0, lambda view, rays: _draft_upright(view, rays, _discount)),
     Kind("carved/revolution", 1e-4, _draft_revolution),
-    Kind("carved/leaning_box", 3e-4, lambda view, rays: _discount_box(fit_leaning_box(view, rays))),
+    Kind("carved/leaning_box", 3e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays), _discount)),
     Kind("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     Kind("carved/sheet", 1e-3, _draft_sheet),
     Kind("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
@@ -293,22 +310,23 @@ KINDS = (
     Kind("carved/turned", 3e-4, _draft_vessel, FEW_NUMBERS_M),
 )
 
-OUTLINED_BOX = Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays)))
 OUTLINED_LYING = Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(view, rays, fit_lying(view, rays)))
 
 # The same for depth that a model estimated, whose errors a free shape follows.
 ESTIMATED_KINDS = (
-    OUTLINED_BOX,
+    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays), float)),
     Kind("carved/turned", 0.0, lambda view, rays: _draft_turned(view, rays, fit_standing(view, rays))),
     OUTLINED_LYING,
-    Kind("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
+    Kind("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays), float)),
     Kind("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     Kind("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     Kind("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )
 
+PLAIN_BOX = Kind("carved/box", 0.0, lambda view, rays: _draft_upright(view, rays, float))
+
 # What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
-PLAIN_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_turned), OUTLINED_LYING)
+PLAIN_KINDS = (PLAIN_BOX, Kind("carved/turned", 0.0, _draft_plain_turned), OUTLINED_LYING)
 
 # And where they dent it: what has a cavity became a vessel before.
-SOLID_KINDS = (OUTLINED_BOX, Kind("carved/turned", 0.0, _draft_plain_solid), OUTLINED_LYING)
+SOLID_KINDS = (PLAIN_BOX, Kind("carved/turned", 0.0, _draft_plain_solid), OUTLINED_LYING)
