@@ -100,7 +100,12 @@ def bench_placement(
 
 
 def bench_completion(
-    folder: Annotated[Path, typer.Argument(help="Folder of scanned meshes.", exists=True, file_okay=False)],
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder of scanned meshes; without it, twenty simple solids.", exists=True, file_okay=False
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the depth noise.")] = 0,
     view: Annotated[
         list[str] | None,
@@ -111,7 +116,7 @@ def bench_completion(
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
-    """Compare single-view completions of scanned meshes with the whole meshes, beside hull and height field.
+    """Compare single-view completions of meshes with the whole meshes, beside hull and height field.
 
     Example: `tableverse bench completion meshes --seed 11 --view 200,25 --view 320,45`
     """

@@ -19,6 +19,7 @@ from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.open3d_import import o3d
 from tableverse_factory.evaluation.bench.measurement import read_meshes
+from tableverse_factory.evaluation.bench.solids import make_solids
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import place_mesh
@@ -59,14 +60,16 @@ class CompletionScore:
 
 
 def bench_completion(
-    folder: Path, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS, error_m: float = 0.0
+    folder: Path | None, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS, error_m: float = 0.0
 ) -> list[CompletionScore]:
     """Complete every mesh in `folder` from each view by convex hull, height field and the place stage.
 
-    A view is the azimuth and elevation of a camera [degrees]; `error_m` is that of `render_noisy_view`.
+    Without a folder, complete the twenty solids of `make_solids`. A view is the azimuth and elevation of a camera
+    [degrees]; `error_m` is that of `render_noisy_view`.
     """
     scores: list[CompletionScore] = []
-    for index, (name, scan) in enumerate(read_meshes(folder, check=_check_size)):
+    meshes = make_solids() if folder is None else read_meshes(folder, check=_check_size)
+    for index, (name, scan) in enumerate(meshes):
         truth = stand_on_table(scan)
         share, cavity = measure_cavity(truth)
         hollow = share >= HOLLOW_SHARE

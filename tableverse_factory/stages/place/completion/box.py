@@ -24,8 +24,8 @@ MIN_SIDE_M, MAX_SIDE_M = 0.003, 2.0
 CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
 STEPS, CALLS = (0.006, 0.006, 0.06, 0.06, 0.04, 0.06), 240  # of the search: middle [m], logarithms of sides, yaw [rad]
-# Radius of rounded edges, as a share of half the shorter side: at the start, at least, and at most, as what is rounder is
-# turned
+# Radius of rounded edges, as a share of half the shorter side: at the start, at least, and at most, as what is rounder
+# is turned
 ROUND_START, LEAST_ROUND, MOST_ROUND = 0.5, 0.3, 0.8
 SEGMENTS = 48  # of a whole turn
 PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]

@@ -53,9 +53,9 @@ UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedo
 ESTIMATED_UNAVOIDABLE_M = 7e-4  # the same where a model estimated the depth
 FEW_NUMBERS_M = 1.2e-3  # the same of a turned shape of few numbers, less the bonus of its cavity
 
-# By how much rounded edges make a misfit smaller, at least and at most [m]: of six tins and food boxes by 0.3 to 1.45 mm,
-# of 49 boxes with sharp ones by 0 to 0.17. A net's masks round all corners
-LEAST_ROUNDED_M, MOST_ROUNDED_M = 2.5e-4, 1.5e-3
+# By how much rounded edges make a misfit smaller, at least and at most [m]: of six tins and food boxes by 0.3 to 1.45
+# mm, of 49 boxes with sharp ones by 0 to 0.17; and at most as a share of one that is no box. A net's masks round all
+LEAST_ROUNDED_M, MOST_ROUNDED_M, MOST_ROUNDED_SHARE = 2.5e-4, 1.5e-3, 0.4
 ROUNDED_M = 2e-4  # cost of rounded edges [m]: much rounded, a box is nearly a cylinder
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
@@ -201,7 +201,8 @@ def _draft_upright(view: ObjectView, rays: RaySample, price: Callable[[float], f
             return build_box_mesh(sharp), sharp.pose, price(sharp.misfit)
         return build_box_mesh(rounded), rounded.pose, min(rounded.misfit + ROUNDED_M, price(sharp.misfit))
 
-    return Draft(min(sharp.misfit - MOST_ROUNDED_M, price(sharp.misfit)), finish)
+    most = max(MOST_ROUNDED_M, MOST_ROUNDED_SHARE * sharp.misfit)
+    return Draft(min(sharp.misfit - most, price(sharp.misfit)), finish)
 
 
 def _draft_box(box: SolidBox, price: Callable[[float], float]) -> Draft:

@@ -15,6 +15,7 @@ from tableverse_factory.stages.place.completion.ray_misfit import (
     compute_mesh_misfit,
     compute_misfit,
     intersect_box,
+    intersect_rounded_box,
 )
 
 
@@ -39,6 +40,21 @@ def test_a_box_has_the_misfit_of_its_mesh(seed):
     assert (hit == MISS_M).any()
     assert compute_misfit(rays, hit) == pytest.approx(
         compute_mesh_misfit(rays, build_box_mesh(box), box.pose), abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("share", [0.2, 0.8, 1.0])
+def test_a_rounded_box_has_the_misfit_of_its_mesh(share):
+    rng = np.random.default_rng(5)
+    rays, box = make_rays(rng, own=200), make_box(rng)
+    box = replace(box, radius=share * box.half_size[:2].min())
+    rotation = rotation_matrix(box.pose.quaternion_wxyz)
+    hit = intersect_rounded_box(rays, box.pose.position, rotation, box.half_size, box.radius)
+    sharp = intersect_box(rays, box.pose.position, rotation, box.half_size)
+    assert (sharp < hit).any(), "no ray passes a rounded edge"
+    assert (hit >= sharp - 1e-9).all()
+    assert compute_misfit(rays, hit) == pytest.approx(
+        compute_mesh_misfit(rays, build_box_mesh(box), box.pose), abs=1e-4
     )
 
 

@@ -1,13 +1,21 @@
-"""Selection among kinds of shape: no finished shape costs less than its draft said."""
+"""Selection among kinds of shape: no finished shape costs less than its draft said, and each solid gets its kind."""
 
 import numpy as np
 import pytest
 import trimesh
 
-from tableverse_factory.evaluation.bench.completion import render_noisy_view, stand_on_table
-from tableverse_factory.geometry.mesh.meshes import from_trimesh
+from tableverse_factory.evaluation.bench.completion import render_noisy_view, score_completion, stand_on_table
+from tableverse_factory.evaluation.bench.solids import make_solids
+from tableverse_factory.geometry.mesh.meshes import from_trimesh, place_mesh
+from tableverse_factory.geometry.mesh.voxel_solids import to_manifold
 from tableverse_factory.stages.place.completion.ray_misfit import sample_rays
-from tableverse_factory.stages.place.completion.select_shape import KINDS, complete_by_carving
+from tableverse_factory.stages.place.completion.select_shape import (
+    ESTIMATED_KINDS,
+    KINDS,
+    PLAIN_KINDS,
+    SOLID_KINDS,
+    complete_by_carving,
+)
 from tableverse_factory.stages.place.view.object_view import view_object
 from tableverse_factory.stages.place.view.support_from_depth import find_supports
 
@@ -16,14 +24,20 @@ SHAPES = {
     "torus": trimesh.creation.torus(0.05, 0.02),
     "capsule": trimesh.creation.capsule(0.08, 0.025),
 }
+SOLIDS = {name: stand_on_table(mesh) for name, mesh in make_solids()}
 ONE_FOR_THE_FAST_RUN = [pytest.param(name, marks=[] if name == "box" else pytest.mark.slow) for name in SHAPES]
+
+
+def see(mesh, error_m=0.0, seed=3):
+    """See a mesh with a sensor: the scene and the view of its object."""
+    scene = render_noisy_view([mesh], 0.7, 0.8, np.random.default_rng(seed), error_m=error_m)
+    support = find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
+    return scene, view_object(scene, scene.objects[0], support)
 
 
 @pytest.mark.parametrize("name", ONE_FOR_THE_FAST_RUN)
 def test_no_shape_costs_less_than_its_draft_and_the_cheapest_is_selected(name):
-    scene = render_noisy_view([stand_on_table(from_trimesh(SHAPES[name]))], 0.7, 0.8, np.random.default_rng(3))
-    support = find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
-    view = view_object(scene, scene.objects[0], support)
+    scene, view = see(stand_on_table(from_trimesh(SHAPES[name])))
     rays, costs = sample_rays(view), {}
     for kind in KINDS:
         if (draft := kind.make(view, rays)) is not None:
@@ -31,3 +45,33 @@ def test_no_shape_costs_less_than_its_draft_and_the_cheapest_is_selected(name):
             assert costs[kind.method] >= draft.least + kind.freedom
     assert len(costs) >= 4
     assert complete_by_carving(scene, view).method == min(costs, key=costs.__getitem__)
+
+
+@pytest.mark.parametrize("kinds", [ESTIMATED_KINDS, PLAIN_KINDS, SOLID_KINDS])
+@pytest.mark.parametrize("name", ["can", "meat tin"])
+def test_no_shape_of_few_numbers_costs_less_than_its_draft(name, kinds):
+    """Fitting all radii, or the radius of edges, must gain no more than drafts expect: others are dropped by it."""
+    _, view = see(SOLIDS[name], error_m=0.004)
+    rays = sample_rays(view, estimated=True)
+    plain = [kind for kind in kinds if kind.freedom < 1e-3]
+    drafts = [draft for kind in plain if (draft := kind.make(view, rays)) is not None]
+    assert len(drafts) >= 2
+    assert all(draft.finish()[2] >= draft.least for draft in drafts)
+
+
+def test_a_tin_has_round_edges_and_a_carton_sharp_ones():
+    for name, error_m in (("meat tin", 0.0), ("meat tin", 0.006), ("carton", 0.0), ("carton", 0.003)):
+        scene, view = see(SOLIDS[name], error_m)
+        found = complete_by_carving(scene, view)
+        assert found.method == "carved/box", (name, error_m)
+        sides = np.ptp(found.mesh.vertices, axis=0)
+        share = to_manifold(found.mesh).volume() / sides.prod()
+        assert share < 0.97 if name == "meat tin" else share > 0.999, (name, error_m)
+        iou = score_completion(name, 0, found.method, SOLIDS[name], place_mesh(found.mesh, found.pose)).iou
+        assert iou > (0.85 if error_m else 0.93), (name, error_m)
+
+
+def test_what_is_round_is_no_box():
+    for name in ("can", "round tin"):
+        scene, view = see(SOLIDS[name], error_m=0.004)
+        assert complete_by_carving(scene, view).method != "carved/box", name
