@@ -219,8 +219,19 @@ def _is_bored(votes: RingVotes, cavity: Cells) -> bool:
 
 
 def _build_solid(votes: RingVotes) -> CrossSection:
-    """Build the largest section that the votes allow: what was not seen is solid."""
-    return _trace_outline(np.where(np.isnan(votes.field), votes.band, votes.field), votes)
+    """Build the largest section that the votes allow: what was not seen is solid.
+
+    Where a whole ring was hidden between others, as behind what stands before a lying can, it is as wide as they are.
+    """
+    field, count = votes.field, votes.field.shape[0]
+    seen = np.flatnonzero((field > 0.0).any(axis=0))
+    unseen = np.full(field.shape, votes.band)
+    if len(seen):
+        hidden = np.setdiff1d(np.arange(seen[0], seen[-1]), seen)
+        edges = count - np.argmax(field[::-1, seen] > 0.0, axis=0)
+        inside = np.interp(hidden, seen, edges) - np.arange(count)[:, None] - 0.5
+        unseen[:, hidden] = np.clip(votes.cell * inside, -votes.band, votes.band)
+    return _trace_outline(np.where(np.isnan(field), unseen, field), votes)
 
 
 def _build_cavity(votes: RingVotes, cavity: Cells, swelling: float) -> CrossSection:

@@ -156,3 +156,22 @@ def test_what_lies_in_a_bowl_does_not_thin_its_wall():
     directions = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(0.0, 2 * np.pi, 0.5)]
     found = np.mean([measure_solid(whole, np.array([0.0, 0.0, 0.04]), along, 0.1) for along in directions])
     assert abs(found - wall) < 0.001
+
+
+def test_a_lying_can_whose_middle_is_hidden_is_no_wider_there():
+    can = trimesh.creation.cylinder(0.037, 0.23, sections=64)
+    can.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1.0, 0.0, 0.0]))
+    can.apply_translation([0.0, 0.0, 0.037])
+    post = trimesh.creation.box((0.05, 0.06, 0.15))
+    post.apply_translation([0.09, 0.0, 0.075])
+    scene = render_noisy_view([from_trimesh(can), from_trimesh(post)], 0.0, 0.6, np.random.default_rng(3))
+    view = view_object(
+        scene, scene.objects[0], find_supports(scene.objects, scene.camera_to_table)[scene.objects[0].object_id]
+    )
+    assert not (np.abs(view.points[:, 1]) < 0.02).any(), "the middle is seen"
+    fit = fit_revolution(view, sample_rays(view))
+    assert fit is not None
+    found = place_mesh(fit[0], fit[1]).vertices
+    middle = found[np.abs(found[:, 1]) < 0.05]
+    assert np.ptp(middle[:, 2]) == pytest.approx(0.074, abs=0.003)
+    assert np.ptp(found[:, 1]) == pytest.approx(0.23, abs=0.006)
