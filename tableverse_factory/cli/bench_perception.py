@@ -118,7 +118,7 @@ def bench_completion(
 ) -> None:
     """Compare single-view completions of meshes with the whole meshes, beside hull and height field.
 
-    Example: `tableverse bench completion meshes --seed 11 --view 200,25 --view 320,45`
+    Example: `tableverse bench completion --error-mm 5` or `tableverse bench completion meshes --view 200,25`
     """
     from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion
 
@@ -136,12 +136,13 @@ def _parse_view(text: str) -> tuple[float, float]:
     except ValueError:
         found = math.nan, math.nan
     if not (math.isfinite(found[0]) and 5.0 <= found[1] <= 85.0):
-        raise typer.BadParameter(f"{text!r}: give azimuth and elevation in degrees, as in 200,25; elevation 5 to 85")
+        message = f"{text!r}: give azimuth and elevation in degrees, as in 200,25; elevation 5 to 85"
+        raise typer.BadParameter(message, param_hint="--view")
     return found
 
 
 def _show_completions(scores: list["CompletionScore"]) -> None:
-    title = "IoU in the mean and its median, Chamfer in mm, of hollow ones IoU and cavity kept"
+    title = "mean and median IoU, Chamfer distance in mm; of hollow meshes IoU and share of the cavity that stays open"
     columns = ("method", "views", "IoU", "median", "mm", "hollow", "cavity", "size %", "CPU s")
     groups = {name: [s for s in scores if s.method == name] for name in ("hull", "height field")}
     ours = [score for score in scores if score.method.startswith("carved")]

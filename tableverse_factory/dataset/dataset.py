@@ -30,6 +30,7 @@ from tableverse_factory.dataset.tar_members import read_scene_files
 
 __all__ = ["Dataset", "Scene", "open_dataset"]
 
+GALLERY_MARKER = "tableverse-gallery.json"  # file in every gallery; it lists its files, also those still to be drawn
 MAX_SCENE_BYTES = 2 * 1024**3
 
 
@@ -49,8 +50,11 @@ def open_dataset(path: str | Path) -> "Dataset":
     if not exists:
         kind = "a file" if filesystem.exists(root) else "no such folder"
         raise InputError(f"{path}: {kind}; give the OUT of `tableverse build`")
-    if not filesystem.exists(f"{root}/run.json") and not filesystem.isdir(f"{root}/scenes"):
-        raise InputError(f"{path}: neither run.json nor scenes/ in it; {_suggest_folder(str(path))}")
+    if not filesystem.exists(f"{root}/run.json"):
+        if filesystem.exists(f"{root}/{GALLERY_MARKER}"):  # it has a folder scenes/ too, of pages
+            raise InputError(f"{path}: a gallery; {_suggest_folder(str(path))}")
+        if not filesystem.isdir(f"{root}/scenes"):
+            raise InputError(f"{path}: neither run.json nor scenes/ in it; {_suggest_folder(str(path))}")
     return Dataset(str(path), filesystem, root)
 
 

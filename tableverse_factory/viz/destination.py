@@ -13,8 +13,8 @@ from tableverse_factory.core.storage.apart import require_apart, resolve_links
 from tableverse_factory.core.storage.files import PARTIAL, remove, resolve_filesystem, write_atomic
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.core.version import __version__
+from tableverse_factory.dataset.dataset import GALLERY_MARKER
 
-MARKER = "tableverse-gallery.json"  # file in every gallery that lists its files, also those that are still to be drawn
 LOCK = "drawn/.lock"  # empty; locked by the process that writes the gallery
 FOLDERS = ("drawn", "pictures", "scenes")
 
@@ -78,9 +78,9 @@ def check_gallery(folder: Path, dataset: str, name: str) -> frozenset[str]:
     if not folder.is_dir():
         raise InputError(f"{name}: a file; {_ELSE}")
     found = _list_entries(folder)  # before the marker is read, which lists a file before it is written
-    marked = (folder / MARKER).is_file()
-    files = _read_marker(folder / MARKER, dataset, name) if marked else frozenset()
-    own = {MARKER, LOCK, *(f"{part}/" for part in FOLDERS), *files}
+    marked = (folder / GALLERY_MARKER).is_file()
+    files = _read_marker(folder / GALLERY_MARKER, dataset, name) if marked else frozenset()
+    own = {GALLERY_MARKER, LOCK, *(f"{part}/" for part in FOLDERS), *files}
     foreign = sorted(entry for entry in found if entry.removesuffix(PARTIAL) not in own)
     if foreign and not marked:
         raise InputError(f"{name}: holds something that is no gallery; {_ELSE}")
@@ -111,7 +111,8 @@ def _read_marker(mark: Path, dataset: str, name: str) -> frozenset[str]:
         files, other = frozenset(str(file) for file in known["files"]), str(known["dataset"])
     except (KeyError, TypeError, ValueError, RecursionError):
         raise InputError(
-            f"{name}: a gallery whose {MARKER} does not list its files, as of an earlier version: delete it, or {_ELSE}"
+            f"{name}: a gallery whose {GALLERY_MARKER} does not list its files, as of an earlier version: delete it, or "
+            f"{_ELSE}"
         ) from None
     if other != dataset:
         shown = sanitize_line(other, 200)
@@ -123,7 +124,7 @@ def write_marker(folder: Path, dataset: str, scenes: int, files: Collection[str]
     """Write the marker, which lists the files that the gallery may have."""
     made_by = f"tableverse-factory {__version__}"
     mark = {"made_by": made_by, "dataset": dataset, "scenes": scenes, "files": sorted(files)}
-    write_atomic(folder / MARKER, (json.dumps(mark, indent=1) + "\n").encode())
+    write_atomic(folder / GALLERY_MARKER, (json.dumps(mark, indent=1) + "\n").encode())
 
 
 def remove_leftovers(folder: Path, files: Collection[str], keep: Collection[str]) -> None:

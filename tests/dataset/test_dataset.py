@@ -16,6 +16,7 @@ from schemas.tables import OBJECTS, SCENES, TASKS
 from schemas.work import SceneResult
 from tableverse_factory import open_dataset
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.dataset.dataset import GALLERY_MARKER
 from tableverse_factory.dataset.journals import WORK, journal_path
 from tableverse_factory.dataset.parts import PartWriter
 from tableverse_factory.evaluation.bench.noop_pipeline import make_minimal_scene
@@ -117,9 +118,11 @@ def test_a_dataset_opens_by_uri(out):
         assert dataset.scene("a-1").model().nbody == 3
 
 
-@pytest.mark.parametrize("path", ["nowhere", "a_file", "an_empty_folder", "nosuch://x", "a::b", "\0"])
+@pytest.mark.parametrize("path", ["nowhere", "a_file", "an_empty_folder", "a_gallery", "nosuch://x", "a::b", "\0"])
 def test_what_is_no_dataset_is_said(tmp_path, monkeypatch, path):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "a_gallery" / "scenes").mkdir(parents=True)
+    (tmp_path / "a_gallery" / GALLERY_MARKER).write_text("{}")
     Path("a_file").write_text("x")
     Path("an_empty_folder").mkdir()
     with pytest.raises(InputError):

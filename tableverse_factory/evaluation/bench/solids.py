@@ -12,7 +12,7 @@ SEGMENTS = 64
 
 
 def make_solids() -> Iterator[tuple[str, TriangleMesh]]:
-    """Make twenty solids of 3 to 16 cm: six round or angular ones, the others oval, with corners, knobs or necks."""
+    """Make twenty: cans, cartons and what is round, then what is oval or has rounded edges, corners, knobs or necks."""
     for name, solid in (
         ("can", _stand(0.11, 0.033)),
         ("lying can", _stand(0.12, 0.033).rotate((90.0, 0.0, 0.0))),

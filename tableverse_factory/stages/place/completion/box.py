@@ -1,5 +1,6 @@
 """Fit of a box that stands upright on the object's support, and of the rounding of its upright edges."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +28,7 @@ STEPS, CALLS = (0.006, 0.006, 0.06, 0.06, 0.04, 0.06), 240  # of the search: mid
 # Radius of rounded edges, as a share of half the shorter side: at the start, at least, and at most, as what is rounder
 # is turned
 ROUND_START, LEAST_ROUND, MOST_ROUND = 0.5, 0.3, 0.8
-SEGMENTS = 48  # of a whole turn
+SEGMENTS = 24  # of a whole turn
 PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]
 
 
@@ -50,7 +51,7 @@ def fit_upright_box(view: ObjectView, rays: RaySample) -> SolidBox:
 
 
 def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | None:
-    """Fit the best box with rounded upright edges, started from the best one with sharp edges; None if it stays so."""
+    """Fit the best box with rounded upright edges, started from one with sharp edges; None if they stay nearly so."""
     sides, yaw = 2 * box.half_size, 2 * float(np.arctan2(box.pose.quaternion_wxyz[3], box.pose.quaternion_wxyz[0]))
     start = np.array([*box.pose.position[:2], *np.log(sides), yaw, ROUND_START])
 
@@ -63,10 +64,8 @@ def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | 
         misfit = compute_misfit(rays, intersect_rounded_box(rays, position, rotation, half, radius))
         return misfit + _penalize_uncarried(view, position, rotation, half)
 
-    for scale in (1.0, -0.5):  # the second search leaves where the first one stuck
-        simplex = np.vstack([start, start + scale * np.diag([*STEPS, -ROUND_START])])
-        options = {"initial_simplex": simplex, "maxfev": CALLS, "xatol": 2e-4, "fatol": 1e-6}
-        start = minimize(cost, start, method="Nelder-Mead", options=options).x
+    steps = np.array([*STEPS, -ROUND_START])
+    start = _minimize(cost, _minimize(cost, start, steps), -steps / 2)  # the second search leaves where the first stuck
     position, rotation, half, radius = decode(start)
     if radius < LEAST_ROUND * half[:2].min():
         return None
@@ -109,12 +108,20 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
         misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
         return misfit + prior + _penalize_uncarried(view, position, rotation, half)
 
-    simplex = np.vstack([start, start + np.diag(STEPS)])
-    options = {"initial_simplex": simplex, "maxfev": CALLS, "xatol": 2e-4, "fatol": 1e-6}
-    found = minimize(cost, start, method="Nelder-Mead", options=options)
-    position, rotation, half = _decode_box(found.x, view.support_z)
+    found = _minimize(cost, start, np.array(STEPS))
+    position, rotation, half = _decode_box(found, view.support_z)
     misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
-    return SolidBox(Pose(position, quaternion_about_z(float(found.x[5]))), half, misfit)
+    return SolidBox(Pose(position, quaternion_about_z(float(found[5]))), half, misfit)
+
+
+def _minimize(
+    cost: Callable[[Float64[np.ndarray, " n"]], float],
+    start: Float64[np.ndarray, " n"],
+    steps: Float64[np.ndarray, " n"],
+) -> Float64[np.ndarray, " n"]:
+    options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": CALLS}
+    options |= {"xatol": 2e-4, "fatol": 1e-6}
+    return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
 
 
 def _penalize_uncarried(view: ObjectView, position: Vector3, rotation: Matrix3, half: Vector3) -> float:

@@ -34,6 +34,8 @@ FLOOR_CELLS = 2  # height above the lowest open cell up to which they are
 MIN_HOLLOW_M = 0.008
 HOLLOW_TILT_COS = 0.8
 SLICE_M = 0.002
+SEEN_CELLS = 2  # of a ring, from which its surface was seen
+EDGE_ROWS = 5  # over which its width is taken
 DETAIL_M = 0.0002
 SWELLINGS = (0.0, 0.4, 0.8)
 NOISY_HOLLOW_SHARE = 0.25  # least depth of a cavity in noise, as a share of the height
@@ -221,14 +223,16 @@ def _is_bored(votes: RingVotes, cavity: Cells) -> bool:
 def _build_solid(votes: RingVotes) -> CrossSection:
     """Build the largest section that the votes allow: what was not seen is solid.
 
-    Where a whole ring was hidden between others, as behind what stands before a lying can, it is as wide as they are.
+    Where whole rings were hidden between others, as behind what stands before a lying can, they go on from one to the
+    other.
     """
     field, count = votes.field, votes.field.shape[0]
-    seen = np.flatnonzero((field > 0.0).any(axis=0))
+    seen = np.flatnonzero((field > 0.0).sum(axis=0) >= SEEN_CELLS)
     unseen = np.full(field.shape, votes.band)
     if len(seen):
         hidden = np.setdiff1d(np.arange(seen[0], seen[-1]), seen)
         edges = count - np.argmax(field[::-1, seen] > 0.0, axis=0)
+        edges = ndimage.median_filter(edges, EDGE_ROWS, mode="nearest")  # next to what hides them they are noisy
         inside = np.interp(hidden, seen, edges) - np.arange(count)[:, None] - 0.5
         unseen[:, hidden] = np.clip(votes.cell * inside, -votes.band, votes.band)
     return _trace_outline(np.where(np.isnan(field), unseen, field), votes)

@@ -102,14 +102,9 @@ def compute_mesh_misfit(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> floa
 
 
 def intersect_box(rays: RaySample, position: Vector3, rotation: Matrix3, half_size: Vector3) -> Depths:
-    """Intersect the rays with a box centred on its frame (slab method): the depths [m], `MISS_M` for a miss."""
-    origin = (rays.eye - position) @ rotation
-    directions = rotation.T @ rays.directions
-    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face: the quotients are infinite
-        one, two = (-half_size - origin)[:, None] / directions, (half_size - origin)[:, None] / directions
-        enter = np.minimum(one, two).max(axis=0)
-        leave = np.maximum(one, two).min(axis=0)
-        return np.where((enter <= leave) & (enter > 0.0), enter, MISS_M)
+    """Intersect the rays with a box centred on its frame: the depths [m], `MISS_M` for a miss."""
+    enter, leave = _intersect_slabs((rays.eye - position) @ rotation, rotation.T @ rays.directions, half_size)
+    return np.where((enter <= leave) & (enter > 0.0), enter, MISS_M)
 
 
 def intersect_rounded_box(
@@ -117,23 +112,33 @@ def intersect_rounded_box(
 ) -> Depths:
     """Intersect the rays with a box whose edges along z have a radius [m]: the depths [m], `MISS_M` for a miss.
 
-    Seen along z it is the union of two rectangles and four circles, and convex: what a ray has in common with it is one
-    interval, from the first of those that it enters to the last that it leaves.
+    It is the union of two boxes and four cylinders, and convex: what a ray has in common with it is one interval, from
+    the first of those that it enters to the last that it leaves.
     """
     origin, directions = (rays.eye - position) @ rotation, rotation.T @ rays.directions
+    x, y, z = half_size
+    boxes = [_intersect_slabs(origin, directions, np.array(half)) for half in ((x - radius, y, z), (x, y - radius, z))]
     corners = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]) * (half_size[:2] - radius)
     away = origin[:2] - corners
     a = (directions[:2] ** 2).sum(axis=0)
     b = away @ directions[:2]
     c = (away**2).sum(axis=1)[:, None] - radius * radius
-    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face or past a circle
-        one, two = (-half_size - origin)[:, None] / directions, (half_size - origin)[:, None] / directions
-        enter, leave = np.minimum(one, two), np.maximum(one, two)
-        inset = radius / np.abs(directions[:2])
-        first, last = np.maximum(enter[:2] + inset, enter[1::-1]), np.minimum(leave[:2] - inset, leave[1::-1])
-        met = first <= last
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray that passes a cylinder, or runs along its axis
         root = np.sqrt(b * b - a * c)
-        first = np.fmin(np.where(met, first, np.inf).min(axis=0), np.fmin.reduce((-b - root) / a))
-        last = np.fmax(np.where(met, last, -np.inf).max(axis=0), np.fmax.reduce((-b + root) / a))
-    first, last = np.maximum(first, enter[2]), np.minimum(last, leave[2])
-    return np.where((first <= last) & (first > 0.0), first, MISS_M)
+        enter, leave = (-b - root) / a, (-b + root) / a
+        low, high = (-z - origin[2]) / directions[2], (z - origin[2]) / directions[2]
+    enter, leave = np.maximum(enter, np.minimum(low, high)), np.minimum(leave, np.maximum(low, high))
+    enter = np.concatenate([[into for into, _ in boxes], enter])
+    leave = np.concatenate([[out for _, out in boxes], leave])
+    met = enter <= leave
+    first = np.where(met, enter, np.inf).min(axis=0)
+    return np.where(met.any(axis=0) & (first > 0.0), first, MISS_M)
+
+
+def _intersect_slabs(
+    origin: Vector3, directions: Float64[np.ndarray, "3 n"], half_size: Vector3
+) -> tuple[Depths, Depths]:
+    """Intersect rays with the box about the origin: the depths where they enter and leave it, if the first is less."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # rays along a face: the quotients are infinite
+        one, two = (-half_size - origin)[:, None] / directions, (half_size - origin)[:, None] / directions
+        return np.minimum(one, two).max(axis=0), np.maximum(one, two).min(axis=0)

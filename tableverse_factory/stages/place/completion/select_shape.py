@@ -1,7 +1,6 @@
 """The mesh model `carved`: the simplest of several kinds of shape that explains the picture."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -53,9 +52,9 @@ UNAVOIDABLE_M = 0.0003  # misfit of even the true shape [m]: a kind whose freedo
 ESTIMATED_UNAVOIDABLE_M = 7e-4  # the same where a model estimated the depth
 FEW_NUMBERS_M = 1.2e-3  # the same of a turned shape of few numbers, less the bonus of its cavity
 
-# By how much rounded edges make a misfit smaller, at least and at most [m]: of six tins and food boxes by 0.3 to 1.45
-# mm, of 49 boxes with sharp ones by 0 to 0.17; and at most as a share of one that is no box. A net's masks round all
-LEAST_ROUNDED_M, MOST_ROUNDED_M, MOST_ROUNDED_SHARE = 2.5e-4, 1.5e-3, 0.4
+# Gain by rounded edges, from which they count and that is expected at most [m], the latter also as a share of a misfit:
+# of six tins and food boxes 0.3 to 1.45 mm, of 49 boxes with sharp edges 0 to 0.17; what is round gains more
+LEAST_GAIN_M, MOST_GAIN_M, MOST_GAIN_SHARE = 2.5e-4, 1.5e-3, 0.4
 ROUNDED_M = 2e-4  # cost of rounded edges [m]: much rounded, a box is nearly a cylinder
 RAGGED_M = 0.002  # cost of surface area beyond a smooth solid's, per area of the hull [m]
 SIMPLER_M = 3e-4  # most by which simplification makes a misfit smaller [m]; 0.13 mm is the most measured
@@ -73,7 +72,7 @@ Shape = tuple[TriangleMesh, Pose, float]  # mesh, pose, and cost: disagreement w
 
 
 class Draft(NamedTuple):
-    """A fit of one kind: the least cost that its shape can have [m], and how to make the shape."""
+    """A fit of one kind: the least cost to expect of its shape [m], and how to make the shape."""
 
     least: float
     finish: Callable[[], Shape]
@@ -134,7 +133,7 @@ def complete_by_carving(scene: PerceivedObjects, view: ObjectView) -> Completion
         GeometryError: if no shape explains the points, or the best one lies far from them.
     """
     kinds, unavoidable = (ESTIMATED_KINDS, ESTIMATED_UNAVOIDABLE_M) if view.estimated else (KINDS, UNAVOIDABLE_M)
-    search = _try_kinds(kinds, view, sample_rays(view), unavoidable)
+    search = try_kinds(kinds, view, sample_rays(view), unavoidable)
     if search.best is None:
         raise GeometryError("; ".join(dict.fromkeys(search.reasons)) or "no shape explains the points")
     _, method, mesh, pose = search.best
@@ -168,11 +167,11 @@ def _find_plain(view: ObjectView, method: str, mesh: TriangleMesh, pose: Pose) -
     kinds, most = SOLID_KINDS, compute_mesh_misfit(rays, mesh, pose) + extra
     if is_torn(view, method, mesh):
         kinds, most = PLAIN_KINDS, max(most, MOST_PLAIN_M)
-    best = _try_kinds(kinds, view, rays, 0.0, most).best
+    best = try_kinds(kinds, view, rays, 0.0, most).best
     return None if best is None or best[0] > most or hides_others(view, *best[2:]) else best[1:]
 
 
-def _try_kinds(
+def try_kinds(
     kinds: tuple[Kind, ...], view: ObjectView, rays: RaySample, unavoidable: float, most: float = np.inf
 ) -> _Search:
     """Search the best shape of some kinds; `unavoidable` is the misfit of even the true one [m]."""
@@ -191,27 +190,27 @@ def _try_kinds(
     return search
 
 
-def _draft_upright(view: ObjectView, rays: RaySample, price: Callable[[float], float]) -> Draft:
+def _draft_upright(view: ObjectView, rays: RaySample, discount: float = 0.0) -> Draft:
     """Draft a box that stands, whose upright edges are rounded where that explains the picture better."""
     sharp = fit_upright_box(view, rays)
+    price = _price_box(sharp, discount)
 
     def finish() -> Shape:
         rounded = round_edges(view, rays, sharp)
-        if rounded is None or rounded.misfit + LEAST_ROUNDED_M > sharp.misfit:
-            return build_box_mesh(sharp), sharp.pose, price(sharp.misfit)
-        return build_box_mesh(rounded), rounded.pose, min(rounded.misfit + ROUNDED_M, price(sharp.misfit))
+        if rounded is None or rounded.misfit + LEAST_GAIN_M > sharp.misfit:
+            return build_box_mesh(sharp), sharp.pose, price
+        return build_box_mesh(rounded), rounded.pose, min(rounded.misfit + ROUNDED_M, price)
 
-    most = max(MOST_ROUNDED_M, MOST_ROUNDED_SHARE * sharp.misfit)
-    return Draft(min(sharp.misfit - most, price(sharp.misfit)), finish)
-
-
-def _draft_box(box: SolidBox, price: Callable[[float], float]) -> Draft:
-    cost = price(box.misfit)
-    return Draft(cost, lambda: (build_box_mesh(box), box.pose, cost))
+    return Draft(min(sharp.misfit - max(MOST_GAIN_M, MOST_GAIN_SHARE * sharp.misfit), price), finish)
 
 
-def _discount(misfit: float) -> float:
-    return misfit - min(BOX_DISCOUNT * misfit, BOX_DISCOUNT_M)
+def _draft_box(box: SolidBox, discount: float = 0.0) -> Draft:
+    price = _price_box(box, discount)
+    return Draft(price, lambda: (build_box_mesh(box), box.pose, price))
+
+
+def _price_box(box: SolidBox, discount: float) -> float:
+    return box.misfit - min(discount * box.misfit, BOX_DISCOUNT_M)
 
 
 def _draft_turned(view: ObjectView, rays: RaySample, fit: TurnedFit | None) -> Draft | None:
@@ -244,14 +243,17 @@ def _draft_plain_turned(view: ObjectView, rays: RaySample) -> Draft | None:
         misfit = compute_misfit(rays, intersect_turned(rays, profile))
         if misfit < MOST_PLAIN_M:
             cost = misfit - (HOLLOW_BONUS_M if shows_cavity(rays, profile) else 0.0)
-            return Draft(cost, partial(_build_turned, view, rays, profile, cost))
+            return _draft_fitted(view, rays, profile, cost)
     return None
 
 
-def _draft_plain_solid(view: ObjectView, rays: RaySample) -> Draft | None:
+def _draft_plain_solid(view: ObjectView, rays: RaySample) -> Draft:
     """Draft a turned solid fitted to the depth as measured."""
     profile, _ = fit_solid(view, sample_rays(view)).finish()
-    cost = compute_misfit(rays, intersect_turned(rays, profile))
+    return _draft_fitted(view, rays, profile, compute_misfit(rays, intersect_turned(rays, profile)))
+
+
+def _draft_fitted(view: ObjectView, rays: RaySample, profile: TurnedProfile, cost: float) -> Draft:
     return Draft(cost, lambda: _build_turned(view, rays, profile, cost))
 
 
@@ -301,9 +303,9 @@ def _price_raggedness(mesh: TriangleMesh) -> float:
 
 # In the order of trial: the fewer freedoms a kind has, the earlier and the cheaper, but for the dearest.
 KINDS = (
-    Kind("carved/box", 0.0, lambda view, rays: _draft_upright(view, rays, _discount)),
+    Kind("carved/box", 0.0, lambda view, rays: _draft_upright(view, rays, BOX_DISCOUNT)),
     Kind("carved/revolution", 1e-4, _draft_revolution),
-    Kind("carved/leaning_box", 3e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays), _discount)),
+    Kind("carved/leaning_box", 3e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays), BOX_DISCOUNT)),
     Kind("carved/half_turn", 5e-4, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     Kind("carved/sheet", 1e-3, _draft_sheet),
     Kind("carved/inflation", 1.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
@@ -315,16 +317,16 @@ OUTLINED_LYING = Kind("carved/lying", 3e-4, lambda view, rays: _draft_turned(vie
 
 # The same for depth that a model estimated, whose errors a free shape follows.
 ESTIMATED_KINDS = (
-    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays), float)),
+    Kind("carved/box", 0.0, lambda view, rays: _draft_box(fit_upright_box(view, rays))),
     Kind("carved/turned", 0.0, lambda view, rays: _draft_turned(view, rays, fit_standing(view, rays))),
     OUTLINED_LYING,
-    Kind("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays), float)),
+    Kind("carved/leaning_box", 6e-4, lambda view, rays: _draft_box(fit_leaning_box(view, rays))),
     Kind("carved/half_turn", 3e-3, lambda view, rays: _draft_carving(carve_half_turn(view), rays, _price_raggedness)),
     Kind("carved/inflation", 3.5e-3, lambda view, rays: _draft_carving(inflate(view), rays, lambda _: 0.0)),
     Kind("carved/columns", 5e-3, lambda view, rays: _draft_carving(carve_columns(view), rays, lambda _: 0.0)),
 )
 
-PLAIN_BOX = Kind("carved/box", 0.0, lambda view, rays: _draft_upright(view, rays, float))
+PLAIN_BOX = Kind("carved/box", 0.0, _draft_upright)
 
 # What is tried where errors of a sensor's depth tear all that follows it: shapes of few numbers average them.
 PLAIN_KINDS = (PLAIN_BOX, Kind("carved/turned", 0.0, _draft_plain_turned), OUTLINED_LYING)

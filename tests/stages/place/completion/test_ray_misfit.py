@@ -58,6 +58,15 @@ def test_a_rounded_box_has_the_misfit_of_its_mesh(share):
     )
 
 
+@pytest.mark.parametrize(("direction", "depth"), [([0, 0, -1], 0.95), ([0, 1, 0], 0.96), ([1, 0, 0], 0.95)])
+def test_rays_along_the_faces_of_a_rounded_box_meet_it(direction, depth):
+    ray = np.array(direction, dtype=np.float64)
+    rays = RaySample(-ray, ray[:, None], np.array([depth]), np.array([1.0]))
+    for radius in (0.0, 0.01, 0.04):
+        hit = intersect_rounded_box(rays, np.zeros(3), np.eye(3), np.array([0.05, 0.04, 0.05]), radius)
+        assert hit == pytest.approx([depth])
+
+
 def test_rays_along_the_faces_of_a_box_meet_it():
     rays = RaySample(np.array([0.0, 0.0, 1.0]), np.array([[0.0], [0.0], [-1.0]]), np.array([0.9]), np.array([1.0]))
     hit = intersect_box(rays, np.zeros(3), np.eye(3), np.full(3, 0.1))
