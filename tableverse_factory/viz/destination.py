@@ -111,8 +111,8 @@ def _read_marker(mark: Path, dataset: str, name: str) -> frozenset[str]:
         files, other = frozenset(str(file) for file in known["files"]), str(known["dataset"])
     except (KeyError, TypeError, ValueError, RecursionError):
         raise InputError(
-            f"{name}: a gallery whose {GALLERY_MARKER} does not list its files, as of an earlier version: delete it, or "
-            f"{_ELSE}"
+            f"{name}: a gallery whose {GALLERY_MARKER} does not list its files, as of an earlier version: delete it, "
+            f"or {_ELSE}"
         ) from None
     if other != dataset:
         shown = sanitize_line(other, 200)
