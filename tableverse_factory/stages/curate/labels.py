@@ -37,7 +37,12 @@ def _compute_size_error(item: JudgedObject) -> float:
 
 
 def estimate_physical_properties(item: JudgedObject) -> PhysicalProperties:
-    """Estimate mass from volume, shell and material; look up the hinge by label."""
-    hinge = find_hinge_category(item.label)
-    mass = estimate_mass_kg(item.label, item.volume_m3, item.size)
+    """Estimate mass from volume, shell and material; look up the hinge by label.
+
+    An unnamed vessel counts as a cup or bowl: its volume is that of its walls, and solid.
+    """
+    hinge, name = find_hinge_category(item.label), item.label
+    if is_generic(name) and item.body.cavity is not None:
+        name = name_shape(item.body, item.size, item.volume_m3)
+    mass = estimate_mass_kg(name, item.volume_m3, item.size)
     return PhysicalProperties(mass_kg=round(mass, 5), has_hinge=hinge is not None, hinge_category=hinge)

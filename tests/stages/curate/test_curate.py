@@ -110,6 +110,14 @@ def test_masses_are_sensible(tmp_path):
     assert not any(o.mass_clipped for o in judged(kitchen(), tmp_path).objects)
 
 
+def test_an_unnamed_bowl_weighs_what_a_bowl_does_and_an_unnamed_box_is_not_solid(tmp_path):
+    things = [Thing(name, vessel(0.06, 0.05), 0.2 * i) for i, name in enumerate(("bowl", "object"))]
+    things.append(Thing("object", box(0.1, 0.1, 0.1), -0.3))
+    named, unnamed, filled = judged(settled(things, (1, 1)), tmp_path).objects
+    assert unnamed.mass_kg == named.mass_kg
+    assert filled.mass_kg == pytest.approx(0.37, abs=0.02)
+
+
 def test_hinges_come_from_the_category(tmp_path):
     labels = ["laptop", "scissors", "trash can", "soup can", "wooden box"]
     things = [Thing(label, box(0.2, 0.1, 0.05), 0.25 * i - 0.5) for i, label in enumerate(labels)]
