@@ -36,7 +36,7 @@ PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evi
 class SolidBox(Frozen):
     """A box: its frame at the centre, along its sides, in the table frame; half sizes and misfit to the picture [m].
 
-    `radius` is that of its edges along z [m], 0 of sharp ones.
+    `radius` is that of its edges along z [m], 0 of sharp ones and less than half of either side.
     """
 
     pose: Pose

@@ -90,7 +90,7 @@ class Kind(NamedTuple):
 class _Search:
     """Drafts of several kinds, which are finished as late as possible, and the best shape so far.
 
-    Drafts that must cost more than `most` [m] are not finished.
+    Drafts of which more than `most` is expected [m] are not finished.
     """
 
     def __init__(self, most: float) -> None:
@@ -174,7 +174,10 @@ def _find_plain(view: ObjectView, method: str, mesh: TriangleMesh, pose: Pose) -
 def try_kinds(
     kinds: tuple[Kind, ...], view: ObjectView, rays: RaySample, unavoidable: float, most: float = np.inf
 ) -> _Search:
-    """Search the best shape of some kinds; `unavoidable` is the misfit of even the true one [m]."""
+    """Search the best shape of some kinds that costs at most `most` [m], or a dearer one that is made anyway.
+
+    `unavoidable` is the misfit of even the true shape [m].
+    """
     search = _Search(most)
     for kind in kinds:
         if search.is_below(kind.freedom + (kind.unavoidable or unavoidable)):
