@@ -65,7 +65,8 @@ def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | 
         return misfit + _penalize_uncarried(view, position, rotation, half)
 
     steps = np.array([*STEPS, -ROUND_START])
-    start = _minimize(cost, _minimize(cost, start, steps), -steps / 2)  # the second search leaves where the first stuck
+    start = minimize_cost(cost, start, steps, CALLS)
+    start = minimize_cost(cost, start, -steps / 2, CALLS)  # leaves where the first search stuck
     position, rotation, half, radius = decode(start)
     if radius < LEAST_ROUND * half[:2].min():
         return None
@@ -82,6 +83,18 @@ def build_box_mesh(box: SolidBox) -> TriangleMesh:
         section = section.offset(box.radius, JoinType.Round, circular_segments=SEGMENTS)
     solid = Manifold.extrude(section, float(size[2])).translate((0.0, 0.0, -float(box.half_size[2])))
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
+
+
+def minimize_cost(
+    cost: Callable[[Float64[np.ndarray, " n"]], float],
+    start: Float64[np.ndarray, " n"],
+    steps: Float64[np.ndarray, " n"],
+    calls: int,
+) -> Float64[np.ndarray, " n"]:
+    """Minimise the cost of a box [m] by Nelder and Mead, from a simplex of one step along each number."""
+    options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": calls}
+    options |= {"xatol": 2e-4, "fatol": 1e-6}
+    return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
 
 
 def _propose_yaws(view: ObjectView) -> list[float]:
@@ -108,20 +121,10 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
         misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
         return misfit + prior + _penalize_uncarried(view, position, rotation, half)
 
-    found = _minimize(cost, start, np.array(STEPS))
+    found = minimize_cost(cost, start, np.array(STEPS), CALLS)
     position, rotation, half = _decode_box(found, view.support_z)
     misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
     return SolidBox(Pose(position, quaternion_about_z(float(found[5]))), half, misfit)
-
-
-def _minimize(
-    cost: Callable[[Float64[np.ndarray, " n"]], float],
-    start: Float64[np.ndarray, " n"],
-    steps: Float64[np.ndarray, " n"],
-) -> Float64[np.ndarray, " n"]:
-    options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": CALLS}
-    options |= {"xatol": 2e-4, "fatol": 1e-6}
-    return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
 
 
 def _penalize_uncarried(view: ObjectView, position: Vector3, rotation: Matrix3, half: Vector3) -> float:

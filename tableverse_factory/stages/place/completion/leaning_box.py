@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import minimize
 
 from schemas.geometry import Matrix3, Pose, Quaternion, Vector3
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
@@ -12,7 +11,7 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_from_matrix,
     rotation_matrix,
 )
-from tableverse_factory.stages.place.completion.box import MAX_SIDE_M, MIN_SIDE_M, SolidBox
+from tableverse_factory.stages.place.completion.box import MAX_SIDE_M, MIN_SIDE_M, SolidBox, minimize_cost
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -52,9 +51,7 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
         )
 
     for scale, calls in ((1.0, 300), (0.4, 200)):
-        simplex = np.vstack([start, start + np.diag(scale * steps)])
-        options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 1e-6}
-        start = minimize(cost, start, method="Nelder-Mead", options=options).x
+        start = minimize_cost(cost, start, scale * steps, calls)
     turned = normalize_quaternion(multiply_quaternions(base, _decode_turn(start)))
     return SolidBox(Pose(start[:3], turned), _decode_half_size(start), cost(start))
 
