@@ -3,7 +3,8 @@
 `my_captures/`, `my_pictures/` and `captures/` (one synthetic capture), `photos/` with one picture, `images.parquet` of
 the first, `layouts/` with its `truth/`, `meshes/`, `recording/` as Open3D unpacks one, and `out`: the dataset as the
 first command of the page that builds it would leave it, so that building it finds nothing left to do. It is not there
-where a page makes its manifest from something else. `SCENE_ID` is the id of a scene of `out`.
+where a page makes its manifest from something else. `SCENE_ID` is the id of a scene of `out`. A page that types nothing
+but how to install us finds `out` alone, a dataset of one scene of blocks: any will do.
 """
 
 import json
@@ -21,6 +22,7 @@ import skimage.data
 
 from tableverse_factory import open_dataset
 from tests.helpers.docs_pages import Command
+from tests.helpers.learnable_dataset import write_learnable_dataset
 from tests.helpers.paths import ROOT
 
 SCENES = 1
@@ -54,14 +56,16 @@ class Room:
         """Lays out a fresh `folder` for a page with these commands."""
         if folder.exists():
             shutil.rmtree(folder)
-        shutil.copytree(prepared / "common", folder)
+        if only_installs(page):
+            folder.mkdir(parents=True)
+            write_learnable_dataset(folder / "out", scenes=1, moved=0)
+        else:
+            lay_out(page, prepared, folder)
         (folder / "deploy").symlink_to(ROOT / "deploy")
-        if kind := kind_of_dataset(page):
-            shutil.copytree(dataset_of(kind, prepared, folder), folder / "out")
         self.folder = folder
         self._state = folder.parent / "shell-state"
         self._state.write_text(f"cd {folder}\n")
-        self.scene_id = first_scene(prepared / "plain")
+        self.scene_id = first_scene(folder / "out" if only_installs(page) else prepared / "plain")
 
     def type(self, command: Command) -> Answer:
         """Runs what a page says, in bash."""
@@ -91,6 +95,21 @@ def environment(folder: Path) -> dict[str, str]:
     """That of a user who has activated the virtual environment."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     return {**os.environ, "PATH": path, "TABLEVERSE_CACHE": str(folder.parent / "cache"), "COLUMNS": "100"}
+
+
+def lay_out(page: Sequence[Command], prepared: Path, folder: Path) -> None:
+    """Copies what a page that types our commands finds; the first such page makes it."""
+    if not (prepared / "plain").exists():
+        prepare(prepared, folder)
+        shutil.rmtree(folder)
+    shutil.copytree(prepared / "common", folder)
+    if kind := kind_of_dataset(page):
+        shutil.copytree(dataset_of(kind, prepared, folder), folder / "out")
+
+
+def only_installs(page: Sequence[Command]) -> bool:
+    """Whether a page types commands, and none of ours."""
+    return bool(page) and not any(command.text.startswith("tableverse ") for command in page)
 
 
 def prepare(prepared: Path, folder: Path) -> None:
@@ -144,10 +163,8 @@ def write_recording(capture: Path, recording: Path) -> None:
 
 
 def kind_of_dataset(page: Sequence[Command]) -> str | None:
-    """Which dataset a page begins with; of one that types nothing but how to install us, any will do."""
+    """Which dataset a page that types our commands, or none at all, begins with."""
     texts = [command.text for command in page]
-    if texts and not any(text.startswith("tableverse ") for text in texts):
-        return "plain"
     sources = [match[1].strip("/") for match in map(_MANIFEST.match, texts) if match]
     if any(source != OWN_CAPTURES and "://" not in source for source in sources):
         return None

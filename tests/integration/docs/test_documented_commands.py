@@ -16,7 +16,7 @@ import pytest
 
 from tests.helpers.command_lines import check_command, check_mention
 from tests.helpers.docs_pages import PAGES, SHELL, Block, Command, blocks, commands, mentioned
-from tests.helpers.docs_workspace import Room, prepare
+from tests.helpers.docs_workspace import Room
 from tests.helpers.paths import ROOT
 
 
@@ -92,9 +92,7 @@ def chapters(page: Path) -> list[list[Command | Block]]:
 
 @pytest.fixture(scope="session")
 def prepared(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("documentation")
-    prepare(root / "prepared", root / "reading")
-    return root
+    return tmp_path_factory.mktemp("documentation")
 
 
 def pages() -> list[Any]:
