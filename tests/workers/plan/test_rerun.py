@@ -115,7 +115,9 @@ def test_a_stage_that_was_finished_before_a_kill_is_not_run_again(tmp_path, mark
     assert digests(out) == digests(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("damage", ["torn", "flipped", "lost"])
+@pytest.mark.parametrize(
+    "damage", ["torn", *(pytest.param(damage, marks=pytest.mark.slow) for damage in ("flipped", "lost"))]
+)
 def test_damaged_and_lost_records_cost_time_only(built, marks, damage):
     manifest, out = built
     before = digests(out)

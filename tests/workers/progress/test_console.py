@@ -54,7 +54,9 @@ def test_a_cold_start_is_seen_to_be_one():
     assert "preparing" not in "\n".join(seen.screen)
 
 
-@pytest.mark.parametrize("size", [(40, 30), (100, 8), (20, 4)])
+@pytest.mark.parametrize(
+    "size", [(20, 4), *(pytest.param(size, marks=pytest.mark.slow) for size in ((40, 30), (100, 8)))]
+)
 def test_a_small_terminal_shows_what_matters(size):
     seen = watch([*PRETEND, "0", "well"], size=size)
     assert seen.code == 0
@@ -81,7 +83,10 @@ def test_an_error_leaves_the_terminal_usable():
     assert not seen.cursor_hidden
 
 
-@pytest.mark.parametrize("environment", [{}, {"FORCE_COLOR": "1"}, {"TERM": "dumb"}])
+@pytest.mark.parametrize(
+    "environment",
+    [{"FORCE_COLOR": "1"}, *(pytest.param(its, marks=pytest.mark.slow) for its in ({}, {"TERM": "dumb"}))],
+)
 def test_a_log_gets_lines_and_few_of_them(environment):
     ended = subprocess.run(
         [*PRETEND, "0", "well"], capture_output=True, text=True, cwd=ROOT, env={**PLAIN, **environment}

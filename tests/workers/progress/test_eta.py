@@ -60,7 +60,7 @@ def told(seed, **options):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("start_s", [0.0, 40.0])
+@pytest.mark.parametrize("start_s", [40.0, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_the_first_word_on_the_end_is_already_a_fair_one(start_s):
     ratios = []
     for seed in range(20):

@@ -135,7 +135,7 @@ def test_memory_that_other_scenes_left_behind_is_no_attempt_of_a_scene(tmp_path)
 
 
 @pytest.mark.parametrize("attempts", [pytest.param(1, marks=pytest.mark.slow), 2])  # two include the first
-@pytest.mark.parametrize("name", ["exit", "hang", "hog"])
+@pytest.mark.parametrize("name", ["exit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("hang", "hog"))])
 def test_a_failure_is_the_same_whatever_its_child_ran_before_and_costs_one_run_more(
     tmp_path, monkeypatch, name, attempts
 ):
@@ -299,7 +299,7 @@ def test_code_in_the_folder_where_a_build_is_started_is_not_imported(tmp_path, m
     sandbox.close()
 
 
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSEGV])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, pytest.param(signal.SIGSEGV, marks=pytest.mark.slow)])
 def test_a_child_that_dies_while_it_writes_the_scene_has_written_none(tmp_path, sent):
     killed = []
 
