@@ -77,7 +77,7 @@ def test_a_replay_from_the_files_alone_is_equal(good: RolloutResult) -> None:
     assert encode_recording(again.now) == data, "and its recording is the same to the last byte"
 
 
-@pytest.mark.parametrize("closed", [0.06, 0.0])
+@pytest.mark.parametrize("closed", [0.0, pytest.param(0.06, marks=pytest.mark.slow)])
 def test_failures_are_reproduced_too(closed: float) -> None:
     failed = execute_and_check(station(), BASE, pick_and_place(place=(-0.15, 0.1, 0.03), closed=closed), goal())
     assert not failed.verdict.success
@@ -130,14 +130,14 @@ def test_tampered_arrays_are_found(good: RolloutResult) -> None:
 LIES = (
     ({"success": False, "reason": "slipped"}, "a failure by its row ('slipped'); replayed it succeeds"),
     ({"lifted_m": 0.5}, "lifted_m: 0.5000 by its row"),
-    ({"robot": "menagerie:x"}, "its row says robot 'menagerie:x', its arrays 'panda'"),
-    ({"base_x_m": 1.0}, "its row puts the base at [1.0"),
-    ({"duration_s": 99.0}, "its row says that the motion takes 99.000 s, its arrays hold"),
-    ({"survives": ["friction_halved", "nonsense"]}, "survives is ['friction_halved', 'nonsense']"),
     ({"relation": Relation.RIGHT.value}, "relation_missed"),
     ({"arrays": None}, "there is no None to replay"),
 )
 MORE_LIES = (
+    ({"robot": "menagerie:x"}, "its row says robot 'menagerie:x', its arrays 'panda'"),
+    ({"base_x_m": 1.0}, "its row puts the base at [1.0"),
+    ({"duration_s": 99.0}, "its row says that the motion takes 99.000 s, its arrays hold"),
+    ({"survives": ["friction_halved", "nonsense"]}, "survives is ['friction_halved', 'nonsense']"),
     ({"disturbed_m": float("nan")}, "disturbed_m: nan by its row"),
     ({"base_x_m": None}, "its row has no base_x_m"),
     ({"base_yaw_rad": 1.0}, "its row turns the base by 1.0000 rad, its arrays by 1.5708 rad"),
@@ -169,12 +169,6 @@ MORE_LIES = (
 )
 def test_rows_that_lie_are_found(good: RolloutResult, changes: dict[str, object], found: str) -> None:
     assert found in problems(good.recording, row_of(good, **changes))
-
-
-def test_a_row_that_calls_a_failure_a_success_is_found() -> None:
-    failed = execute_and_check(station(), BASE, pick_and_place(closed=0.06), goal())
-    lies = problems(failed.recording, row_of(failed, success=True))
-    assert "a success by its row; replayed it fails in grasp: not_grasped" in lies
 
 
 def test_a_task_has_to_be_asked_for_once_and_not_refused(good: RolloutResult) -> None:

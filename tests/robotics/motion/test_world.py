@@ -36,7 +36,7 @@ def near_the_table(count: int) -> np.ndarray:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("carrying", [False, True])
+@pytest.mark.parametrize("carrying", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_free_agrees_with_the_distance_of_every_pair(carrying):
     world = clutter()
     held = held_pose(down(0.0, 0.0, GRASP_M), world.object_pose(BLOCK)) if carrying else None
