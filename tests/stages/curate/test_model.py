@@ -223,7 +223,12 @@ def test_a_hostile_answer_spoils_nothing_and_every_refusal_is_told(ask, server, 
 
 
 @pytest.mark.parametrize(
-    "change", [{"final_score": 11}, {"final_score": -5}, {"usability": "fine"}, {"per_criterion": 3}]
+    "change",
+    [
+        {"final_score": 11},
+        {"per_criterion": 3},
+        *(pytest.param(change, marks=pytest.mark.slow) for change in ({"final_score": -5}, {"usability": "fine"})),
+    ],
 )
 def test_an_answer_without_a_verdict_is_sent_back_and_then_dropped(ask, server, sound, change):
     broken, (key,) = {**sound, **change}, change

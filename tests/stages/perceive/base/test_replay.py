@@ -151,7 +151,9 @@ def test_two_of_which_one_hides_in_the_others_region_share_its_pixels(breakfast,
     assert basket.sum() > 200
 
 
-@pytest.mark.parametrize("with_ids", [True, False], ids=["with masks", "boxes alone"])
+@pytest.mark.parametrize(
+    "with_ids", [pytest.param(True, marks=pytest.mark.slow), False], ids=["with masks", "boxes alone"]
+)
 def test_two_hundred_things_take_no_memory_of_a_picture_each(breakfast, tmp_path, with_ids):
     observation = breakfast[0]
     rows, columns = np.indices(observation.depth.shape, dtype=np.int32)

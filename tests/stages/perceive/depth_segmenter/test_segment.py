@@ -32,19 +32,19 @@ def assert_found(things, tmp_path, at_least=0.9, **scene):
     return found
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 0.0015])
+@pytest.mark.parametrize("noise_m", [0.0015, pytest.param(0.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("yaw", [0.0, 0.5])
 def test_a_box_with_three_visible_faces_is_one_object(tmp_path, noise_m, yaw):
     assert_found([Box(0.0, 0.0, (0.16, 0.1, 0.12), yaw=yaw)], tmp_path, noise_m=noise_m)
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 0.0015])
+@pytest.mark.parametrize("noise_m", [0.0015, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_two_boxes_that_touch_are_two(tmp_path, noise_m):
     tall, low = Box(-0.05, 0.0, (0.1, 0.1, 0.16)), Box(0.06, 0.02, (0.12, 0.1, 0.07), color=(40, 160, 60))
     assert_found([tall, low], tmp_path, noise_m=noise_m)
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 0.0015])
+@pytest.mark.parametrize("noise_m", [0.0015, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_a_box_stacked_on_another_is_cut_at_the_crease(tmp_path, noise_m):
     lower = Box(0.0, 0.0, (0.24, 0.18, 0.07))
     upper = Box(0.0, 0.01, (0.12, 0.09, 0.09), z=0.07, yaw=0.4, color=(40, 160, 60))
@@ -144,7 +144,12 @@ def test_at_most_so_many_objects_as_configured(tmp_path):
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("name", "count"),
-    [("grasp6d_cheezit", (1, 1)), ("grasp6d_red_mug", (1, 1)), ("uoc_000000", (9, 11)), ("ycbv_000002", (5, 6))],
+    [
+        ("grasp6d_cheezit", (1, 1)),
+        pytest.param("grasp6d_red_mug", (1, 1), marks=pytest.mark.slow),
+        pytest.param("uoc_000000", (9, 11), marks=pytest.mark.slow),
+        ("ycbv_000002", (5, 6)),
+    ],
 )
 def test_real_table_tops_hold_as_many_objects_as_one_counts(shared_dir, tmp_path, name, count):
     row = ImageRow(scene_id=name, kind=SceneKind.CAPTURE, uri=str(shared_dir / "captures" / name))

@@ -97,7 +97,7 @@ def spoken(recorded: Detections, detector: str) -> str:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("detector", list(DIALECTS))
+@pytest.mark.parametrize("detector", ["openai", pytest.param("gemini", marks=pytest.mark.slow)])
 def test_a_model_that_sees_what_is_there_finds_the_true_objects(server, tmp_path, capture, detector):
     server.say(DIALECTS[detector](spoken(capture.recorded_detections, detector)))
     config, services = configured(server, detector), Services(tmp_path)
