@@ -86,7 +86,7 @@ def test_what_is_convex_is_one_piece_without_a_search(shape: trimesh.Trimesh, tm
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("make", [bowl, cup, l_shape])
+@pytest.mark.parametrize("make", [bowl, pytest.param(cup, marks=pytest.mark.slow), l_shape])
 def test_pieces_are_convex_closed_small_and_cover_the_mesh(make: type, tmp_path: Path) -> None:
     mesh = make()
     pieces = decompose(mesh, CONFIG, tmp_path)

@@ -17,6 +17,7 @@ from tests.helpers.bad_meshes import BAD_MESHES, LARGE_MESHES, BadMesh
 pytestmark = pytest.mark.heavy
 
 CONFIG = RectifyConfig()
+SLOW = ("needles", "klein_bottle", "bottomless_bowl", "three_hundred_shells")
 REFUSED_FOR_THEIR_SIZE = ("three_micrometres", "forty_metres")  # by the stage, which knows that this is a table
 
 
@@ -38,7 +39,7 @@ def ended(bad: BadMesh, mesh: TriangleMesh, cache: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "needles" else []) for name in BAD_MESHES]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in BAD_MESHES]
 )
 def test_a_bad_mesh_is_repaired_or_refused(name: str, tmp_path: Path) -> None:
     bad = BAD_MESHES[name]
