@@ -242,9 +242,14 @@ def failing(status: int, times: int, where: str, **headers: str):
     [
         failing(500, 2, "/commit/main"),
         failing(429, 1, "/commit/main", **{"Retry-After": "0"}),
-        failing(409, 2, "/commit/main"),
-        failing(503, 2, "/api/repos/create"),
-        failing(502, 1, "/tree/"),
+        *(
+            pytest.param(fault, marks=pytest.mark.slow)
+            for fault in (
+                failing(409, 2, "/commit/main"),
+                failing(503, 2, "/api/repos/create"),
+                failing(502, 1, "/tree/"),
+            )
+        ),
     ],
 )
 def test_a_hub_that_is_busy_is_asked_again(hub, dataset, run, fault):

@@ -50,7 +50,7 @@ def test_a_capture_is_the_same_in_a_store_and_on_the_disk(capture):
     assert list_file_names(f"{place}/nothing") == ()
 
 
-@pytest.mark.parametrize("fault", ["error", "refused"])
+@pytest.mark.parametrize("fault", ["refused", pytest.param("error", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["color.png", "detections.json", "masks.png", "meshes"])
 def test_no_answer_about_a_file_is_not_its_absence(capture, proxy, impatient, fault, name):
     place, _ = capture
@@ -75,7 +75,7 @@ def test_a_bucket_that_is_not_there_is_no_empty_capture(store, impatient):
         read_detections("s3://no-such-bucket/one")
 
 
-@pytest.mark.parametrize("fault", ["error", "refused"])
+@pytest.mark.parametrize("fault", ["error", pytest.param("refused", marks=pytest.mark.slow)])
 def test_a_folder_that_cannot_be_listed_is_not_left_out_of_a_manifest(store, proxy, impatient, tmp_path, fault):
     write_picture(tmp_path / "in" / "a" / "one.png", 1)
     write_picture(tmp_path / "in" / "b" / "two.png", 2)
@@ -90,7 +90,7 @@ def test_a_folder_that_cannot_be_listed_is_not_left_out_of_a_manifest(store, pro
         make_manifest([str(store)], BOUNDS)
 
 
-@pytest.mark.parametrize("fault", ["error", "refused"])
+@pytest.mark.parametrize("fault", ["error", pytest.param("refused", marks=pytest.mark.slow)])
 def test_a_dataset_whose_tables_cannot_be_listed_is_not_an_empty_one(store, proxy, impatient, tmp_path, fault):
     upload(write_small_dataset(tmp_path / "out"), store)
     dataset = open_dataset(str(store))
