@@ -318,7 +318,9 @@ def test_only_one_run_at_a_time_has_the_journal(tmp_path):
 
 
 def test_no_word_of_a_policy_makes_a_failure_a_success(benchmark, dataset, policies, tmp_path):
-    results = run(benchmark, dataset, PolicyName(f"{policies}:Sly"), tmp_path / "sly.jsonl", jobs=1, splits=("test",))
+    results = run(
+        benchmark, dataset, PolicyName(f"{policies}:Sly"), tmp_path / "sly.jsonl", splits=("test",), axes=("none",)
+    )
     found = {row.episode_id: (row.success, row.reason) for row in results if row.axis == "none"}
     assert found["test_0001"] == found["test_0000"] == (False, "policy_error")
 
