@@ -49,17 +49,22 @@ def bash(here: Path, line: str) -> list[str]:
         ("tableverse st", {"stats", "status"}, {"build"}),
         ("tableverse build --", {"--workers", "--set", "--from", "--help"}, {"--films"}),
         ("tableverse build m.parquet out --executor ", {"local", "ray"}, set()),
-        ("tableverse build m.parquet out --from se", {"settle"}, {"export"}),
         ("tableverse build m.parquet out --set rectify.cl", {"rectify.clearance_m="}, {"rectify.method="}),
-        ("tableverse trajectories out --set ", {"trajectories.robot="}, {"run.seed="}),
-        ("tableverse query out --table o", {"objects"}, {"scenes"}),
-        ("tableverse query out --table objects --columns mass", {"mass_kg"}, {"status"}),
         ("tableverse query out --columns scene_id,stat", {"scene_id,status"}, {"scene_id,usable"}),
         ("tableverse extract out there --scene c", {"c-3", "c-4"}, {"a-1", "b-2"}),
         ("tableverse extract nowhere there --scene c", set(), {"c-3"}),
-        ("tableverse extract out there --texture marb", {"marble-"}, set()),
-        ("tableverse failures out --stage cur", {"curate"}, set()),
-        ("tableverse export ler", {"lerobot"}, set()),
+        *(
+            pytest.param(*more, marks=pytest.mark.slow)
+            for more in (
+                ("tableverse build m.parquet out --from se", {"settle"}, {"export"}),
+                ("tableverse trajectories out --set ", {"trajectories.robot="}, {"run.seed="}),
+                ("tableverse query out --table o", {"objects"}, {"scenes"}),
+                ("tableverse query out --table objects --columns mass", {"mass_kg"}, {"status"}),
+                ("tableverse extract out there --texture marb", {"marble-"}, set()),
+                ("tableverse failures out --stage cur", {"curate"}, set()),
+                ("tableverse export ler", {"lerobot"}, set()),
+            )
+        ),
     ],
 )
 def test_bash_is_offered_what_fits(here, line, offered, not_offered):

@@ -75,7 +75,13 @@ def test_well_wrong_and_not_understood(home):
     assert (misspelt.returncode, misspelt.stdout) == (2, "")
 
 
-@pytest.mark.parametrize("command", ["config", "--help", "query out --json --table objects", "query out --format csv"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "query out --json --table objects",
+        *(pytest.param(command, marks=pytest.mark.slow) for command in ("config", "--help", "query out --format csv")),
+    ],
+)
 def test_a_reader_who_has_seen_enough_is_no_error(home, command):
     codes, out, err = pipeline(home, f"T {command} | head -c 5")
     assert codes[0] in (0, 141), "0 where all was written before the pipe was closed"
@@ -144,7 +150,7 @@ def test_a_terminal_that_lacks_letters_shows_their_codes(home, encoding):
 @pytest.mark.parametrize(
     ("variables", "coloured"),
     [
-        ({}, False),
+        pytest.param({}, False, marks=pytest.mark.slow),
         ({"FORCE_COLOR": "1", "TERM": "xterm-256color"}, True),
         ({"FORCE_COLOR": "1", "NO_COLOR": "1", "TERM": "xterm-256color"}, False),
         pytest.param({"FORCE_COLOR": "1", "TERM": "dumb"}, False, marks=pytest.mark.slow),

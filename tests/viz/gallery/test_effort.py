@@ -70,7 +70,9 @@ def test_before_is_where_the_picture_put_things(tmp_path):
     assert np.abs(greens[0].sum() - greens[1].sum()) < 0.02 * greens[1].sum(), "what was not moved stands still"
 
 
-@pytest.mark.parametrize("pose", [{"position": [0, 0], "quaternion_wxyz": [1, 0, 0, 0]}, 3])
+@pytest.mark.parametrize(
+    "pose", [{"position": [0, 0], "quaternion_wxyz": [1, 0, 0, 0]}, pytest.param(3, marks=pytest.mark.slow)]
+)
 def test_a_pose_that_is_none_costs_the_pictures_and_says_so(tmp_path, pose):
     members = scene_members("odd", photographed=False)
     item = {"object_id": "obj_000", "poses": {"placed": pose, "settled": pose}}
