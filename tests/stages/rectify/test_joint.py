@@ -32,9 +32,10 @@ from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_box, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import read_support
 from tests.helpers.convex_layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
+from tests.helpers.examples import examples
 
 CONFIG = RectifyConfig(method="joint")
-LAWS = settings(max_examples=15, deadline=None)
+LAWS = settings(max_examples=examples(25), deadline=None)
 
 
 def rectified(items: Sequence[PlacedObject]) -> RectificationResult:
