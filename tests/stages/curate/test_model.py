@@ -182,7 +182,10 @@ def task(x, relation, y, x_name, y_name):
     return {"instruction": instruction, "X_id": x, "X_name": x_name, "Y_id": y, "Y_name": y_name, "relation": relation}
 
 
-@pytest.mark.parametrize("wrap", ["{}", "```json\n{}\n```", "Sure!\n{}\n<b>done</b>"])
+@pytest.mark.parametrize(
+    "wrap",
+    ["Sure!\n{}\n<b>done</b>", *(pytest.param(wrap, marks=pytest.mark.slow) for wrap in ("{}", "```json\n{}\n```"))],
+)
 def test_a_hostile_answer_spoils_nothing_and_every_refusal_is_told(ask, server, sound, wrap):
     server.say(chat(wrap.replace("{}", json.dumps(hostile(sound)))))
     found = verdict(ask())
@@ -246,7 +249,15 @@ def test_an_answer_without_a_verdict_is_sent_back_and_then_dropped(ask, server, 
 
 @pytest.mark.parametrize(
     "text",
-    ["I cannot see a picture.", "[" * 300_000, '{"a":' * 100_000, "9" * 999_999, "\udfff{\ud800", "{}", "null"],
+    [
+        "I cannot see a picture.",
+        "[" * 300_000,
+        "{}",
+        *(
+            pytest.param(text, marks=pytest.mark.slow)
+            for text in ('{"a":' * 100_000, "9" * 999_999, "\udfff{\ud800", "null")
+        ),
+    ],
 )
 def test_what_is_no_answer_drops_the_scene(ask, server, text):
     server.say(chat(text))
@@ -262,7 +273,7 @@ def test_silence_is_asked_again_and_never_judged(ask, server, sound):
     assert len(server.asked) == 2
 
 
-@pytest.mark.parametrize("mass", [1e308, 1e-308])
+@pytest.mark.parametrize("mass", [1e308, pytest.param(1e-308, marks=pytest.mark.slow)])
 def test_masses_beyond_all_bounds_leave_figures_that_can_be_counted(ask, server, sound, mass):
     physical = {key: {"mass_kg": mass} for key in sound["physical_properties"]}
     server.say(chat(json.dumps({**sound, "physical_properties": physical})))

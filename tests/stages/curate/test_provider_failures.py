@@ -64,6 +64,9 @@ FAILURES = {
 }
 
 
+FAST = (("detector", "openai"), ("judge", "gemini"))
+"""In the fast run each of them has every other failure."""
+
 SHORT = ("429 without a time", "time-out in the middle of the body")
 """Those that would wait for long otherwise."""
 
@@ -85,14 +88,13 @@ def ask_of(door: str, dialect: str, server: ModelServer, services: Services, cas
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("failure", list(FAILURES))
 @pytest.mark.parametrize(
-    ("door", "dialect"),
+    ("door", "dialect", "failure"),
     [
-        ("detector", "openai"),
-        ("judge", "gemini"),
-        pytest.param("detector", "gemini", marks=pytest.mark.slow),
-        pytest.param("judge", "openai", marks=pytest.mark.slow),
+        pytest.param(door, dialect, failure, marks=[] if (door, dialect) == FAST[number % 2] else pytest.mark.slow)
+        for door in ("detector", "judge")
+        for dialect in SPEAK
+        for number, failure in enumerate(FAILURES)
     ],
 )
 def test_every_failure_ends_as_designed(server, tmp_path, monkeypatch, case, door, dialect, failure):
