@@ -77,7 +77,7 @@ FACES = DECAL.replace(".002 .002 .002", ".05 .05 .0002") + DECAL.replace(".002 .
 
 @pytest.mark.parametrize("extra", ["", DECAL, DECAL.replace("mass", 'group="1" mass'), FACES])
 @pytest.mark.parametrize("second", ["<freejoint/>", ""])
-@pytest.mark.parametrize("solid", [SOLID, HIDDEN])
+@pytest.mark.parametrize("solid", [HIDDEN, pytest.param(SOLID, marks=pytest.mark.slow)])
 def test_no_dressing_hides_a_collision(solid, second, extra, tmp_path):
     """Neither what is drawn beside a solid, nor a body that is fixed, nor a group, is a way to a rate of 0."""
     (tmp_path / "a.xml").write_text(

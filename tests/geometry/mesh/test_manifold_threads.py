@@ -17,7 +17,7 @@ print(len(os.listdir("/proc/self/task")) - threads, os.sched_getaffinity(0) == a
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
-@pytest.mark.parametrize("module", ["hulls", "repair"])
+@pytest.mark.parametrize("module", ["repair", pytest.param("hulls", marks=pytest.mark.slow)])
 def test_solids_are_cut_without_further_threads(module: str) -> None:
     """On all processors, and these stay allowed."""
     command = [sys.executable, "-c", PROGRAM.format(module=module)]

@@ -44,7 +44,7 @@ def stays(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) -> bool:
     return bool(middle and end[2] < high[2] + 0.008)
 
 
-@pytest.mark.parametrize("name", VESSELS)
+@pytest.mark.parametrize("name", [*VESSELS[:2], *(pytest.param(name, marks=pytest.mark.slow) for name in VESSELS[2:])])
 def test_vessels_of_our_own_hold_the_probe(name: str, tmp_path: Path) -> None:
     model = CATEGORIES[name].make(np.random.default_rng(4))
     pieces = decompose(model.mesh, RectifyConfig(), tmp_path)

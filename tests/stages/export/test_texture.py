@@ -74,7 +74,9 @@ def test_equal_meshes_give_equal_bytes() -> None:
     assert first.texture_png == again.texture_png
 
 
-@pytest.mark.parametrize("density", [0.0, 500.0, 2000.0])
+@pytest.mark.parametrize(
+    "density", [500.0, *(pytest.param(density, marks=pytest.mark.slow) for density in (0.0, 2000.0))]
+)
 def test_no_texel_belongs_to_two_faces(density: float) -> None:
     mesh = from_trimesh(trimesh.creation.icosphere(3, 0.03))
     atlas = lay_out_atlas(mesh, np.full(len(mesh.faces), density), 512)

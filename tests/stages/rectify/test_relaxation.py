@@ -67,7 +67,9 @@ def test_a_heap_beyond_the_work_allowed_does_not_keep_the_rest_from_its_least_mo
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(("bound", "most"), [("MAX_WORK", 1.5e7), ("MAX_WAYS_OUT", 130)])
+@pytest.mark.parametrize(
+    ("bound", "most"), [pytest.param("MAX_WORK", 1.5e7, marks=pytest.mark.slow), ("MAX_WAYS_OUT", 130)]
+)
 def test_the_work_of_a_layout_is_bounded_whatever_its_clusters(
     bound: str, most: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
