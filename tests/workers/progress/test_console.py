@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.helpers.paths import HELPERS
-from tests.helpers.terminal import PLAIN, ROOT, watch
+from tests.helpers.terminal import PLAIN, ROOT, Seen, watch
 
 pytestmark = pytest.mark.heavy
 
@@ -18,8 +18,13 @@ PRETEND = [sys.executable, str(HELPERS / "fake_build_display.py")]
 TABLEVERSE = [sys.executable, "-c", "from tableverse_factory.cli.main import main; main()"]
 
 
-def test_the_table_is_drawn_over_itself_and_stays_at_the_end():
-    seen = watch([*PRETEND, "0", "well"], size=(100, 60))
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    """A build that goes well, in a terminal with room for all of it."""
+    return watch([*PRETEND, "0", "well"], size=(100, 60))
+
+
+def test_the_table_is_drawn_over_itself_and_stays_at_the_end(seen):
     text = "\n".join(seen.screen)
     assert seen.code == 0
     assert text.count("stage  ") == 1
@@ -39,8 +44,7 @@ def test_what_is_printed_while_the_table_is_drawn_leaves_no_second_table():
     assert sum(line.startswith("stage  ") for line in [*seen.scrolled, *seen.screen]) == 1
 
 
-def test_a_failure_of_every_scene_does_not_bury_the_table():
-    seen = watch([*PRETEND, "0", "well"], size=(100, 60))
+def test_a_failure_of_every_scene_does_not_bury_the_table(seen):
     text = "\n".join(seen.screen)
     assert text.count("TypeError") <= 20
     assert "tableverse failures" in text
@@ -70,9 +74,9 @@ def test_another_size_half_way_is_survived():
     assert "220/400 scenes" in "\n".join(seen.screen)
 
 
-def test_no_colour_where_it_is_not_wanted():
+def test_no_colour_where_it_is_not_wanted(seen):
     colours = rb"\x1b\[[0-9;]*3[0-9]m"
-    assert re.search(colours, watch([*PRETEND, "0", "well"]).raw)
+    assert re.search(colours, seen.raw)
     assert not re.search(colours, watch([*PRETEND, "0", "well"], environment={"NO_COLOR": "1"}).raw)
 
 
