@@ -117,9 +117,14 @@ def test_a_shard_cut_short_after_its_commit_is_noticed(finished):
 @pytest.mark.parametrize(
     ("folder", "merged"),
     [
-        *((folder, True) for folder in FOLDERS if folder != "scenes"),
         ("mjcf", False),
-        *(pytest.param(folder, False, marks=pytest.mark.slow) for folder in ("objects", "tasks", "timings")),
+        ("objects", True),
+        *(
+            pytest.param(folder, merged, marks=pytest.mark.slow)
+            for folder in FOLDERS
+            for merged in (True, False)
+            if folder != "scenes" and (folder, merged) not in (("mjcf", False), ("objects", True))
+        ),
     ],
 )
 def test_a_file_that_a_committed_shard_has_lost_is_named_and_the_advice_mends_it(finished, folder, merged):
