@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from tableverse_factory.dataset.dataset import open_dataset
+from tableverse_factory.physics.render.views import FAST
+from tableverse_factory.viz.gallery import pictures
 from tableverse_factory.viz.gallery.gallery import write_gallery
 from tests.helpers.browser_harness import PHONE, is_blank, pixels, watched
 from tests.helpers.gallery_dataset import HOSTILE, scene_members, write_dataset
@@ -37,9 +39,11 @@ def hostile(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory) -> Path:
-    """Two scenes with trajectories, everything drawn."""
+    """Two scenes with trajectories, everything drawn, by one sample per pixel; the other gallery is of full quality."""
     out = two_scenes(tmp_path_factory.mktemp("films") / "out")
-    return write_gallery(open_dataset(out), out.with_name("gallery"), films=1)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pictures, "QUALITY", FAST)
+        return write_gallery(open_dataset(out), out.with_name("gallery"), films=1)
 
 
 def found(page) -> list[str]:
