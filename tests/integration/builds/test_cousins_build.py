@@ -32,7 +32,7 @@ from tests.helpers.cousin_parents import SCENES, build_parents, make_request
 from workers.run import run_build
 
 pytestmark = pytest.mark.heavy
-PER_SCENE = 4
+PER_SCENE = 3
 
 
 def plan(parents: Path, per_scene: int = PER_SCENE, seed: int = 0) -> list:
@@ -252,11 +252,11 @@ def test_the_bench_counts_cousins_that_no_stage_was_timed_of(made, tmp_path):
 
 
 def test_the_command_writes_manifest_and_dataset(made, tmp_path, run):
-    code, text, errors = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 2, "--executor", "local")
+    code, text, errors = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 1, "--executor", "local")
     assert code == 0, errors
-    assert "of 6 scenes" in text
+    assert "of 3 scenes" in text
     assert (tmp_path / "dest.parquet").is_file()
-    code, text, _ = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 2, "--executor", "local")
+    code, text, _ = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 1, "--executor", "local")
     assert "nothing was left to do" in text
     manifest = (tmp_path / "dest.parquet").read_bytes()
     code, _, errors = run("cousins", made / "out", tmp_path / "dest", "--per-scene", 3, "--executor", "local")
