@@ -19,7 +19,7 @@ NAN_MESH = b"v nan 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\
 @pytest.fixture(scope="module")
 def manifest(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("real")
-    synthesize_captures(folder / "in", 1, seed=5)
+    synthesize_captures(folder / "in", 1, seed=38)  # of five things
     hostile = folder / "in" / "hostile"
     truncated = write_capture(hostile / "truncated", 1) / "color.png"
     truncated.write_bytes(truncated.read_bytes()[:200])
