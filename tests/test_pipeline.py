@@ -59,7 +59,7 @@ def test_stages_read_what_they_declare(entries, tmp_path, kind):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("module", ["tableverse_factory.pipeline", "workers.api"])
+@pytest.mark.parametrize("module", ["workers.api", pytest.param("tableverse_factory.pipeline", marks=pytest.mark.slow)])
 def test_whoever_only_plans_a_build_imports_no_native_code_of_stages(module):
     line = f"import sys, {module}; print(*({{'open3d', 'mujoco', 'scipy', 'trimesh', 'coal'}} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", line], check=True, capture_output=True, text=True).stdout.split() == []

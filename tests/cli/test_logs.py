@@ -44,7 +44,10 @@ def clock(monkeypatch) -> Clock:
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize(("hours", "most"), [(0.1, 80), (10.0, 260), (240.0, 3000)])
+@pytest.mark.parametrize(
+    ("hours", "most"),
+    [(10.0, 260), *(pytest.param(*its, marks=pytest.mark.slow) for its in ((0.1, 80), (240.0, 3000)))],
+)
 def test_a_build_of_100_000_scenes_says_few_lines(clock, hours, most):
     """Every scene fails and is noted, as where a model is misconfigured."""
     log = io.StringIO()

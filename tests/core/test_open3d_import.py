@@ -37,7 +37,9 @@ def test_processes_of_a_pool_load_no_web_server():
     assert list(parallel_map(find_web_server, [0, 1], 2, "imports")) == [False, False]
 
 
-@pytest.mark.parametrize("name", ["open3d", "tableverse_factory.geometry.mesh.height_maps"])
+@pytest.mark.parametrize(
+    "name", ["open3d", pytest.param("tableverse_factory.geometry.mesh.height_maps", marks=pytest.mark.slow)]
+)
 def test_plots_are_there_for_whoever_draws_them(name):
     """Each time, whoever imports first; and the packages that they bring are the true ones."""
     drawn = f"""

@@ -123,7 +123,7 @@ def test_a_film_never_mirrors_left_and_right(figure, yaw):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("yaw", [0.0, 1.6, -2.5])
+@pytest.mark.parametrize("yaw", [-2.5, *(pytest.param(yaw, marks=pytest.mark.slow) for yaw in (0.0, 1.6))])
 def test_the_arm_does_not_stand_before_the_object_in_the_end(out, figure, yaw):
     """Beside the robot's line and straight below its hand, the object shows in the last picture."""
     taken, scene = recording(), open_dataset(out).scene("a-1")

@@ -8,7 +8,7 @@ from tableverse_factory.core.storage.files import get_store
 from tests.helpers.learnable_dataset import write_learnable_dataset
 
 
-@pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork")])
+@pytest.mark.parametrize(("workers", "context"), [pytest.param(0, None, marks=pytest.mark.slow), (2, "fork")])
 def test_a_stream_reads_a_store(store, tmp_path, workers, context):
     here = write_learnable_dataset(tmp_path / "out", scenes=3)
     for path in here.rglob("*"):

@@ -289,7 +289,7 @@ def test_a_scene_that_would_be_simulated_for_ever_is_refused(option: bytes, foun
         execute_and_check(endless, BASE, pick_and_place(), goal())
 
 
-@pytest.mark.parametrize("step_s", [0.02, 0.013, 0.05])
+@pytest.mark.parametrize("step_s", [0.013, *(pytest.param(step_s, marks=pytest.mark.slow) for step_s in (0.02, 0.05))])
 def test_samples_fall_on_steps_whatever_their_distance(step_s: float) -> None:
     motion = replace(pick_and_place(), step_s=step_s)
     execution = Rollout(station(), BASE, build_commands(motion), BLOCK, REFERENCE)
