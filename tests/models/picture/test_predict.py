@@ -161,12 +161,11 @@ def test_a_picture_upside_down_is_answered() -> None:
 @pytest.mark.parametrize(
     ("size", "value"),
     [
-        ((1, 1), 0),
         ((8, 64), 255),
         *(
             pytest.param(size, value, marks=pytest.mark.slow)
             for size, value in product([(1, 1), (8, 8), (8, 64), (480, 640)], [0, 255])
-            if (size, value) not in (((1, 1), 0), ((8, 64), 255))
+            if (size, value) != ((8, 64), 255)
         ),
     ],
     ids=str,

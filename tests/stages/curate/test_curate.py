@@ -22,13 +22,18 @@ def judged(scene: SettledScene, tmp_path, **options) -> Assessment:
     return outcome.value.assessment
 
 
+@pytest.fixture(scope="module")
+def assessment(tmp_path_factory) -> Assessment:
+    """Of the kitchen."""
+    return judged(kitchen(), tmp_path_factory.mktemp("kitchen"))
+
+
 @pytest.mark.heavy
-def test_same_scene_same_bytes(tmp_path):
-    assert judged(kitchen(), tmp_path) == judged(kitchen(), tmp_path)
+def test_same_scene_same_bytes(assessment, tmp_path):
+    assert judged(kitchen(), tmp_path) == assessment
 
 
-def test_a_kitchen_scene_is_usable_and_worth_its_points(tmp_path):
-    assessment = judged(kitchen(), tmp_path)
+def test_a_kitchen_scene_is_usable_and_worth_its_points(assessment):
     assert assessment.usable
     assert assessment.quality_score >= 7
     assert set(assessment.criterion_scores) == {
@@ -103,11 +108,11 @@ def test_an_impossible_size_is_a_severe_error_and_a_generic_label_is_not(tmp_pat
 
 
 @pytest.mark.heavy
-def test_masses_are_sensible(tmp_path):
-    masses = {o.relabel_name: o.mass_kg for o in judged(kitchen(), tmp_path).objects}
+def test_masses_are_sensible(assessment):
+    masses = {o.relabel_name: o.mass_kg for o in assessment.objects}
     assert 0.05 < masses["mug"] < 0.6
     assert 0.03 < masses["lemon"] < 0.2
-    assert not any(o.mass_clipped for o in judged(kitchen(), tmp_path).objects)
+    assert not any(o.mass_clipped for o in assessment.objects)
 
 
 def test_an_unnamed_bowl_weighs_what_a_bowl_does_and_an_unnamed_box_is_not_solid(tmp_path):
@@ -134,8 +139,8 @@ def test_names_never_carry_an_index(tmp_path):
         assert not any(c.isdigit() for phrase in item.distinguishing_phrases for c in phrase)
 
 
-def test_phrases_name_one_object_each(tmp_path):
-    phrases = [o.distinguishing_phrases for o in judged(kitchen(), tmp_path).objects]
+def test_phrases_name_one_object_each(assessment):
+    phrases = [o.distinguishing_phrases for o in assessment.objects]
     flat = [phrase for own in phrases for phrase in own]
     assert all(phrases)
     assert len(set(flat)) == len(flat)
