@@ -24,10 +24,11 @@ from tableverse_factory.stages.place.view.object_view import ObjectView
 MIN_SIDE_M, MAX_SIDE_M = 0.003, 2.0
 CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
-STEPS, CALLS = (0.006, 0.006, 0.06, 0.06, 0.04, 0.06), 240  # of the search: middle [m], logarithms of sides, yaw [rad]
-# Radius of rounded edges, as a share of half the shorter side: at the start, at least, and at most, as what is rounder
-# is turned
-ROUND_START, LEAST_ROUND, MOST_ROUND = 0.5, 0.3, 0.8
+STEPS = np.array([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])  # of the search: middle [m], logarithms of sides, yaw [rad]
+CALLS, ROUND_CALLS = 160, 130  # of each search for a box, and for its rounded edges
+# Radius of rounded edges, as a share of half the shorter side: at the start, of a step, at least, and at most, as what
+# is rounder is turned
+ROUND_START, ROUND_STEP, LEAST_ROUND, MOST_ROUND = 0.7, -0.4, 0.3, 0.8
 SEGMENTS = 24  # of a whole turn
 PRIOR_M = 2e-4  # weight of the prior on unobserved sides: small against the evidence of a single pixel column [m]
 
@@ -64,14 +65,13 @@ def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | 
         misfit = compute_misfit(rays, intersect_rounded_box(rays, position, rotation, half, radius))
         return misfit + _penalize_uncarried(view, position, rotation, half)
 
-    steps = np.array([*STEPS, -ROUND_START])
-    start = minimize_cost(cost, start, steps, CALLS)
-    start = minimize_cost(cost, start, -steps / 2, CALLS)  # leaves where the first search stuck
-    position, rotation, half, radius = decode(start)
+    steps = np.array([*2.0 * STEPS, ROUND_STEP])  # shorter ones end in worse minima, however long they search
+    found = minimize_cost(cost, start, (steps, -steps), ROUND_CALLS)
+    position, rotation, half, radius = decode(found)
     if radius < LEAST_ROUND * half[:2].min():
         return None
     misfit = compute_misfit(rays, intersect_rounded_box(rays, position, rotation, half, radius))
-    return SolidBox(Pose(position, quaternion_about_z(float(start[5]))), half, misfit, radius)
+    return SolidBox(Pose(position, quaternion_about_z(float(found[5]))), half, misfit, radius)
 
 
 def build_box_mesh(box: SolidBox) -> TriangleMesh:
@@ -88,13 +88,18 @@ def build_box_mesh(box: SolidBox) -> TriangleMesh:
 def minimize_cost(
     cost: Callable[[Float64[np.ndarray, " n"]], float],
     start: Float64[np.ndarray, " n"],
-    steps: Float64[np.ndarray, " n"],
+    searches: tuple[Float64[np.ndarray, " n"], ...],
     calls: int,
 ) -> Float64[np.ndarray, " n"]:
-    """Minimise the cost of a box [m] by Nelder and Mead, from a simplex of one step along each number."""
-    options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": calls}
-    options |= {"xatol": 2e-4, "fatol": 1e-6}
-    return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
+    """Minimise the cost of a box [m] by Nelder and Mead, from a simplex of one step along each number.
+
+    Each of the searches, with its steps and as many calls, begins where the one before it ended, or stuck.
+    """
+    for steps in searches:
+        options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": calls}
+        options |= {"xatol": 2e-4, "fatol": 1e-6}
+        start = np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
+    return start
 
 
 def _propose_yaws(view: ObjectView) -> list[float]:
@@ -121,7 +126,7 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
         misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
         return misfit + prior + _penalize_uncarried(view, position, rotation, half)
 
-    found = minimize_cost(cost, start, np.array(STEPS), CALLS)
+    found = minimize_cost(cost, start, (STEPS,), CALLS)
     position, rotation, half = _decode_box(found, view.support_z)
     misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
     return SolidBox(Pose(position, quaternion_about_z(float(found[5]))), half, misfit)

@@ -22,6 +22,9 @@ THICKNESS_M = 0.008  # initial length of a hidden side [m]
 SINK_WEIGHT = 0.2  # weight of corners below the support, against the misfit of rays
 MAX_SINK_M = 0.05  # from which a corner counts no more [m]
 FLOAT_WEIGHT = 0.05  # weight of the height of the lowest corner above the support, which has to be touched
+# Of the first search: middle [m], logarithms of sides, turn [rad]
+STEPS = np.array([0.005] * 3 + [0.08] * 3 + [0.05] * 3)
+CALLS = 200  # of each search
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
@@ -38,7 +41,6 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
     base = quaternion_from_matrix(rotation)
     base_axes = rotation_matrix(base)
     start = np.concatenate([center, np.log(size), np.zeros(3)])
-    steps = np.array([0.005, 0.005, 0.005, 0.08, 0.08, 0.08, 0.05, 0.05, 0.05])
 
     def cost(x: Float64[np.ndarray, "9"]) -> float:
         half, axes = _decode_half_size(x), base_axes @ rotation_matrix(_decode_turn(x))
@@ -50,10 +52,9 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
             + FLOAT_WEIGHT * max(float(heights.min()) - view.support_z, 0.0)
         )
 
-    for scale, calls in ((1.0, 300), (0.4, 200)):
-        start = minimize_cost(cost, start, scale * steps, calls)
-    turned = normalize_quaternion(multiply_quaternions(base, _decode_turn(start)))
-    return SolidBox(Pose(start[:3], turned), _decode_half_size(start), cost(start))
+    found = minimize_cost(cost, start, (STEPS, 0.4 * STEPS), CALLS)
+    turned = normalize_quaternion(multiply_quaternions(base, _decode_turn(found)))
+    return SolidBox(Pose(found[:3], turned), _decode_half_size(found), cost(found))
 
 
 def _decode_turn(x: Float64[np.ndarray, "9"]) -> Quaternion:

@@ -88,9 +88,17 @@ def _weigh_estimated(rays: RaySample, ahead: Depths, hit: Depths) -> Depths:
     met = (hit != MISS_M) & (rays.facing > 0.0)
     if not met.any():
         return np.abs(ahead)
-    middle = float(np.median(ahead[met]))
+    middle = _find_median(ahead[met])
     off = float(huber(rays.often_off_m, middle)) / rays.often_off_m if rays.often_off_m > 0.0 else abs(middle)
     return np.asarray(np.minimum(RELIEF * np.abs(ahead - middle), WORST_RELIEF_M) + DISTANCE * off)
+
+
+def _find_median(values: Depths) -> float:
+    """Find the median of a few hundred, where `np.median` takes most of its time to check them."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
+    return float(np.partition(values, (half - 1, half))[half - 1 : half + 1].mean())
 
 
 def compute_mesh_misfit(rays: RaySample, mesh: TriangleMesh, pose: Pose) -> float:

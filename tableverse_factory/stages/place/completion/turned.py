@@ -30,7 +30,7 @@ WALL_SHARE, WALL_RANGE_M = 0.06, (0.0025, 0.006)  # thickness of a wall, as a sh
 MIN_HOLLOW = 0.25  # least depth of a cavity, as a share of the height
 BEND_M = 3e-4  # cost of bends of the profile by its widest radius [m]: it decides what was not seen
 CARRY_WEIGHT = 0.1  # weight of how far outside of the body stands what it carries
-CALLS, REFINING_CALLS = 70, 320  # of the search for the size of a template, and for all radii
+CALLS, REFINING_CALLS = 70, 220  # of the search for the size of a template, and for all radii
 HOPELESS_M = 1e-3  # cost over the best template's from which a template is not refined [m]
 MOST_REFINED_M = 1.5e-3  # gain to expect by all radii [m]: of 112 selected shapes under 1.3 mm of 95 %, at most 2.6
 # Radii at the knots as shares of the widest, of which one is the start: a can, a ball, a cone; a beaker, a cup, a bowl
@@ -54,6 +54,7 @@ FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
 
 # Heights of the knots as shares of the whole: denser at the ends, where a ball closes.
 _LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
+_GRADIENT = np.gradient(np.eye(KNOTS), _LEVELS, axis=0)  # of values at the knots, over the height
 
 Kind = Literal["solid", "hollow", "lying"]
 KindTemplates = tuple[Kind, tuple[tuple[float, ...], ...]]
@@ -246,10 +247,10 @@ def _decode(view: ObjectView, x: Numbers, kind: Kind) -> TurnedProfile:
 
 def _build_cavity(heights: Radii, radii: Radii, floor_share: float) -> tuple[Radii, Radii]:
     """Build heights and radii of a cavity within a wall, down to a floor at a share of the height."""
-    wall = float(np.clip(WALL_SHARE * radii.max(), *WALL_RANGE_M))
-    inner = radii - wall * np.hypot(1.0, np.gradient(radii, heights))
+    wall = min(max(WALL_SHARE * float(radii.max()), WALL_RANGE_M[0]), WALL_RANGE_M[1])
     height = float(heights[-1])
-    floor = max(float(np.clip(floor_share, 0.0, 1.0 - MIN_HOLLOW)) * height, min(wall, 0.5 * height))
+    inner = radii - wall * np.hypot(1.0, _GRADIENT @ radii / height)
+    floor = max(min(max(floor_share, 0.0), 1.0 - MIN_HOLLOW) * height, min(wall, 0.5 * height))
     above = heights > floor + 1e-6
     at = np.concatenate([[floor], heights[above]])
     found = np.maximum(np.concatenate([[np.interp(floor, heights, inner)], inner[above]]), 1e-3)

@@ -98,3 +98,12 @@ def test_the_distance_of_estimated_depth_costs_by_its_square_up_to_three_per_cen
 def test_an_error_of_the_relief_of_estimated_depth_costs_a_quarter():
     rays = RaySample(np.zeros(3), np.zeros((3, 5)), np.ones(5), np.ones(5), estimated=True)
     assert compute_misfit(rays, np.array([1.0, 1.0, 1.0, 1.0, 0.98])) == pytest.approx(0.25 * 0.02 / 5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+def test_the_relief_of_estimated_depth_is_measured_about_its_median(count):
+    off = np.random.default_rng(count).uniform(-0.02, 0.02, count)
+    rays = RaySample(np.zeros(3), np.zeros((3, count)), np.ones(count), np.ones(count), estimated=True)
+    middle = np.median(off)
+    cost = np.minimum(0.25 * np.abs(off - middle), 0.008).mean() + 0.1 * abs(middle)
+    assert compute_misfit(rays, 1.0 - off) == pytest.approx(cost)
