@@ -103,7 +103,7 @@ def bench_completion(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder of scanned meshes; without it, twenty simple solids.", exists=True, file_okay=False
+            help="Folder of scanned meshes; without it, twenty-four simple solids.", exists=True, file_okay=False
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the depth noise.")] = 0,
@@ -122,9 +122,10 @@ def bench_completion(
     """
     from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion
 
-    scores = bench_completion(folder, seed, [_parse_view(text) for text in view] if view else VIEWS, error_mm / 1e3)
+    views = [_parse_view(text) for text in view] if view else VIEWS
+    scores = bench_completion(folder, seed, views, error_mm / 1e3)
     if as_json:
-        print_json(scores)
+        print_json({"seed": seed, "error_mm": error_mm, "views": views, "scores": scores})
     else:
         _show_completions(scores)
 

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 
 from schemas.config import ObserveConfig
 from schemas.geometry import Picture
@@ -99,14 +100,16 @@ def create_manifest(
         >>> manifest = create_manifest(["captures"], "images.parquet")
         >>> sum(not row.rejected for row in manifest.rows)
     """
-    bounds = ObserveConfig() if bounds is None else bounds
+    bounds, place = ObserveConfig() if bounds is None else bounds, parse_path(out)
+    if isinstance(place, Path) and place.is_dir():  # said before a hundred thousand pictures are decoded
+        raise InputError(f"{place} is a folder: name the Parquet file to write, such as {place / 'images.parquet'}")
     made = make_manifest(paths, bounds, listed, criteria, on_checked, known_length)
     if not made.rows:
         raise InputError(
             f"nothing found in {', '.join(sanitize_line(path) for path in paths)[:500]}: a capture is a folder with "
             "color.png, depth.png and camera.json; layouts are JSON files; pictures are JPEG, PNG or WebP"
         )
-    write_manifest(parse_path(out), made.rows)
+    write_manifest(place, made.rows)
     return made
 
 

@@ -17,7 +17,7 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.tables import MANIFEST
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.sources.discovery import RECORDED
-from tableverse_factory.sources.manifest import make_manifest, write_manifest
+from tableverse_factory.sources.manifest import create_manifest, make_manifest, write_manifest
 from tests.helpers.captures_on_disk import huge_png, write_capture, write_layout, write_picture
 
 BOUNDS = ObserveConfig()
@@ -162,6 +162,12 @@ def test_order_and_bytes_do_not_depend_on_the_order_of_creation(tmp_path):
     for name in ("1", "2"):
         write_manifest(tmp_path / f"{name}.parquet", left)
     assert (tmp_path / "1.parquet").read_bytes() == (tmp_path / "2.parquet").read_bytes()
+
+
+def test_a_folder_is_no_file_to_write(tmp_path):
+    write_picture(tmp_path / "in" / "one.png", 1)
+    with pytest.raises(InputError, match=r"is a folder: name the Parquet file to write, such as .*images\.parquet"):
+        create_manifest([str(tmp_path / "in" / "one.png")], str(tmp_path / "in"))
 
 
 def test_rows_come_back_from_the_file(tmp_path):

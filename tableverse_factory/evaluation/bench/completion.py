@@ -64,7 +64,7 @@ def bench_completion(
 ) -> list[CompletionScore]:
     """Complete every mesh in `folder` from each view by convex hull, height field and the place stage.
 
-    Without a folder, complete the twenty solids of `make_solids`. A view is the azimuth and elevation of a camera
+    Without a folder, complete the solids of `make_solids`. A view is the azimuth and elevation of a camera
     [degrees]; `error_m` is that of `render_noisy_view`.
     """
     scores: list[CompletionScore] = []

@@ -1,4 +1,4 @@
-"""Solids of kinds that stand on tables: cans, tins, jars, bottles, cartons, fruit, and what is nearly such a kind."""
+"""Solids that stand on tables: cans, tins, jars, cartons, fruit, what is nearly such a kind, and vessels."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,7 @@ SEGMENTS = 64
 
 
 def make_solids() -> Iterator[tuple[str, TriangleMesh]]:
-    """Make twenty: cans, cartons and what is round, then what is oval or has rounded edges, corners, knobs or necks."""
+    """Make twenty-four: cans, cartons, what is round, oval, or has rounded edges, corners, knobs or necks; vessels."""
     for name, solid in (
         ("can", _stand(0.11, 0.033)),
         ("lying can", _stand(0.12, 0.033).rotate((90.0, 0.0, 0.0))),
@@ -34,6 +34,10 @@ def make_solids() -> Iterator[tuple[str, TriangleMesh]]:
         ("pot with a knob", _stand(0.09, 0.045) + _stand(0.02, 0.01).translate((0.0, 0.0, 0.09))),
         ("square bottle", _round_edges(0.06, 0.06, 0.12, 0.01) + _stand(0.05, 0.014).translate((0.0, 0.0, 0.12))),
         ("pot with a spout", _stand(0.09, 0.045) + _stand(0.05, 0.01).rotate((0, 60, 0)).translate((0.03, 0.0, 0.05))),
+        ("cup", _hollow(0.09, 0.033, 0.042, 0.003)),
+        ("mug", _hollow(0.095, 0.04, 0.041, 0.004) + _build_handle()),
+        ("bowl", _hollow(0.06, 0.04, 0.075, 0.004)),
+        ("plate", _hollow(0.022, 0.07, 0.115, 0.004)),
     ):
         yield name, from_manifold(solid)
 
@@ -45,6 +49,17 @@ def _stand(height: float, radius: float, top: float | None = None, segments: int
 def _round_edges(length: float, width: float, height: float, radius: float) -> Manifold:
     core = CrossSection.square((length - 2 * radius, width - 2 * radius), True)
     return Manifold.extrude(core.offset(radius, JoinType.Round, circular_segments=SEGMENTS), height)
+
+
+def _hollow(height: float, base: float, top: float, wall: float) -> Manifold:
+    """Build a vessel with a floor; its wall is measured on the level."""
+    return _stand(height, base, top) - _stand(height, base - wall, top - wall).translate((0.0, 0.0, wall))
+
+
+def _build_handle() -> Manifold:
+    ring = Manifold.revolve(CrossSection.circle(0.005, SEGMENTS).translate((0.026, 0.0)), SEGMENTS)
+    handle = ring.rotate((90.0, 0.0, 0.0)).translate((0.044, 0.0, 0.05))
+    return handle - _stand(0.1, 0.0385)  # it ends inside the wall
 
 
 def _build_wedge() -> Manifold:

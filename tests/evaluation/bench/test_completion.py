@@ -79,9 +79,11 @@ def test_views_are_those_that_were_asked_for(tmp_path, run):
     found = {}
     for view in ("20,35", "200,60"):
         code, out, _ = run("bench", "completion", tmp_path, "--view", view, "--json")
-        found[view] = {row["method"]: row["iou"] for row in json.loads(out)}
+        said = json.loads(out)
+        found[view] = {row["method"]: row["iou"] for row in said["scores"]}
         assert code == 0
-        assert {row["view"] for row in json.loads(out)} == {0}
+        assert {row["view"] for row in said["scores"]} == {0}
+        assert said["views"] == [[float(part) for part in view.split(",")]]
     assert found["20,35"]["hull"] != found["200,60"]["hull"]
 
 
@@ -96,7 +98,7 @@ def test_a_view_that_is_none_is_refused_with_what_would_be_right(tmp_path, run, 
 def test_figures_come_as_strict_json_too(tmp_path, run):
     (tmp_path / "NaN.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))
     code, out, _ = run("bench", "completion", tmp_path, "--json")
-    rows = json.loads(out, parse_constant=pytest.fail)
+    rows = json.loads(out, parse_constant=pytest.fail)["scores"]
     assert code == 0
     assert {row["method"] for row in rows} > {"hull", "height field"}
     assert {(row["mesh"], row["cavity_kept"]) for row in rows} == {("NaN.obj", None)}
