@@ -13,7 +13,7 @@ import pytest
 
 import tests.helpers.blas_kernels  # noqa: F401 - before anything imports numpy
 from tests.helpers.model_server import ModelServer, model_server
-from tests.helpers.paths import SHARED
+from tests.helpers.paths import ROOT, SHARED
 
 pytest_plugins = ["tests.helpers.browser_harness", "tests.helpers.tiny_pipeline_fixtures", "tests.helpers.s3_fixtures"]
 
@@ -74,8 +74,8 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files begin first, or one would end alone; `--no-loadscope-reorder` keeps this order."""
-    items.sort(key=lambda item: not {"integration", "workers"} & set(item.path.parts))
+    """Files that start builds begin first, or a long one would end alone; `--no-loadscope-reorder` keeps this order."""
+    items.sort(key=lambda item: not {"integration", "workers"} & set(item.path.relative_to(ROOT).parts))
 
 
 @pytest.fixture(scope="session", autouse=True)

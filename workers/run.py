@@ -1,6 +1,7 @@
 """A build from its manifest to its dataset, or from where the last run stopped."""
 
 import os
+import signal
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -234,7 +235,13 @@ def _run_driver(
     _note_missing_keys(request, display)
     if request.executor == "ray":
         display.note(f"joining Ray at {request.address} …" if request.address else "starting Ray on this machine …")
-    with closing(_make_executor(request, spec, watch)) as executor:
+    try:
+        made = _make_executor(request, spec, watch)
+    except SystemExit as error:  # by Ray's own handler of SIGTERM, which it installs before it starts
+        if signals is None or error.code != signal.SIGTERM:
+            raise
+        raise StoppedError(signal.SIGTERM) from error
+    with closing(made) as executor:
         if signals is not None:
             signals.install()  # again, because `ray.init` takes SIGTERM for itself
         record_build()

@@ -90,12 +90,11 @@ def manifest(
     """
     from tableverse_factory.cli.progress_bar import count_progress
     from tableverse_factory.core.config import load_config
-    from tableverse_factory.core.storage.files import parse_path
     from tableverse_factory.sources.known_length import read_known_length
-    from tableverse_factory.sources.manifest import create_manifest
+    from tableverse_factory.sources.manifest import check_manifest_path, create_manifest
     from tableverse_factory.sources.urls.lists import is_list
 
-    place, bounds = parse_path(out), load_config(config, overrides or []).observe
+    place, bounds = check_manifest_path(out), load_config(config, overrides or []).observe
     known = None if known_length is None else read_known_length(known_length, "--known-length")
     lists = [path for path in paths if is_list(path)]
     criteria = {"min_side_px": min_side, "max_aspect": max_aspect, "min_contrast": min_contrast}

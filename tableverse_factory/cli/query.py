@@ -13,6 +13,7 @@ import typer
 from tableverse_factory.cli.completions import complete_columns
 from tableverse_factory.cli.options import ReadableOut
 from tableverse_factory.cli.tables import make_table, to_strict_json
+from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ def query(
     from tableverse_factory.dataset.query_parser import check_columns
     from tableverse_factory.dataset.query_parser import parse_filter as condition
 
+    if as_json and output == "csv":
+        raise InputError("--json and --format csv contradict each other: give one of them")
     output = "json" if as_json else output
     rows_of = open_dataset(out).table(table)
     asked = [name.strip() for name in columns.split(",") if name.strip()]

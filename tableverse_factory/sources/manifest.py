@@ -1,5 +1,6 @@
 """Image manifest: a row per entry with an id from its content, also for entries that cannot be used."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -100,9 +101,8 @@ def create_manifest(
         >>> manifest = create_manifest(["captures"], "images.parquet")
         >>> sum(not row.rejected for row in manifest.rows)
     """
-    bounds, place = ObserveConfig() if bounds is None else bounds, parse_path(out)
-    if isinstance(place, Path) and place.is_dir():  # said before a hundred thousand pictures are decoded
-        raise InputError(f"{place} is a folder: name the Parquet file to write, such as {place / 'images.parquet'}")
+    place = check_manifest_path(out)
+    bounds = ObserveConfig() if bounds is None else bounds
     made = make_manifest(paths, bounds, listed, criteria, on_checked, known_length)
     if not made.rows:
         raise InputError(
@@ -111,6 +111,14 @@ def create_manifest(
         )
     write_manifest(place, made.rows)
     return made
+
+
+def check_manifest_path(out: str) -> StoragePath:
+    """Parse where a manifest is to be written, and refuse a folder before a hundred thousand pictures are read."""
+    place = parse_path(out)
+    if isinstance(place, Path) and os.path.isdir(place):  # noqa: PTH112 a name that is too long is said when it is written
+        raise InputError(f"{place} is a folder: name the Parquet file to write, such as {place / 'images.parquet'}")
+    return place
 
 
 def write_manifest(path: StoragePath, rows: Iterable[ImageRow]) -> None:

@@ -46,6 +46,12 @@ def test_query_prints_json_and_csv_with_every_column(tableverse, out):
     assert json.loads(tableverse("query", out, "--where", "n_objects = 99", "--json").out) == []
 
 
+def test_json_that_is_csv_too_is_refused(tableverse, out):
+    answer = tableverse("query", out, "--json", "-f", "csv")
+    assert (answer.code, answer.out) == (1, "")
+    assert "--json and --format csv contradict each other" in answer.err
+
+
 @pytest.mark.parametrize("output", ["table", "json", "csv"])
 def test_texts_cannot_drive_the_terminal(tableverse, out, output):
     for table in ("objects", "scenes"):

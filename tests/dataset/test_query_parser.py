@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from schemas.tables import OBJECTS, SCENES, TASKS
 from tableverse_factory.core.errors import QueryError
 from tableverse_factory.dataset.query_parser import MAX_CHARS, MAX_CHOICES, check_columns, parse_filter
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 SCHEMA = pa.schema(
     [("i", pa.int32()), ("f", pa.float64()), ("s", pa.string()), ("b", pa.bool_()), ("l", pa.list_(pa.string()))]
@@ -121,7 +121,7 @@ conditions = st.recursive(
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(300), deadline=None)
+@settings(max_examples=scale_examples(300), deadline=None)
 @given(conditions)
 def test_a_condition_selects_what_python_selects(condition):
     text, truth = condition

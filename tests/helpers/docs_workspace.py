@@ -100,6 +100,7 @@ def environment(folder: Path) -> dict[str, str]:
 def lay_out(page: Sequence[Command], prepared: Path, folder: Path) -> None:
     """Copies what a page that types our commands finds; the first such page makes it."""
     if not (prepared / "plain").exists():
+        shutil.rmtree(prepared, ignore_errors=True)  # what a preparation that failed has left
         prepare(prepared, folder)
         shutil.rmtree(folder)
     shutil.copytree(prepared / "common", folder)

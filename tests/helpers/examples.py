@@ -1,8 +1,8 @@
-"""How many examples a law is tried on that takes long, or has more ways to break than others."""
+"""Numbers of examples of laws that take long, or have more ways to break than others."""
 
 from hypothesis import settings
 
 
-def examples(count: int) -> int:
-    """So many where slow tests run, three tenths of them in the fast run."""
-    return count * settings.default.max_examples // 100
+def scale_examples(count: int) -> int:
+    """Scale by the examples of the profile, 100 where slow tests run and 30 where not, to at least 10."""
+    return max(10, count * settings.default.max_examples // 100)

@@ -9,10 +9,12 @@ from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
 
 SEGMENTS = 64
+# Radii and heights of a plate's section, a wall of 4 mm [m]
+PLATE = np.array([(0.0, 0.0), (0.07, 0.0), (0.115, 0.02), (0.1134, 0.0237), (0.0691, 0.004), (0.0, 0.004)])
 
 
 def make_solids() -> Iterator[tuple[str, TriangleMesh]]:
-    """Make twenty-four: cans, cartons, what is round, oval, or has rounded edges, corners, knobs or necks; vessels."""
+    """Make twenty bodies (cans, cartons, fruit, what has rounded edges, corners, knobs or necks), then four vessels."""
     for name, solid in (
         ("can", _stand(0.11, 0.033)),
         ("lying can", _stand(0.12, 0.033).rotate((90.0, 0.0, 0.0))),
@@ -34,10 +36,10 @@ def make_solids() -> Iterator[tuple[str, TriangleMesh]]:
         ("pot with a knob", _stand(0.09, 0.045) + _stand(0.02, 0.01).translate((0.0, 0.0, 0.09))),
         ("square bottle", _round_edges(0.06, 0.06, 0.12, 0.01) + _stand(0.05, 0.014).translate((0.0, 0.0, 0.12))),
         ("pot with a spout", _stand(0.09, 0.045) + _stand(0.05, 0.01).rotate((0, 60, 0)).translate((0.03, 0.0, 0.05))),
-        ("cup", _hollow(0.09, 0.033, 0.042, 0.003)),
-        ("mug", _hollow(0.095, 0.04, 0.041, 0.004) + _build_handle()),
-        ("bowl", _hollow(0.06, 0.04, 0.075, 0.004)),
-        ("plate", _hollow(0.022, 0.07, 0.115, 0.004)),
+        ("cup", _build_vessel(0.09, 0.033, 0.042, 0.003)),
+        ("mug", _build_vessel(0.095, 0.04, 0.041, 0.004) + _build_handle()),
+        ("bowl", _build_vessel(0.06, 0.04, 0.075, 0.004)),
+        ("plate", Manifold.revolve(CrossSection([PLATE]), SEGMENTS)),
     ):
         yield name, from_manifold(solid)
 
@@ -51,15 +53,16 @@ def _round_edges(length: float, width: float, height: float, radius: float) -> M
     return Manifold.extrude(core.offset(radius, JoinType.Round, circular_segments=SEGMENTS), height)
 
 
-def _hollow(height: float, base: float, top: float, wall: float) -> Manifold:
+def _build_vessel(height: float, base: float, top: float, wall: float) -> Manifold:
     """Build a vessel with a floor; its wall is measured on the level."""
     return _stand(height, base, top) - _stand(height, base - wall, top - wall).translate((0.0, 0.0, wall))
 
 
 def _build_handle() -> Manifold:
+    """Build the handle of the mug, which ends inside its wall."""
     ring = Manifold.revolve(CrossSection.circle(0.005, SEGMENTS).translate((0.026, 0.0)), SEGMENTS)
     handle = ring.rotate((90.0, 0.0, 0.0)).translate((0.044, 0.0, 0.05))
-    return handle - _stand(0.1, 0.0385)  # it ends inside the wall
+    return handle - _stand(0.1, 0.0385)
 
 
 def _build_wedge() -> Manifold:

@@ -241,7 +241,7 @@ def failing(status: int, times: int, where: str, **headers: str):
     "fault",
     [
         failing(500, 2, "/commit/main"),
-        failing(429, 1, "/commit/main", **{"Retry-After": "0"}),
+        failing(429, 1, "/api/repos/create", **{"Retry-After": "0"}),
         *(
             pytest.param(fault, marks=pytest.mark.slow)
             for fault in (

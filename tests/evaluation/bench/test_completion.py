@@ -78,11 +78,12 @@ def test_views_are_those_that_were_asked_for(tmp_path, run):
     (tmp_path / "box.obj").write_text(trimesh.creation.box((0.06, 0.05, 0.04)).export(file_type="obj"))
     found = {}
     for view in ("20,35", "200,60"):
-        code, out, _ = run("bench", "completion", tmp_path, "--view", view, "--json")
+        code, out, _ = run("bench", "completion", tmp_path, "--view", view, "--seed", 4, "--error-mm", 1, "--json")
         said = json.loads(out)
         found[view] = {row["method"]: row["iou"] for row in said["scores"]}
         assert code == 0
         assert {row["view"] for row in said["scores"]} == {0}
+        assert (said["seed"], said["error_mm"]) == (4, 1.0)
         assert said["views"] == [[float(part) for part in view.split(",")]]
     assert found["20,35"]["hull"] != found["200,60"]["hull"]
 

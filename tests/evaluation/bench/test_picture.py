@@ -142,7 +142,7 @@ def test_the_proportions_of_the_same_scene_at_another_scale_are_the_same(tmp_pat
         perceive(replace(seen, depth=seen.depth * scale), config, make_rng(0, "a", "perceive"), Services(Path())).value
         for scale in (1.0, np.float32(1.25))
     )
-    sensed, larger = (replace(found, objects=found.objects[:3]) for found in (sensed, larger))
+    sensed, larger = (replace(found, objects=found.objects[:3]) for found in (sensed, larger))  # three tell as much
     score = compare_proportions(larger, larger.instance_ids, sensed, config)
     errors = score.proportions
     assert 0 < len(errors) <= score.objects

@@ -11,7 +11,7 @@ from schemas.geometry import TriangleMesh
 from tableverse_factory.geometry.collision.broad_phase import crop_to_half_space, find_separating_slab
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.geometry.mesh.repair import mesh_to_solid
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 
 def bowl() -> trimesh.Trimesh:
@@ -37,7 +37,7 @@ def placed(name: str, at: tuple[float, ...], turn: int) -> TriangleMesh:
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(200))
+@settings(max_examples=scale_examples(200))
 @given(NAMES, NAMES, AT, TURNS, TURNS)
 # Where faces are flat, a cut that folds them within their plane loses part of what is shared, or all of it.
 @example("ball", "box", (0.03125, 0.03125, 0.03125), 0, 3062)

@@ -12,7 +12,7 @@ from tableverse_factory.geometry.collision.inscribed_ball import find_largest_ba
 from tableverse_factory.geometry.mesh.meshes import from_trimesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid, mesh_to_solid, solid_to_mesh
 from tests.helpers.bad_meshes import bowl
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 RING = from_trimesh(trimesh.creation.torus(0.05, 0.015, 48, 24))
 SPHERE = from_trimesh(trimesh.creation.icosphere(3, 0.05))
@@ -40,7 +40,7 @@ def test_the_ball_is_as_large_as_the_shape_is_thick(mesh, diameter, at_most):
     assert find_largest_ball(mesh, 0.0, at_most) == pytest.approx(diameter, rel=0.1)
 
 
-@settings(max_examples=examples(40))
+@settings(max_examples=scale_examples(40))
 @given(st.floats(1e-8, 1e-3), st.floats(5e-4, 0.01), st.floats(1e-3, 0.02), st.integers(0, 2**31))
 @example(1e-6, 0.003, 0.004, 0)
 def test_a_film_around_something_thick_hides_nothing_and_is_not_thick(film, deep, wide, turn):

@@ -10,7 +10,7 @@ from tableverse_factory.geometry.collision.linear_sweep import LinearSweep, Movi
 from tableverse_factory.geometry.collision.separating_planes import PlaneFinder, PosedPieces
 from tableverse_factory.geometry.collision.solids import Solids
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 MARGIN, REACH = 0.001, 0.02
 
@@ -36,7 +36,7 @@ def stance(solids: Solids, shift: np.ndarray, turn: np.ndarray | None = None) ->
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=scale_examples(40), deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([-1.0, 0.0, 1.0]))
 def test_a_translation_that_satisfies_every_plane_is_free(seed: int, rise: float) -> None:
     rng = np.random.default_rng(seed)
@@ -88,7 +88,7 @@ def test_a_stance_turns_about_the_origin_and_moves_then() -> None:
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=scale_examples(40), deadline=None)
 @given(st.integers(0, 10**6))
 def test_room_ends_where_the_clearance_begins(seed: int) -> None:
     rng = np.random.default_rng(seed)

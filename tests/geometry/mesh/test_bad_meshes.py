@@ -17,7 +17,12 @@ from tests.helpers.bad_meshes import BAD_MESHES, LARGE_MESHES, BadMesh
 pytestmark = pytest.mark.heavy
 
 CONFIG = RectifyConfig()
-SLOW = ("needles", "klein_bottle", "bottomless_bowl", "three_hundred_shells")
+SLOW = (
+    "needles",
+    "klein_bottle",
+    "bottomless_bowl",
+    "three_hundred_shells",
+)  # others have their faults
 REFUSED_FOR_THEIR_SIZE = ("three_micrometres", "forty_metres")  # by the stage, which knows that this is a table
 
 

@@ -23,7 +23,7 @@ from tableverse_factory.geometry.mesh.meshes import (
     read_mesh,
     to_trimesh,
 )
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 FILES = {suffix: BOX.export(file_type=suffix) for suffix in ("obj", "ply", "stl", "glb")}
@@ -169,7 +169,7 @@ def test_a_truncated_file_is_an_error_or_a_smaller_mesh(suffix):
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(150), deadline=None)
+@settings(max_examples=scale_examples(150), deadline=None)
 @given(st.sampled_from(sorted(FILES)), st.integers(0, 2**32 - 1))
 def test_damaged_files_never_give_numbers_that_cannot_be_computed_with(suffix, seed):
     rng = np.random.default_rng(seed)

@@ -22,7 +22,7 @@ from tableverse_factory.geometry.relations.relations import (
     rotate_body_quarter_turn,
 )
 from tableverse_factory.geometry.relations.stable_placement import find_placement, make_support_surface
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 TABLE = Table(np.zeros(2), np.array([0.6, 0.6]), 0.0, (0, 0, 0), 0.0)
 CONTAINING = (Relation.IN, Relation.INTO, Relation.INSIDE)
@@ -60,7 +60,7 @@ def ball(radius, x=0.0, y=0.0, z=0.0) -> BodyFeatures:
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=scale_examples(40), deadline=None)
 @given(sizes, places, sizes, places)
 def test_converse_relations(size_a, at_a, size_b, at_b):
     a, b = box(size_a, *at_a), box(size_b, *at_b)
@@ -74,7 +74,7 @@ def test_converse_relations(size_a, at_a, size_b, at_b):
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=scale_examples(30), deadline=None)
 @given(sizes, places, sizes, places)
 def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
     a, b = box(size_a, *at_a), box(size_b, *at_b)
@@ -85,7 +85,7 @@ def test_a_mirrored_scene_mirrors_its_relations(size_a, at_a, size_b, at_b):
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=scale_examples(30), deadline=None)
 @given(sizes, places, sizes, places)
 def test_the_gap_of_axis_aligned_boxes_is_the_gap_of_their_boxes(size_a, at_a, size_b, at_b):
     a, b = box(size_a, *at_a), box(size_b, *at_b)
@@ -155,7 +155,7 @@ def test_what_a_tilted_vessel_stands_on_is_not_inside_it():
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=scale_examples(25), deadline=None)
 @given(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(0.004, 0.1))
 def test_inside_implies_within_the_box_of_the_vessel(x, y, z):
     vessel, thing = bowl(), ball(0.02, x, y, z)
@@ -186,7 +186,7 @@ def test_a_vessel_needs_depth_and_width(shape, is_vessel):
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=scale_examples(40), deadline=None)
 @given(
     radius=st.floats(0.02, 0.07),
     height=st.floats(0.05, 0.12),

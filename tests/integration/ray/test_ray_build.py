@@ -115,6 +115,16 @@ def test_sigterm_stops_ray_within_three_seconds_and_nothing_computes_on(whole, t
     wait_until(lambda: not any(is_alive(worker) for worker in workers), 30.0)
 
 
+def test_sigterm_while_ray_starts_is_a_stop_too(whole, tmp_path):
+    manifest, _ = whole
+    process = start(manifest, tmp_path / "out", "ray", 1, **RUN)
+    driver = psutil.Process(process.pid)
+    wait_until(lambda: any("gcs_server" in child.name() for child in driver.children()))
+    process.send_signal(signal.SIGTERM)
+    code, errors = finish(process)
+    assert code == 143, errors
+
+
 def test_actors_that_only_raise_stop_the_build_and_cost_no_scene(whole, tmp_path, monkeypatch):
     """No actor can start its sandbox, as where the temporary folder is full."""
     manifest, expected = whole

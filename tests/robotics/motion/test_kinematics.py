@@ -15,7 +15,7 @@ from tableverse_factory.robotics.motion.kinematics import (
     follow_poses,
     solve_ik,
 )
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 from tests.helpers.work_cells import HOME, alone, down
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -42,7 +42,7 @@ def test_forward_is_what_mujoco_says(seed):
 
 @pytest.mark.heavy
 @given(SEEDS)
-@settings(max_examples=examples(40))
+@settings(max_examples=scale_examples(40))
 def test_solutions_have_the_pose_within_limits_and_differ(seed):
     chain = alone().chain
     wanted = pose_from_matrix(chain.pose_matrix(configuration(seed)))

@@ -22,7 +22,7 @@ from tableverse_factory.robotics.placements.domains import SIDES, build_domain, 
 from tableverse_factory.robotics.placements.on_and_in import WALL_CLEARANCE_M
 from tableverse_factory.robotics.placements.request import RELEASE_HEIGHT_M, NoPlacement
 from tableverse_factory.robotics.placements.sampling import sample_placements
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 from tests.helpers.simple_scenes import ball, box, cylinder
 
 TABLE = Slab(np.zeros(2), np.array([0.5, 0.4]), 0.0, (150, 120, 90))
@@ -244,7 +244,7 @@ def test_the_first_ones_differ_so_that_a_planner_has_a_choice():
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=scale_examples(25), deadline=None)
 @given(
     st.tuples(st.floats(-0.3, 0.3), st.floats(-0.2, 0.2), st.floats(-3.1, 3.1)),
     st.tuples(*(st.floats(0.01, 0.15) for _ in range(3))),

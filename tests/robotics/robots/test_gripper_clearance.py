@@ -14,7 +14,7 @@ from tableverse_factory.geometry.relations.antipodal import sample_inward_normal
 from tableverse_factory.robotics.grasps.antipodal import sample_antipodal_grasps
 from tableverse_factory.robotics.grasps.clearance import TABLE_CLEARANCE_M, find_clear_grasps
 from tableverse_factory.robotics.robots.gripper_clearance import STANDOFF_M, compute_approach_openings
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 from tests.helpers.simple_bodies import box, cup, middle, standing
 
 FAR = np.array([[10.0, 10.0, 10.0]])
@@ -45,7 +45,7 @@ def swept(arm, grasps) -> np.ndarray:
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-1.5, 1.5), st.floats(0.0, 0.2), st.floats(0.0, 0.08))
-@settings(max_examples=examples(60))
+@settings(max_examples=scale_examples(60))
 def test_nothing_of_the_gripper_is_ever_below_the_table(arm, turn, lean, height, width):
     grasps = one_grasp(down(turn, lean), [0.0, 0.0, height], width)
     lowest = swept(arm, grasps)[:, 2].min()
@@ -79,7 +79,7 @@ def test_other_things_are_kept_clear_of_along_the_whole_way(arm, place, free):
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-0.8, 0.8), st.tuples(*[st.floats(-0.15, 0.15)] * 2), st.floats(0.02, 0.25))
-@settings(max_examples=examples(80))
+@settings(max_examples=scale_examples(80))
 def test_what_passes_touches_no_other_thing(arm, turn, lean, at, height):
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.03)
     ball.apply_translation([*at, height])

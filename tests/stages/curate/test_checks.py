@@ -22,7 +22,7 @@ from tableverse_factory.stages.curate.judge_input import build_judge_input
 from tableverse_factory.stages.curate.parse_answer import parse_judgement
 from tableverse_factory.stages.curate.rules import RulesJudge
 from tests.helpers.curate_scenes import kitchen
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 BOWL, RED_MUG, BLUE_MUG, PLATE, LEMON, CRACKERS, BLOCK = range(7)
 
@@ -263,7 +263,7 @@ def corrupted(draw, node):
 
 
 @pytest.mark.heavy
-@settings(max_examples=examples(60), deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=scale_examples(60), deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_whatever_parts_of_an_answer_are_exchanged_it_is_a_verdict_or_none(case, sound, data):
     answer = {**sound, "generated_tasks": sound["generated_tasks"][:3]}

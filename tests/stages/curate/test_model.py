@@ -252,11 +252,9 @@ def test_an_answer_without_a_verdict_is_sent_back_and_then_dropped(ask, server, 
     [
         "I cannot see a picture.",
         "[" * 300_000,
-        "{}",
-        *(
-            pytest.param(text, marks=pytest.mark.slow)
-            for text in ('{"a":' * 100_000, "9" * 999_999, "\udfff{\ud800", "null")
-        ),
+        "9" * 999_999,
+        "\udfff{\ud800",
+        *(pytest.param(text, marks=pytest.mark.slow) for text in ('{"a":' * 100_000, "{}", "null")),
     ],
 )
 def test_what_is_no_answer_drops_the_scene(ask, server, text):

@@ -32,10 +32,10 @@ from tableverse_factory.stages.rectify.rectify import rectify
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_box, merge_rigid_parts
 from tableverse_factory.stages.rectify.support import read_support
 from tests.helpers.convex_layouts import ball, box, layouts, offsets, part, placed, quarter_turns, smallest_gap, turned
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 CONFIG = RectifyConfig(method="joint")
-LAWS = settings(max_examples=examples(25), deadline=None)
+LAWS = settings(max_examples=scale_examples(25), deadline=None)
 
 
 def rectified(items: Sequence[PlacedObject]) -> RectificationResult:

@@ -26,10 +26,10 @@ from tests.helpers.convex_layouts import (
     smallest_gap,
     turned,
 )
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 CONFIG = RectifyConfig()
-LAWS = settings(max_examples=examples(30), deadline=None)
+LAWS = settings(max_examples=scale_examples(30), deadline=None)
 Method = Callable[[Sequence[RigidPart], RectifyConfig], RectificationResult]
 
 pytestmark = pytest.mark.parametrize("method", [rectify_lccr, rectify_jointly])
@@ -103,7 +103,7 @@ def test_nothing_hangs_beside_another(method: Method, yaw: float, nearer_m: floa
     assert low.lowest_now_m < 1e-3
 
 
-@settings(max_examples=examples(30), deadline=None)
+@settings(max_examples=scale_examples(30), deadline=None)
 @given(halves=st.lists(st.integers(5, 59).map(lambda n: n / 1000), min_size=1, max_size=9))
 def test_a_free_layout_on_the_table_is_left_alone(method: Method, halves: list[float]) -> None:
     items = [

@@ -16,10 +16,10 @@ from tableverse_factory.stages.rectify.radial import compute_azimuths, list_memb
 from tableverse_factory.stages.rectify.rigid_part import RigidPart, compute_center
 from tableverse_factory.stages.rectify.vertical import disentangle
 from tests.helpers.convex_layouts import ball, box, channel, layouts, offsets, part, placed, smallest_gap
-from tests.helpers.examples import examples
+from tests.helpers.examples import scale_examples
 
 CONFIG = RectifyConfig()
-LAWS = settings(max_examples=examples(40), deadline=None)
+LAWS = settings(max_examples=scale_examples(40), deadline=None)
 
 
 def rectified(items: Sequence[PlacedObject], config: RectifyConfig = CONFIG) -> RectificationResult:

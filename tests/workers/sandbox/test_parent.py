@@ -135,7 +135,7 @@ def test_memory_that_other_scenes_left_behind_is_no_attempt_of_a_scene(tmp_path)
 
 
 @pytest.mark.parametrize("attempts", [pytest.param(1, marks=pytest.mark.slow), 2])  # two include the first
-@pytest.mark.parametrize("name", ["exit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("hang", "hog"))])
+@pytest.mark.parametrize("name", ["hog", *(pytest.param(name, marks=pytest.mark.slow) for name in ("exit", "hang"))])
 def test_a_failure_is_the_same_whatever_its_child_ran_before_and_costs_one_run_more(
     tmp_path, monkeypatch, name, attempts
 ):

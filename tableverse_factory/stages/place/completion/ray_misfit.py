@@ -94,7 +94,7 @@ def _weigh_estimated(rays: RaySample, ahead: Depths, hit: Depths) -> Depths:
 
 
 def _find_median(values: Depths) -> float:
-    """Find the median of a few hundred, where `np.median` takes most of its time to check them."""
+    """Find the median of finite values, at least one: of a few hundred `np.median` takes most of its time to check."""
     half = len(values) // 2
     if len(values) % 2:
         return float(np.partition(values, half)[half])

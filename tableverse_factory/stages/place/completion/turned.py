@@ -54,7 +54,8 @@ FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
 
 # Heights of the knots as shares of the whole: denser at the ends, where a ball closes.
 _LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
-_GRADIENT = np.gradient(np.eye(KNOTS), _LEVELS, axis=0)  # of values at the knots, over the height
+# What gives the gradient of values at the knots, over the height: `np.gradient` costs more than all rays
+_GRADIENT = np.gradient(np.eye(KNOTS), _LEVELS, axis=0)
 
 Kind = Literal["solid", "hollow", "lying"]
 KindTemplates = tuple[Kind, tuple[tuple[float, ...], ...]]
@@ -241,14 +242,14 @@ def _decode(view: ObjectView, x: Numbers, kind: Kind) -> TurnedProfile:
         axes = np.stack([np.array([-along[1], along[0], 0.0]), np.array([0.0, 0.0, 1.0]), along], axis=1)
         return TurnedProfile(Pose(start, quaternion_from_matrix(axes)), heights, radii, *inner)
     if kind == "hollow":
-        inner = _build_cavity(heights, radii, float(x[-1]))
+        inner = _build_cavity(height, radii, float(x[-1]))
     return TurnedProfile(Pose(np.array([*x[:2], view.support_z]), quaternion_about_z(0.0)), heights, radii, *inner)
 
 
-def _build_cavity(heights: Radii, radii: Radii, floor_share: float) -> tuple[Radii, Radii]:
+def _build_cavity(height: float, radii: Radii, floor_share: float) -> tuple[Radii, Radii]:
     """Build heights and radii of a cavity within a wall, down to a floor at a share of the height."""
+    heights = height * _LEVELS
     wall = min(max(WALL_SHARE * float(radii.max()), WALL_RANGE_M[0]), WALL_RANGE_M[1])
-    height = float(heights[-1])
     inner = radii - wall * np.hypot(1.0, _GRADIENT @ radii / height)
     floor = max(min(max(floor_share, 0.0), 1.0 - MIN_HOLLOW) * height, min(wall, 0.5 * height))
     above = heights > floor + 1e-6
