@@ -21,7 +21,13 @@ from tableverse_factory.stages.place.completion.ring_votes import (
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 WALL_RANGE_M = (0.001, 0.012)
-USUAL_WALL_M = 0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls
+USUAL_WALL_M = (
+    0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls, if its rim shows nothing
+)
+RIM_HEIGHT_M, RIM_TOP_M = 0.004, 0.003  # below the rim, in which the cavity's mouth and the points of the rim lie
+RIM_INSIDE_M, RIM_OUTSIDE_M = 0.002, 0.012  # beside the mouth, within which they do: handles reach further
+RIM_SHARE = 0.9  # of them, within the rim's width: the rest is noise
+MOST_RIM_WALL_M = 0.006  # of a wall as thick as its rim: a wider rim is one that is rolled
 WALL_POINTS, LEAST_POINTS = 300, 30
 LIP_HEIGHT_M = 0.008  # next to the rim, over which a lip may turn outward and down: a rolled edge is lower
 LIP_M = 0.004  # height next to rim and floor over which a wall is not measured: both are rounded
@@ -102,7 +108,7 @@ def _find_cavity_cells(votes: RingVotes, least: float) -> Cells | None:
 
 
 def _measure_wall_across(hole: CrossSection, outer: Profile, low: float, high: float) -> float:
-    """Measure a wall between its cavity and the points seen outside [m]; a usual one where too few lie beside it.
+    """Measure a wall between its cavity and the points seen outside [m]; NaN where too few lie beside it.
 
     Those whose nearest point of the cavity is not between the heights `low` and `high` belong to the lip or the foot.
     """
@@ -117,8 +123,22 @@ def _measure_wall_across(hole: CrossSection, outer: Profile, low: float, high: f
     height = nearest[np.arange(len(best)), best, 1]
     beside = (height > low) & (height < high)
     if beside.sum() * step < LEAST_POINTS:
-        return USUAL_WALL_M
+        return np.nan
     return float(np.clip(np.median(distance.min(axis=1)[beside]), *WALL_RANGE_M))
+
+
+def _measure_rim(hole: CrossSection, profile: Profile, rim: float) -> float:
+    """Measure a wall by the width of its rim, at the height `rim` [m]; a usual one where too few points lie there."""
+    corners = np.concatenate([np.asarray(loop) for loop in hole.to_polygons()])
+    radii = corners[(corners[:, 1] > rim - RIM_HEIGHT_M) & (corners[:, 1] < rim), 0]
+    if len(radii) == 0:
+        return USUAL_WALL_M
+    mouth = float(np.quantile(radii, RIM_SHARE))
+    beyond = profile[profile[:, 1] > rim - RIM_TOP_M, 0] - mouth
+    beyond = beyond[(beyond > -RIM_INSIDE_M) & (beyond < RIM_OUTSIDE_M)]
+    if len(beyond) < LEAST_POINTS:
+        return USUAL_WALL_M
+    return float(np.clip(np.quantile(beyond, RIM_SHARE), USUAL_WALL_M, MOST_RIM_WALL_M))
 
 
 def _measure_inside_height(votes: RingVotes, inside: Points, mouth: float) -> float:
@@ -159,6 +179,7 @@ def _build_thin_wall(
     completed, floor_z = _complete_cavity(votes, cavity, outer, USUAL_WALL_M, flat)
     seen = _build_cavity(votes, completed, swelling)
     wall = _measure_wall_across(seen, profile[outward > OUTWARD], floor_z + LIP_M, rim - LIP_M)
+    wall = _measure_rim(seen, profile, rim) if np.isnan(wall) else wall
     mouth = votes.cell * float(cavity.sum(axis=0).max())
     lowest = np.inf if inside is None else _measure_inside_height(votes, inside, mouth)
     wall = max(min(wall, lowest), WALL_RANGE_M[0])

@@ -82,3 +82,11 @@ def test_what_is_round_is_no_box(name):
     best = try_kinds(SOLID_KINDS, view, sample_rays(view, estimated=True), 0.0).best
     assert best is not None
     assert best[1] == "carved/turned"
+
+
+@pytest.mark.parametrize("name", ["bowl", SLOW("plate")])
+def test_a_wall_whose_outside_is_hidden_is_as_thick_as_its_rim(name):
+    scene, view = see(SOLIDS[name], elevation=1.05)
+    found = complete_by_carving(scene, view)
+    assert found.method == "carved/revolution"
+    assert score_completion(name, 0, found.method, SOLIDS[name], place_mesh(found.mesh, found.pose)).iou > 0.65
