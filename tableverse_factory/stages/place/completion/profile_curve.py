@@ -133,8 +133,7 @@ def _measure_rim(hole: CrossSection, profile: Profile, rim: float) -> float:
     radii = corners[(corners[:, 1] > rim - RIM_HEIGHT_M) & (corners[:, 1] < rim), 0]
     if len(radii) == 0:
         return USUAL_WALL_M
-    mouth = float(np.quantile(radii, RIM_SHARE))
-    beyond = profile[profile[:, 1] > rim - RIM_TOP_M, 0] - mouth
+    beyond = profile[profile[:, 1] > rim - RIM_TOP_M, 0] - float(radii.max())
     beyond = beyond[(beyond > -RIM_INSIDE_M) & (beyond < RIM_OUTSIDE_M)]
     if len(beyond) < LEAST_POINTS:
         return USUAL_WALL_M
