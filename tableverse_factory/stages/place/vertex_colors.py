@@ -47,11 +47,11 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView, *, projecte
     vertices = mesh.vertices @ rotation.T
     own = TriangleMesh(vertices, mesh.faces)
     scene, outward = make_raycasting_scene(own), _compute_vertex_normals(own)
-    inside = _measure_inside(scene, points, normals)
+    inside, within = _measure_inside(scene, points, normals), _measure_inside_of_vertices(scene, own, outward)
     sources = np.concatenate(
         [_stack_features(points * t, normals * t, inside, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
     )
-    targets = _stack_features(vertices, outward, _measure_inside(scene, vertices, outward), 0.0)
+    targets = _stack_features(vertices, outward, within, 0.0)
     colors = _mix_colors(sources, np.tile(shown[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
@@ -97,6 +97,17 @@ def _measure_inside(scene: RaycastingScene, points: Points, normals: Points) -> 
     inside = _find_surrounded(scene, before)
     rim = ~inside & _find_surrounded(scene, before - 2 * OFFSET_M * _UP)
     return INSIDE_M * inside + INSIDE_M / 2 * rim
+
+
+def _measure_inside_of_vertices(scene: RaycastingScene, mesh: TriangleMesh, normals: Points) -> Distances:
+    """Measure the same of vertices, by most of the area beside each: the normal at a corner may end in a wall."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    weighted = np.cross(b - a, c - a)
+    area = np.maximum(np.linalg.norm(weighted, axis=1), 1e-18)
+    surrounded = _find_surrounded(scene, (a + b + c) / 3 + OFFSET_M * weighted / area[:, None])
+    at, count = mesh.faces.ravel(), len(mesh.vertices)
+    total, within = (np.bincount(at, np.repeat(weight, 3), count) for weight in (area, area * surrounded))
+    return np.where(within > 0.5 * total, INSIDE_M, _measure_inside(scene, mesh.vertices, normals))
 
 
 def _find_surrounded(scene: RaycastingScene, points: Points) -> Bool[np.ndarray, " n"]:
