@@ -30,7 +30,7 @@ WALL_SHARE, WALL_RANGE_M = 0.06, (0.0025, 0.006)  # thickness of a wall, as a sh
 MIN_HOLLOW = 0.25  # least depth of a cavity, as a share of the height
 BEND_M = 3e-4  # cost of bends of the profile by its widest radius [m]: it decides what was not seen
 CARRY_WEIGHT = 0.1  # weight of how far outside of the body stands what it carries
-CALLS, REFINING_CALLS = 70, 220  # of the search for the size of a template, and for all radii
+CALLS, REFINING_CALLS = 70, 320  # of the search for the size of a template, and for all radii
 HOPELESS_M = 1e-3  # cost over the best template's from which a template is not refined [m]
 MOST_REFINED_M = 1.5e-3  # gain to expect by all radii [m]: of 112 selected shapes under 1.3 mm of 95 %, at most 2.6
 # Radii at the knots as shares of the widest, of which one is the start: a can, a ball, a cone; a beaker, a cup, a bowl
