@@ -25,7 +25,7 @@ MIN_SIDE_M, MAX_SIDE_M = 0.003, 2.0
 CARRY_WEIGHT = 0.02
 EDGES_ON_LONGEST_SIDE = 20
 STEPS = np.array([0.006, 0.006, 0.06, 0.06, 0.04, 0.06])  # of the search: middle [m], logarithms of sides, yaw [rad]
-CALLS, ROUND_CALLS = 160, 130  # of each search for a box, and for its rounded edges
+CALLS, ROUND_CALLS = 240, 130  # of each search for a box, and for its rounded edges
 # Radius of rounded edges, as a share of half the shorter side: at the start and of a step of the search, at least, and
 # at most, as what is rounder is turned
 ROUND_START, ROUND_STEP, LEAST_ROUND, MOST_ROUND = 0.7, -0.4, 0.3, 0.8
