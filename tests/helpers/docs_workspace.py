@@ -56,16 +56,18 @@ class Room:
         """Lays out a fresh `folder` for a page with these commands."""
         if folder.exists():
             shutil.rmtree(folder)
+        plain = folder / "out"
         if only_installs(page):
             folder.mkdir(parents=True)
-            write_learnable_dataset(folder / "out", scenes=1, moved=0)
+            write_learnable_dataset(plain, scenes=1, moved=0)
         else:
             lay_out(page, prepared, folder)
+            plain = prepared / "plain"
         (folder / "deploy").symlink_to(ROOT / "deploy")
         self.folder = folder
         self._state = folder.parent / "shell-state"
         self._state.write_text(f"cd {folder}\n")
-        self.scene_id = first_scene(folder / "out" if only_installs(page) else prepared / "plain")
+        self.scene_id = first_scene(plain)
 
     def type(self, command: Command) -> Answer:
         """Runs what a page says, in bash."""

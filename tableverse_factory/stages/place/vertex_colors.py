@@ -46,12 +46,12 @@ def paint_vertices(mesh: TriangleMesh, pose: Pose, view: ObjectView, *, projecte
     rotation = turn @ rotation_matrix(pose.quaternion_wxyz)
     vertices = mesh.vertices @ rotation.T
     own = TriangleMesh(vertices, mesh.faces)
-    scene, outward = make_raycasting_scene(own), _compute_vertex_normals(own)
-    inside, within = _measure_inside(scene, points, normals), _measure_inside_of_vertices(scene, own, outward)
+    scene, faced = make_raycasting_scene(own), _compute_area_vectors(own)
+    inside, outward = _measure_inside(scene, points, normals), _compute_vertex_normals(own, faced)
     sources = np.concatenate(
         [_stack_features(points * t, normals * t, inside, 0.0 if k == 0 else COPY_M) for k, t in enumerate(_TURNS)]
     )
-    targets = _stack_features(vertices, outward, within, 0.0)
+    targets = _stack_features(vertices, outward, _measure_inside_of_vertices(scene, own, faced, outward), 0.0)
     colors = _mix_colors(sources, np.tile(shown[::step], (len(_TURNS), 1)), targets)
     return TriangleMesh(mesh.vertices, mesh.faces, colors)
 
@@ -74,13 +74,17 @@ def _project_sources(mesh: TriangleMesh, pose: Pose, view: ObjectView) -> tuple[
     return view.eye + rays[kept] * share[kept, None], normals[kept], view.colors[kept]
 
 
-def _compute_vertex_normals(mesh: TriangleMesh) -> Points:
-    """Compute the area-weighted mean normals of adjacent faces, unit length; zero where a vertex has none."""
+def _compute_area_vectors(mesh: TriangleMesh) -> Points:
+    """Compute the normals of the faces, as long as twice their areas [m^2]."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    weighted = np.cross(b - a, c - a)
+    return np.cross(b - a, c - a)
+
+
+def _compute_vertex_normals(mesh: TriangleMesh, faced: Points) -> Points:
+    """Compute the mean normals of adjacent faces by area, unit length; zero where a vertex has none."""
     normals = np.zeros_like(mesh.vertices)
     for k in range(3):
-        np.add.at(normals, mesh.faces[:, k], weighted)
+        np.add.at(normals, mesh.faces[:, k], faced)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / np.where(length > 0.0, length, 1.0)
 
@@ -99,12 +103,12 @@ def _measure_inside(scene: RaycastingScene, points: Points, normals: Points) -> 
     return INSIDE_M * inside + INSIDE_M / 2 * rim
 
 
-def _measure_inside_of_vertices(scene: RaycastingScene, mesh: TriangleMesh, normals: Points) -> Distances:
+def _measure_inside_of_vertices(
+    scene: RaycastingScene, mesh: TriangleMesh, faced: Points, normals: Points
+) -> Distances:
     """Measure the same of vertices, by most of the area beside each: the normal at a corner may end in a wall."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    weighted = np.cross(b - a, c - a)
-    area = np.maximum(np.linalg.norm(weighted, axis=1), 1e-18)
-    surrounded = _find_surrounded(scene, (a + b + c) / 3 + OFFSET_M * weighted / area[:, None])
+    area = np.maximum(np.linalg.norm(faced, axis=1), 1e-18)
+    surrounded = _find_surrounded(scene, mesh.vertices[mesh.faces].mean(axis=1) + OFFSET_M * faced / area[:, None])
     at, count = mesh.faces.ravel(), len(mesh.vertices)
     total, within = (np.bincount(at, np.repeat(weight, 3), count) for weight in (area, area * surrounded))
     return np.where(within > 0.5 * total, INSIDE_M, _measure_inside(scene, mesh.vertices, normals))

@@ -11,6 +11,7 @@ from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold, to_manifold
 from tableverse_factory.stages.place.vertex_colors import (
     INSIDE_M,
+    _compute_area_vectors,
     _compute_vertex_normals,
     _measure_inside,
     _measure_inside_of_vertices,
@@ -54,7 +55,8 @@ def test_inside_is_what_walls_surround_and_nothing_covers(
 def test_the_edge_of_a_floor_is_inside_though_the_wall_leans_over_it() -> None:
     hollow = Manifold.cylinder(0.1, 0.036, 0.034, 40).translate((0.0, 0.0, 0.004))
     cup = from_manifold(Manifold.cylinder(0.1, 0.04, circular_segments=40) - hollow)
-    inside = _measure_inside_of_vertices(make_raycasting_scene(cup), cup, _compute_vertex_normals(cup))
+    faced = _compute_area_vectors(cup)
+    inside = _measure_inside_of_vertices(make_raycasting_scene(cup), cup, faced, _compute_vertex_normals(cup, faced))
     away, height = np.linalg.norm(cup.vertices[:, :2], axis=1), cup.vertices[:, 2]
     floor = (np.abs(height - 0.004) < 1e-6) & (away < 0.0365)
     assert floor.sum() == 40

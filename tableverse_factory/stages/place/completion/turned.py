@@ -54,7 +54,7 @@ FLOORS = (0.15, 0.5)  # of a cavity at the start, as shares of the height
 
 # Heights of the knots as shares of the whole: denser at the ends, where a ball closes.
 _LEVELS = (1.0 - np.cos(np.linspace(0.0, np.pi, KNOTS))) / 2.0
-# What gives the gradient of values at the knots, over the height: `np.gradient` costs more than all rays
+# Matrix (knots, knots) of the gradient of values at the knots, over the height: `np.gradient` costs more than all rays
 _GRADIENT = np.gradient(np.eye(KNOTS), _LEVELS, axis=0)
 
 Kind = Literal["solid", "hollow", "lying"]
