@@ -21,9 +21,7 @@ from tableverse_factory.stages.place.completion.ring_votes import (
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 WALL_RANGE_M = (0.001, 0.012)
-USUAL_WALL_M = (
-    0.002  # of a wall whose outside was not seen, as that of plates and shallow bowls, if its rim shows nothing
-)
+USUAL_WALL_M = 0.002  # of a wall of which neither the outside nor the rim was seen
 RIM_HEIGHT_M, RIM_TOP_M = 0.004, 0.003  # below the rim, in which the cavity's mouth and the points of the rim lie
 RIM_INSIDE_M, RIM_OUTSIDE_M = 0.002, 0.012  # beside the mouth, within which they do: handles reach further
 RIM_SHARE = 0.9  # of them, within the rim's width: the rest is noise
