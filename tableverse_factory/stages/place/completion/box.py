@@ -66,7 +66,7 @@ def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | 
         return misfit + _penalize_uncarried(view, position, rotation, half)
 
     steps = np.array([*2.0 * STEPS, ROUND_STEP])  # with shorter ones, twice as many calls end 0.1 mm above, in the mean
-    found = minimize_cost(cost, start, (steps, -steps), ROUND_CALLS)
+    found = minimize_cost(cost, start, ((steps, ROUND_CALLS), (-steps, ROUND_CALLS)))
     position, rotation, half, radius = decode(found)
     if radius < LEAST_ROUND * half[:2].min():
         return None
@@ -88,15 +88,14 @@ def build_box_mesh(box: SolidBox) -> TriangleMesh:
 def minimize_cost(
     cost: Callable[[Float64[np.ndarray, " n"]], float],
     start: Float64[np.ndarray, " n"],
-    searches: tuple[Float64[np.ndarray, " n"], ...],
-    calls: int,
+    searches: tuple[tuple[Float64[np.ndarray, " n"], int], ...],
 ) -> Float64[np.ndarray, " n"]:
     """Minimise the cost of a box [m] by Nelder and Mead, from a simplex of one step along each number.
 
-    Each of the searches has its own steps and `calls` calls, and begins where the one before it ended: other steps
-    leave minima in which it stuck.
+    Each of the searches, steps and most calls, begins where the one before it ended: other steps leave minima in which
+    it stuck.
     """
-    for steps in searches:
+    for steps, calls in searches:
         options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": calls}
         options |= {"xatol": 2e-4, "fatol": 1e-6}
         start = np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
@@ -127,7 +126,7 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
         misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
         return misfit + prior + _penalize_uncarried(view, position, rotation, half)
 
-    found = minimize_cost(cost, start, (STEPS,), CALLS)
+    found = minimize_cost(cost, start, ((STEPS, CALLS),))
     position, rotation, half = _decode_box(found, view.support_z)
     misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
     return SolidBox(Pose(position, quaternion_about_z(float(found[5]))), half, misfit)

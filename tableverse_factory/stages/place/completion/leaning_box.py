@@ -22,10 +22,8 @@ THICKNESS_M = 0.008  # initial length of a hidden side [m]
 SINK_WEIGHT = 0.2  # weight of corners below the support, against the misfit of rays
 MAX_SINK_M = 0.05  # from which a corner counts no more [m]
 FLOAT_WEIGHT = 0.05  # weight of the height of the lowest corner above the support, which has to be touched
-# Of the first search: middle [m], logarithms of sides, turn [rad]; the second looks nearer
-STEPS = np.array([0.005] * 3 + [0.08] * 3 + [0.05] * 3)
-NEARER = 0.4
-CALLS = 200  # of each search
+STEPS = np.array([0.005] * 3 + [0.08] * 3 + [0.05] * 3)  # of the search: middle [m], logarithms of sides, turn [rad]
+SEARCHES = ((STEPS, 300), (0.4 * STEPS, 200))  # with their calls; the second looks nearer
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
@@ -53,7 +51,7 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
             + FLOAT_WEIGHT * max(float(heights.min()) - view.support_z, 0.0)
         )
 
-    found = minimize_cost(cost, start, (STEPS, NEARER * STEPS), CALLS)
+    found = minimize_cost(cost, start, SEARCHES)
     turned = normalize_quaternion(multiply_quaternions(base, _decode_turn(found)))
     return SolidBox(Pose(found[:3], turned), _decode_half_size(found), cost(found))
 
