@@ -19,10 +19,7 @@ from tableverse_factory.models.picture.predict import (
 )
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
-from tableverse_factory.stages.perceive.base.object_filter import (
-    keep_objects,
-    renumber_regions,
-)
+from tableverse_factory.stages.perceive.base.object_filter import drop_shadows, keep_objects, renumber_regions
 from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
 from tableverse_factory.stages.perceive.depth_segmenter.segment import (
@@ -44,11 +41,13 @@ def detect_in_picture(view: TableView, config: Config, _services: Services) -> D
 
 def detect_predicted(view: TableView, found: PicturePrediction) -> DetectionResult:
     """Detect the objects that the net has `found`, as `detect_in_picture`."""
-    regions = keep_objects(segment_prediction(found, view.valid.shape), view, by_depth=False)
+    seen = segment_prediction(found, view.valid.shape)
+    lit = drop_shadows(seen, view) if view.observation.bend else seen
+    regions = keep_objects(lit, view, by_depth=False)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
     detections = to_detections(regions, find_containers(regions, find_rims(regions, view), view))
-    return replace(detections, shown=find_standing(view, found))
+    return replace(detections, shown=find_standing(view, found) & ((seen == 0) | (lit > 0)))
 
 
 def find_standing(view: TableView, found: PicturePrediction) -> Mask:
