@@ -43,6 +43,7 @@ def bench_perception(
 
     Example: `tableverse bench perception captures --detector geometric`
     """
+    from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.errors import InputError
     from tableverse_factory.evaluation.bench.captures import list_captures, list_captures_lacking
@@ -53,7 +54,7 @@ def bench_perception(
     if weights and detector in ("geometric", "replay"):
         raise typer.BadParameter(f"--weights is for ensemble and picture: {detector} asks no net")
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
-    scores = list(bench_masks(folder, load_config(config, chosen)))
+    scores = list(track_progress("captures", bench_masks(folder, load_config(config, chosen))))
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     rows = [*scores, merge_scores(scores)]
@@ -122,10 +123,12 @@ def bench_completion(
 
     Example: `tableverse bench completion --error-mm 5` or `tableverse bench completion meshes --view 200,25`
     """
+    from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion
 
-    views = [_parse_view(text) for text in view] if view else VIEWS
-    scores = bench_completion(folder, seed, views, error_mm / 1e3)
+    views = list(dict.fromkeys(_parse_view(text) for text in view)) if view else VIEWS
+    of_meshes = bench_completion(folder, seed, views, error_mm / 1e3)
+    scores = [score for of_mesh in track_progress("meshes", of_meshes) for score in of_mesh]
     if as_json:
         print_json({"seed": seed, "error_mm": error_mm, "views": views, "scores": scores})
     else:
@@ -180,11 +183,12 @@ def _select_known(name: str, known: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _show_placements(folder: Path, ways: tuple[tuple[str, str], ...], config: Path | None, as_json: bool) -> None:
+    from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.bench.placement import bench_placement
 
     found: dict[tuple[str, str], list[PlacementError]] = {way: [] for way in ways}
-    for of_capture in bench_placement(folder, load_config(config), ways):
+    for of_capture in track_progress("captures", bench_placement(folder, load_config(config), ways)):
         for way, entries in of_capture.items():
             found[way] += entries
     if as_json:

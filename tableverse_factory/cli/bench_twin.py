@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tableverse_factory.cli.options import AsJson, ConfigFile, Jobs
+from tableverse_factory.cli.options import AsJson, ConfigFile, Jobs, Overrides
 from tableverse_factory.cli.tables import print_figures, print_json
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def bench_twin(
     ] = None,
     jobs: Jobs = None,
     config: ConfigFile = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare the scene of each capture with its photograph, drawn from the same camera.
@@ -39,7 +40,7 @@ def bench_twin(
     from tableverse_factory.core.process_pool import count_available_cpus, parallel_map
     from tableverse_factory.evaluation.bench.twin import find_captures, measure_twin, summarize_twins
 
-    settings = load_config(config)
+    settings = load_config(config, overrides or ())
     rows = find_captures(captures, settings, dataset)
     measure = partial(measure_twin, config=settings, dataset=dataset, pictures=pictures)
     scores = []

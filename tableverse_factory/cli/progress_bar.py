@@ -2,14 +2,16 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from workers.progress.console import choose_log_interval_s
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+T = TypeVar("T")
 
 
 class ProgressCounter:
@@ -50,3 +52,11 @@ def count_progress(what: str, total: int | None = None) -> Iterator[ProgressCoun
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         yield ProgressCounter(what, total, progress)
+
+
+def track_progress(what: str, items: Iterable[T]) -> Iterator[T]:
+    """Yield the items and show how many, named in the plural, were computed."""
+    with count_progress(what) as done:
+        for item in items:
+            yield item
+            done()

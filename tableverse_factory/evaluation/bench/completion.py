@@ -61,15 +61,15 @@ class CompletionScore:
 
 def bench_completion(
     folder: Path | None, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS, error_m: float = 0.0
-) -> list[CompletionScore]:
-    """Complete every mesh in `folder` from each view by convex hull, height field and the place stage.
+) -> Iterator[list[CompletionScore]]:
+    """Complete each mesh in `folder` from each view by convex hull, height field and the place stage.
 
     Without a folder, complete the solids of `make_solids`. A view is the azimuth and elevation of a camera
     [degrees]; `error_m` is that of `render_noisy_view`.
     """
-    scores: list[CompletionScore] = []
     meshes = make_solids() if folder is None else read_meshes(folder, check=_check_size)
     for index, (name, scan) in enumerate(meshes):
+        scores: list[CompletionScore] = []
         truth = stand_on_table(scan)
         share, cavity = measure_cavity(truth)
         hollow = share >= HOLLOW_SHARE
@@ -80,7 +80,7 @@ def bench_completion(
                 plain = score_completion(name, view, method, truth, mesh)
                 kept = 1.0 - float(contains_points(mesh, cavity).mean()) if hollow else float("nan")
                 scores.append(replace(plain, hollow=hollow, cavity_kept=kept, cpu_s=cpu_s))
-    return scores
+        yield scores
 
 
 def _check_size(name: str, mesh: TriangleMesh) -> None:

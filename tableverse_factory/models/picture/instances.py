@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.models.picture.net import REACHES
-from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction
+from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction
 
 SPREAD_PX = 3.5  # standard deviation of the votes of one object about its middle
 MIN_VOTES = 10  # at a peak of votes
@@ -24,6 +24,7 @@ AGREED, LIKELY, SAME = 0.3, 0.6, 0.9  # votes between two middles, as a share of
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
 PROBABLE = -0.8  # the same on a smooth surface; odds are even at -1.1: training weighs pairs of two objects threefold
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
+ISLAND_PX, ISLAND_M = 100, 0.025  # of what is neither object nor table, between both: size and height of an object
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
 SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
@@ -54,7 +55,7 @@ def segment_prediction(found: PicturePrediction, shape: tuple[int, int]) -> IdIm
 
 
 def _find_objects(found: PicturePrediction) -> IdImage:
-    is_object = found.label.argmax(axis=0) == OBJECT
+    is_object, probability = _find_object_pixels(found)
     density, middles, nearest = _group_votes(found, is_object)
     pieces, middle_of = _cut_pieces(nearest, found.boundary < EDGE)
     pieces = np.where(is_object, _spread(pieces), 0)
@@ -75,8 +76,23 @@ def _find_objects(found: PicturePrediction) -> IdImage:
     touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}
     ids = _join_fragments(found, group[pieces], touching)
     count = np.bincount(ids.ravel())
-    sure = np.bincount(ids.ravel(), found.label[OBJECT].ravel()) >= MIN_PROBABILITY * count
+    sure = np.bincount(ids.ravel(), probability.ravel()) >= MIN_PROBABILITY * count
     return _renumber(np.where(sure[ids], ids, 0))
+
+
+def _find_object_pixels(found: PicturePrediction) -> tuple[Mask, Float64[np.ndarray, "h w"]]:
+    """Find the pixels of objects, and the probability that each is one.
+
+    What is neither object nor table but rises over the table, with nothing but both around it, is an object as well.
+    """
+    label = found.label.argmax(axis=0)
+    islands, count = ndimage.label(label == OTHER)
+    border = np.concatenate([islands[[0, -1]].ravel(), islands[:, [0, -1]].ravel()])
+    height = backproject(found.depth, found.camera) @ found.normal + found.distance_m
+    sizes = np.bincount(islands.ravel(), minlength=count + 1)
+    inner = np.setdiff1d(np.flatnonzero(sizes >= ISLAND_PX), [0, *border])
+    island = np.isin(islands, [k for k in inner if np.median(height[islands == k]) > ISLAND_M])
+    return (label == OBJECT) | island, np.where(island, 1.0 - found.label[TABLE], found.label[OBJECT])
 
 
 def _merge_pieces(wanted: Sequence[tuple[_Border, float]], borders: Sequence[_Border], count: int) -> IdImage:

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.geometry import Camera
 from tableverse_factory.models.picture.instances import MIN_OBJECT_PX, segment_prediction, upsample_ids
-from tableverse_factory.models.picture.predict import OBJECT, TABLE, PicturePrediction
+from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction
 
 ROWS, COLUMNS = 96, 128
 LEFT, RIGHT = (slice(30, 60), slice(30, 60)), (slice(30, 60), slice(60, 90))  # they touch
@@ -195,3 +195,22 @@ def test_what_is_unlikely_to_be_an_object_is_none() -> None:
     label = found.label.copy()
     label[:, *LARGE] = np.array([0.3, 0.25, 0.45], np.float32)[:, None, None]
     assert segment(replace(found, label=label)).max() == 0
+
+
+@pytest.mark.parametrize(
+    ("thing", "distance_m", "count"),
+    [
+        pytest.param(LEFT, 0.95, 1, id="raised, on the table"),
+        pytest.param(LEFT, 0.99, 0, id="flat: a hole in what is called table"),
+        pytest.param((slice(30, 60), slice(0, 30)), 0.95, 0, id="at the border of the picture, as an arm"),
+        pytest.param((slice(30, 38), slice(30, 38)), 0.95, 0, id="a speck"),
+    ],
+)
+def test_an_island_of_the_room_that_rises_over_the_table_is_an_object(thing, distance_m, count) -> None:
+    found = make_prediction(thing)
+    label, depth = found.label.copy(), found.depth.copy()
+    label[:, *thing] = np.eye(3, dtype=np.float32)[OTHER][:, None, None]
+    depth[thing] = distance_m
+    ids = segment(replace(found, label=label, depth=depth))
+    assert ids.max() == count
+    assert (ids[thing] == count).all()
