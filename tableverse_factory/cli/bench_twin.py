@@ -40,7 +40,7 @@ def bench_twin(
     from tableverse_factory.core.process_pool import count_available_cpus, parallel_map
     from tableverse_factory.evaluation.bench.twin import find_captures, measure_twin, summarize_twins
 
-    settings = load_config(config, overrides or ())
+    settings = load_config(config, overrides or [])
     rows = find_captures(captures, settings, dataset)
     measure = partial(measure_twin, config=settings, dataset=dataset, pictures=pictures)
     scores = []

@@ -1,7 +1,7 @@
 """Objects of a prediction: pixels grouped by their votes, cut at boundaries, and merged where surfaces continue."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from schemas.geometry import IdImage, Mask
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.models.picture.net import REACHES
-from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction
+from tableverse_factory.models.picture.predict import OBJECT, OTHER, PicturePrediction
 
 SPREAD_PX = 3.5  # standard deviation of the votes of one object about its middle
 MIN_VOTES = 10  # at a peak of votes
@@ -24,7 +24,9 @@ AGREED, LIKELY, SAME = 0.3, 0.6, 0.9  # votes between two middles, as a share of
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
 PROBABLE = -0.8  # the same on a smooth surface; odds are even at -1.1: training weighs pairs of two objects threefold
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
-ISLAND_PX, ISLAND_M = 100, 0.025  # of what is neither object nor table, between both: size and height of an object
+# Of what is neither object nor table but stands on it: least size, median height, and height of a pixel [m]; ratio of
+# the depths at a step; share of what surrounds it that is table or object, and share that is more of the same
+STANDING_PX, STANDING_M, LOW_M, STEP, MIN_ENDED, MAX_GOING_ON = 100, 0.025, 0.005, 1.06, 0.6, 0.1
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
 SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
@@ -55,7 +57,8 @@ def segment_prediction(found: PicturePrediction, shape: tuple[int, int]) -> IdIm
 
 
 def _find_objects(found: PicturePrediction) -> IdImage:
-    is_object, probability = _find_object_pixels(found)
+    found = _add_standing(found)
+    is_object = found.label.argmax(axis=0) == OBJECT
     density, middles, nearest = _group_votes(found, is_object)
     pieces, middle_of = _cut_pieces(nearest, found.boundary < EDGE)
     pieces = np.where(is_object, _spread(pieces), 0)
@@ -76,23 +79,36 @@ def _find_objects(found: PicturePrediction) -> IdImage:
     touching = {tuple(sorted(group[list(border.pieces)].tolist())) for border in borders}
     ids = _join_fragments(found, group[pieces], touching)
     count = np.bincount(ids.ravel())
-    sure = np.bincount(ids.ravel(), probability.ravel()) >= MIN_PROBABILITY * count
+    sure = np.bincount(ids.ravel(), found.label[OBJECT].ravel()) >= MIN_PROBABILITY * count
     return _renumber(np.where(sure[ids], ids, 0))
 
 
-def _find_object_pixels(found: PicturePrediction) -> tuple[Mask, Float64[np.ndarray, "h w"]]:
-    """Find the pixels of objects, and the probability that each is one.
+def _add_standing(found: PicturePrediction) -> PicturePrediction:
+    """Add to the objects what stands on the table and is, says the net, neither object nor table.
 
-    What is neither object nor table but rises over the table, with nothing but both around it, is an object as well.
+    It rises over the table and ends at table and objects, or before what lies farther away, all around it: a wall, a
+    chair and an arm go on. It votes for its own middle.
     """
-    label = found.label.argmax(axis=0)
-    islands, count = ndimage.label(label == OTHER)
-    border = np.concatenate([islands[[0, -1]].ravel(), islands[:, [0, -1]].ravel()])
+    label, votes = found.label.copy(), found.votes.copy()
+    kind = label.argmax(axis=0)
     height = backproject(found.depth, found.camera) @ found.normal + found.distance_m
-    sizes = np.bincount(islands.ravel(), minlength=count + 1)
-    inner = np.setdiff1d(np.flatnonzero(sizes >= ISLAND_PX), [0, *border])
-    island = np.isin(islands, [k for k in inner if np.median(height[islands == k]) > ISLAND_M])
-    return (label == OBJECT) | island, np.where(island, 1.0 - found.label[TABLE], found.label[OBJECT])
+    rises = (kind == OTHER) & (height > LOW_M)
+    parts, _ = ndimage.label(rises & (found.depth < STEP * ndimage.minimum_filter(found.depth, 3)))
+    sizes = np.bincount(parts.ravel())
+    for part in np.flatnonzero(sizes[1:] >= STANDING_PX) + 1:
+        mask = parts == part
+        around = ndimage.binary_dilation(mask, iterations=ACROSS_PX) & ~mask
+        nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+        goes_on = around & rises & (found.depth <= STEP * found.depth[tuple(nearest)])
+        at_border = mask[[0, -1]].any() or mask[:, [0, -1]].any()
+        ended = (kind != OTHER)[around].mean() >= MIN_ENDED and goes_on[around].mean() <= MAX_GOING_ON
+        if at_border or not ended or np.median(height[mask]) <= STANDING_M:
+            continue
+        label[OBJECT][mask] += label[OTHER][mask]
+        label[OTHER][mask] = 0.0
+        at = np.argwhere(mask)
+        votes[::-1, mask] = (at.mean(axis=0) - at).T
+    return replace(found, label=label, votes=votes)
 
 
 def _merge_pieces(wanted: Sequence[tuple[_Border, float]], borders: Sequence[_Border], count: int) -> IdImage:

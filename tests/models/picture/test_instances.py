@@ -197,20 +197,33 @@ def test_what_is_unlikely_to_be_an_object_is_none() -> None:
     assert segment(replace(found, label=label)).max() == 0
 
 
+ROOM = (slice(0, 36), slice(0, COLUMNS))  # behind the table's far end
+
+
 @pytest.mark.parametrize(
-    ("thing", "distance_m", "count"),
+    ("thing", "distance_m", "room_m", "count"),
     [
-        pytest.param(LEFT, 0.95, 1, id="raised, on the table"),
-        pytest.param(LEFT, 0.99, 0, id="flat: a hole in what is called table"),
-        pytest.param((slice(30, 60), slice(0, 30)), 0.95, 0, id="at the border of the picture, as an arm"),
-        pytest.param((slice(30, 38), slice(30, 38)), 0.95, 0, id="a speck"),
+        pytest.param(LEFT, 0.95, None, 1, id="on the table"),
+        pytest.param(LEFT, 0.95, 1.5, 1, id="before the room, which is farther away"),
+        pytest.param(LEFT, 0.95, 0.95, 0, id="before what rises as far away and goes on, as a wall does"),
+        pytest.param(LEFT, 0.99, None, 0, id="flat: a hole in what is called table"),
+        pytest.param((slice(30, 60), slice(0, 30)), 0.95, None, 0, id="at the border of the picture, as an arm"),
+        pytest.param((slice(30, 38), slice(30, 38)), 0.95, None, 0, id="a speck"),
     ],
 )
-def test_an_island_of_the_room_that_rises_over_the_table_is_an_object(thing, distance_m, count) -> None:
+def test_what_the_net_calls_neither_object_nor_table_is_an_object_where_it_stands_on_the_table(
+    thing, distance_m, room_m, count
+) -> None:
     found = make_prediction(thing)
     label, depth = found.label.copy(), found.depth.copy()
-    label[:, *thing] = np.eye(3, dtype=np.float32)[OTHER][:, None, None]
-    depth[thing] = distance_m
+    for part, there in ((ROOM, room_m), (thing, distance_m)):
+        if there is not None:
+            label[:, *part] = np.eye(3, dtype=np.float32)[OTHER][:, None, None]
+            depth[part] = there
     ids = segment(replace(found, label=label, depth=depth))
     assert ids.max() == count
-    assert (ids[thing] == count).all()
+    if count:
+        shown = np.zeros(ids.shape, dtype=bool)
+        shown[thing] = True
+        assert (ids == 1)[thing].mean() > 0.9
+        assert not (ids == 1)[~shown].any()
