@@ -54,7 +54,8 @@ def bench_perception(
     if weights and detector in ("geometric", "replay"):
         raise typer.BadParameter(f"--weights is for ensemble and picture: {detector} asks no net")
     chosen = [f"perceive.detector={detector}", *([f"perceive.detector_weights={weights}"] if weights else [])]
-    scores = list(track_progress("captures", bench_masks(folder, load_config(config, chosen))))
+    total = len(list_captures(folder, TRUTH_NAMES, COLOR_NAMES))
+    scores = list(track_progress("captures", bench_masks(folder, load_config(config, chosen)), total))
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     rows = [*scores, merge_scores(scores)]
@@ -63,7 +64,8 @@ def bench_perception(
         more = f" and {len(untold) - MOST_NAMED} more" if len(untold) > MOST_NAMED else ""
         print(f"without {' or '.join(TRUTH_NAMES)}: {', '.join(names)}{more}", file=sys.stderr)
     if as_json:
-        print_json([asdict(row) | _derive_scores(row) for row in rows])
+        *of_each, together = [asdict(row) | _derive_scores(row) for row in rows]
+        print_json({"captures": of_each, "together": together})
     else:
         _show_masks(rows, detector)
         if list_captures(folder, [GROUND_TRUTH_NAME]):
@@ -104,13 +106,15 @@ def bench_completion(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder of scanned meshes; without it, twenty-four simple solids.", exists=True, file_okay=False
+            help="Folder of scanned meshes; without it, twenty simple bodies and four vessels, in about a minute.",
+            exists=True,
+            file_okay=False,
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the depth noise.")] = 0,
     view: Annotated[
         list[str] | None,
-        typer.Option(metavar="AZIMUTH,ELEVATION", help="A camera's direction [degrees]; repeat it for more."),
+        typer.Option(metavar="AZIMUTH,ELEVATION", help="A camera's direction [degrees]; repeat it for others."),
     ] = None,
     error_mm: Annotated[
         float, typer.Option(min=0.0, max=50.0, help="Errors on the objects that agree over a few pixels, as gloss has.")
@@ -121,14 +125,15 @@ def bench_completion(
 
     JSON holds `seed`, `error_mm`, `views` and `scores`, one of each mesh, view and method.
 
-    Example: `tableverse bench completion --error-mm 5` or `tableverse bench completion meshes --view 200,25`
+    Example: `tableverse bench completion --view 200,25 --error-mm 5` or `tableverse bench completion meshes`
     """
     from tableverse_factory.cli.progress_bar import track_progress
-    from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion
+    from tableverse_factory.evaluation.bench.completion import VIEWS, bench_completion, read_solids
 
-    views = list(dict.fromkeys(_parse_view(text) for text in view)) if view else VIEWS
-    of_meshes = bench_completion(folder, seed, views, error_mm / 1e3)
-    scores = [score for of_mesh in track_progress("meshes", of_meshes) for score in of_mesh]
+    views = [_parse_view(text) for text in view] if view else VIEWS
+    meshes = read_solids(folder)
+    of_meshes = bench_completion(meshes, seed, views, error_mm / 1e3)
+    scores = [score for of_mesh in track_progress("meshes", of_meshes, len(meshes)) for score in of_mesh]
     if as_json:
         print_json({"seed": seed, "error_mm": error_mm, "views": views, "scores": scores})
     else:
@@ -185,10 +190,13 @@ def _select_known(name: str, known: tuple[str, ...]) -> tuple[str, ...]:
 def _show_placements(folder: Path, ways: tuple[tuple[str, str], ...], config: Path | None, as_json: bool) -> None:
     from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.core.config import load_config
+    from tableverse_factory.evaluation.bench.captures import list_captures
     from tableverse_factory.evaluation.bench.placement import bench_placement
+    from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
 
     found: dict[tuple[str, str], list[PlacementError]] = {way: [] for way in ways}
-    for of_capture in track_progress("captures", bench_placement(folder, load_config(config), ways)):
+    total = len(list_captures(folder, [GROUND_TRUTH_NAME]))
+    for of_capture in track_progress("captures", bench_placement(folder, load_config(config), ways), total):
         for way, entries in of_capture.items():
             found[way] += entries
     if as_json:

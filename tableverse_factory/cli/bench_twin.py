@@ -20,7 +20,10 @@ def bench_twin(
         str, typer.Option(metavar="OUT", help="Dataset of these captures; by default their scenes are computed.")
     ] = "",
     pictures: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write photograph, twin and difference of each side by side.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", file_okay=False, help="Write photograph, twin and difference of each side by side."
+        ),
     ] = None,
     jobs: Jobs = None,
     config: ConfigFile = None,

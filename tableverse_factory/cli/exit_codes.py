@@ -115,6 +115,7 @@ def _describe_usage_error(error: Any) -> str:
         return f"{' / '.join(_list_names(parameter))} is missing{shown}"
     message = error.message.removeprefix("Value error, ").removeprefix("Input ").removesuffix(".")
     if parameter is None:
+        message = f"{hint}: {message}" if (hint := getattr(error, "param_hint", None)) else message
         return f"{message[:1].lower()}{message[1:]}{shown}"
     return f"{' / '.join(_list_names(parameter))}: {_format_refused_value(error)}{message}\nsee: {help_of_it}"
 

@@ -21,6 +21,7 @@ class ProgressCounter:
         self._what, self._total, self._bar, self._done = what, total, bar, 0
         self._task = None if bar is None else bar.add_task(what, total=total)
         self._started = self._shown = time.monotonic()
+        self._shown_done = 0
 
     def __call__(self) -> None:
         """Count one more item."""
@@ -35,7 +36,17 @@ class ProgressCounter:
         now = time.monotonic()
         if now - self._shown >= choose_log_interval_s(now - self._started):
             self._shown = now
-            print(f"{self._what}: {done}" + (f" of {total}" if total else ""), file=sys.stderr, flush=True)
+            self._print()
+
+    def close(self) -> None:
+        """Print the last number behind others in a log."""
+        if self._bar is None and 0 < self._shown_done < self._done:
+            self._print()
+
+    def _print(self) -> None:
+        self._shown_done = self._done
+        count = f"{self._done} of {self._total}" if self._total else f"{self._done}"
+        print(f"{self._what}: {count}", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -47,16 +58,18 @@ def count_progress(what: str, total: int | None = None) -> Iterator[ProgressCoun
     console = Console(stderr=True)
     # rich takes FORCE_COLOR for a terminal too, but a log must not fill with cursor movements
     if not (console.is_terminal and sys.stderr.isatty()) or console.is_dumb_terminal:
-        yield ProgressCounter(what, total, None)
+        counter = ProgressCounter(what, total, None)
+        yield counter
+        counter.close()
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         yield ProgressCounter(what, total, progress)
 
 
-def track_progress(what: str, items: Iterable[T]) -> Iterator[T]:
-    """Yield the items and show how many, named in the plural, were computed."""
-    with count_progress(what) as done:
+def track_progress(what: str, items: Iterable[T], total: int) -> Iterator[T]:
+    """Yield the items, `total` of them, and show how many there were; `what` names them in the plural."""
+    with count_progress(what, total) as done:
         for item in items:
             yield item
             done()

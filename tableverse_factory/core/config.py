@@ -214,7 +214,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
     key = key.strip()
     if not equals or key.count(".") != 1:
         raise ConfigError(
-            f"{_OVERRIDE_PREFIX}{represent(text)}: write section.key=value, e.g. rectify.clearance_m=0.001"
+            f"{_OVERRIDE_PREFIX}{represent(text)}: write it as section.key=value, e.g. rectify.clearance_m=0.001"
         )
     try:
         return key, yaml.load(value, _StrictLoader)  # noqa: S506 a SafeLoader with less

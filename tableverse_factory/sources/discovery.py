@@ -78,6 +78,8 @@ def discover_entries(paths: Sequence[str]) -> Discovery:
 
 
 def _walk_local(path: str) -> Iterator[_Folder | ManifestEntry]:
+    if not path:
+        raise InputError("an empty path: name a folder or a file; . is the folder that you are in")
     root = os.path.abspath(path)  # noqa: PTH100 Path.resolve would rename what a link names
     if os.path.isdir(root):  # noqa: PTH112 Path.is_dir raises for some hostile names
         yield from _walk_local_folders(root)

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tableverse_factory.cli import progress_bar as counter_module
-from tableverse_factory.cli.progress_bar import count_progress
+from tableverse_factory.cli.progress_bar import count_progress, track_progress
 from tests.helpers.fake_build_display import STAGES
 from tests.helpers.paths import ROOT
 from workers.progress import console as progress_module
@@ -85,6 +85,19 @@ def test_a_counter_says_lines_on_stderr_where_there_is_no_terminal(clock, capsys
     counts = [int(re.fullmatch(r"scenes: (\d+) of 100000", line)[1]) for line in lines]
     assert 20 < len(lines) < 120
     assert all(a < b for a, b in pairwise(counts))
+
+
+def test_items_are_counted_with_their_total_up_to_the_last(clock, capsys):
+    def compute():
+        for number in range(7):
+            clock.now += 4.0
+            yield number
+
+    assert [*track_progress("meshes", compute(), 7)] == [*range(7)]
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "meshes: 2 of 7"
+    assert lines[-1] == "meshes: 7 of 7"
+    assert len({*lines}) == len(lines)
 
 
 def test_what_is_quick_says_nothing(capsys):

@@ -229,7 +229,7 @@ def make_missing_build_error(path: StoragePath) -> BuildError:
     """Make the error for a missing file that every build has."""
     folder = path.parent
     if isinstance(folder, Path) and not folder.exists():
-        return BuildError(f"{folder}: there is no such folder; give the OUT of `tableverse build`")
+        return BuildError(f"{sanitize_line(str(folder))}: there is no such folder; give the OUT of `tableverse build`")
     return BuildError(f"{folder} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from schemas.identity import SAFE_ID, content_hash
+
 
 def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
     """List the captures that have a file of each group of names: `folder` itself, or those in it, sorted by name."""
@@ -14,6 +16,12 @@ def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
 def list_captures_lacking(folder: Path, needed: Iterable[str], missing: Iterable[str]) -> list[Path]:
     """List the captures in `folder` that have a file of `needed` and none of `missing`, sorted by name."""
     return [path for path in list_captures(folder, needed) if find_file(path, missing) is None]
+
+
+def make_scene_id(capture: Path) -> str:
+    """Make the id of a capture's scene: the folder's name, or a hash of it where that cannot be an id."""
+    name = capture.name
+    return name if SAFE_ID.fullmatch(name) and ".." not in name else content_hash(name.encode())[:12]
 
 
 def find_file(capture: Path, names: Iterable[str]) -> Path | None:

@@ -59,15 +59,21 @@ class CompletionScore:
     cpu_s: float = 0.0  # CPU time of the place stage; 0 for the other methods [s]
 
 
-def bench_completion(
-    folder: Path | None, seed: int = 0, views: Sequence[tuple[float, float]] = VIEWS, error_m: float = 0.0
-) -> Iterator[list[CompletionScore]]:
-    """Complete each mesh in `folder` from each view by convex hull, height field and the place stage.
+def read_solids(folder: Path | None) -> list[tuple[str, TriangleMesh]]:
+    """Read the named meshes of a folder, errors as of `read_meshes`; without one, make the solids of `make_solids`."""
+    return [*make_solids()] if folder is None else read_meshes(folder, check=_check_size)
 
-    Without a folder, complete the solids of `make_solids`. A view is the azimuth and elevation of a camera
-    [degrees]; `error_m` is that of `render_noisy_view`.
+
+def bench_completion(
+    meshes: Sequence[tuple[str, TriangleMesh]],
+    seed: int = 0,
+    views: Sequence[tuple[float, float]] = VIEWS,
+    error_m: float = 0.0,
+) -> Iterator[list[CompletionScore]]:
+    """Yield the scores of each mesh, completed from each view by convex hull, height field and the place stage.
+
+    A view is the azimuth and elevation of a camera [degrees]; `error_m` is that of `render_noisy_view`.
     """
-    meshes = make_solids() if folder is None else read_meshes(folder, check=_check_size)
     for index, (name, scan) in enumerate(meshes):
         scores: list[CompletionScore] = []
         truth = stand_on_table(scan)

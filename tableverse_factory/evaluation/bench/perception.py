@@ -12,13 +12,12 @@ from scipy.optimize import linear_sum_assignment
 
 from schemas.config import Config, ObserveConfig
 from schemas.geometry import Camera, DepthImage, Frozen, IdImage
-from schemas.identity import check_id
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.bench.captures import find_file, list_captures
+from tableverse_factory.evaluation.bench.captures import find_file, list_captures, make_scene_id
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import COLOR_NAMES, MASKS_NAME, read_id_image
 from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
@@ -114,7 +113,7 @@ def bench_masks(folder: Path, config: Config) -> Iterator[MaskScore]:
 
 def score_capture(capture: Path, config: Config) -> MaskScore:
     """Run `observe` and `perceive` on one capture and compare the masks with the truth."""
-    scene_id = check_id(capture.name)
+    scene_id = make_scene_id(capture)
     services = Services(Path())
     seen = observe(
         ImageRow(scene_id=scene_id, kind=SceneKind.CAPTURE, uri=str(capture)),

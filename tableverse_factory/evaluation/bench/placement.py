@@ -16,7 +16,7 @@ from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.bench.captures import list_captures
+from tableverse_factory.evaluation.bench.captures import list_captures, make_scene_id
 from tableverse_factory.evaluation.methods.heading import compute_heading_error, find_symmetric_turns
 from tableverse_factory.evaluation.methods.sources import read_pose
 from tableverse_factory.geometry.math.aabb import aabb
@@ -124,16 +124,16 @@ def place_capture(
     capture: Path, truth: PlacementTruth, config: Config
 ) -> tuple[PerceivedObjects, PlacedObjects] | None:
     """Return the perceived and the placed objects of a capture; None if a stage dropped it."""
-    services = Services(Path())
-    item = ImageRow(scene_id=capture.name, kind=SceneKind.CAPTURE, uri=str(capture))
-    observed = observe(item, config, make_rng(config.run.seed, capture.name, "observe"), services)
+    services, scene_id = Services(Path()), make_scene_id(capture)
+    item = ImageRow(scene_id=scene_id, kind=SceneKind.CAPTURE, uri=str(capture))
+    observed = observe(item, config, make_rng(config.run.seed, scene_id, "observe"), services)
     if not isinstance(observed, Done):
         return None
     seen = _attach_true_meshes(observed.value, truth, config) if config.place.mesh_model == "replay" else observed.value
-    perceived = perceive(seen, config, make_rng(config.run.seed, capture.name, "perceive"), services)
+    perceived = perceive(seen, config, make_rng(config.run.seed, scene_id, "perceive"), services)
     if not isinstance(perceived, Done):
         return None
-    placed = place(perceived.value, config, make_rng(config.run.seed, capture.name, "place"), services)
+    placed = place(perceived.value, config, make_rng(config.run.seed, scene_id, "place"), services)
     return (perceived.value, placed.value) if isinstance(placed, Done) else None
 
 

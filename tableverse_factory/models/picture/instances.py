@@ -9,10 +9,10 @@ from jaxtyping import Float64
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from schemas.geometry import IdImage, Mask
+from schemas.geometry import DepthImage, IdImage, Mask
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.models.picture.net import REACHES
-from tableverse_factory.models.picture.predict import OBJECT, OTHER, PicturePrediction
+from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction
 
 SPREAD_PX = 3.5  # standard deviation of the votes of one object about its middle
 MIN_VOTES = 10  # at a peak of votes
@@ -24,9 +24,15 @@ AGREED, LIKELY, SAME = 0.3, 0.6, 0.9  # votes between two middles, as a share of
 SURE = 1.5  # mean logit of pairs of pixels from which two pieces are of one object; below its negative they are of two
 PROBABLE = -0.8  # the same on a smooth surface; odds are even at -1.1: training weighs pairs of two objects threefold
 MIN_PROBABILITY = 0.55  # least mean probability of an object's pixels: those of a dark corner of the room have 0.44
-# Of what is neither object nor table but stands on it: least size, median height, and height of a pixel [m]; ratio of
-# the depths at a step; share of what surrounds it that is table or object, and share that is more of the same
-STANDING_PX, STANDING_M, LOW_M, STEP, MIN_ENDED, MAX_GOING_ON = 100, 0.025, 0.005, 1.06, 0.6, 0.1
+# Parts that are labelled neither object nor table and yet stand on the table
+SURELY_OTHER = 0.9  # mean probability of neither from which they are none: of people's arms, of what stands behind
+MIN_PART_PX, MIN_PART_M = 100, 0.025  # least size and least median height over the table: lower ones are holes in it
+PART_PIXEL_M = 0.005  # least height of each pixel [m]
+DEPTH_STEP = 1.06  # least ratio of the depths on both sides of a depth discontinuity: the net's relief is flatter
+MIN_TABLE_AROUND = (
+    0.5  # least share of their surroundings that is table: of a pocket in an object or a chair it is less
+)
+MAX_CONTINUED = 0.1  # most share of their surroundings to which they continue
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both
 SMOOTH, CREASED = 0.45, 0.9  # distance out of the other's tangent plane, as a share of that across the line of sight
@@ -56,8 +62,45 @@ def segment_prediction(found: PicturePrediction, shape: tuple[int, int]) -> IdIm
     return upsample_ids(_find_objects(found), shape)
 
 
+def label_standing_parts(found: PicturePrediction) -> PicturePrediction:
+    """Label as objects the parts of a bare picture that stand on the table, though the net has labelled them otherwise.
+
+    The net leaves out parts of objects and small ones far away. Such a part rises over the table and is surrounded by
+    table for the most part, and elsewhere by objects or a depth discontinuity: walls, furniture and arms continue. It
+    votes for its own middle.
+    """
+    label, votes = found.label.copy(), found.votes.copy()
+    kind = label.argmax(axis=0)
+    height = backproject(found.depth, found.camera) @ found.normal + found.distance_m
+    rises = (kind == OTHER) & (height > PART_PIXEL_M)
+    parts, _ = ndimage.label(rises & (found.depth < DEPTH_STEP * ndimage.minimum_filter(found.depth, 3)))
+    for part, (rows, columns) in enumerate(ndimage.find_objects(parts), start=1):
+        window = tuple(slice(its.start - ACROSS_PX, its.stop + ACROSS_PX) for its in (rows, columns))
+        if any(its.start < 0 or its.stop > n for its, n in zip(window, parts.shape, strict=True)):
+            continue  # at the border of the picture nobody knows how it continues
+        mask = parts[window] == part
+        if (
+            mask.sum() >= MIN_PART_PX
+            and np.median(height[window][mask]) > MIN_PART_M
+            and label[OTHER][window][mask].mean() <= SURELY_OTHER
+            and _ends_all_around(mask, found.depth[window], kind[window], rises[window])
+        ):
+            label[OBJECT][window][mask] += label[OTHER][window][mask]
+            label[OTHER][window][mask] = 0.0
+            at = np.argwhere(mask)
+            votes[::-1, *window][:, mask] = (at.mean(axis=0) - at).T
+    return replace(found, label=label, votes=votes)
+
+
+def _ends_all_around(mask: Mask, depth: DepthImage, kind: IdImage, rises: Mask) -> bool:
+    around = ndimage.binary_dilation(mask, iterations=ACROSS_PX) & ~mask
+    nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    continued = rises & (depth <= DEPTH_STEP * depth[tuple(nearest)])
+    table, more = (float(share[around].mean()) for share in (kind == TABLE, continued))
+    return table >= MIN_TABLE_AROUND and more <= MAX_CONTINUED
+
+
 def _find_objects(found: PicturePrediction) -> IdImage:
-    found = _add_standing(found)
     is_object = found.label.argmax(axis=0) == OBJECT
     density, middles, nearest = _group_votes(found, is_object)
     pieces, middle_of = _cut_pieces(nearest, found.boundary < EDGE)
@@ -81,34 +124,6 @@ def _find_objects(found: PicturePrediction) -> IdImage:
     count = np.bincount(ids.ravel())
     sure = np.bincount(ids.ravel(), found.label[OBJECT].ravel()) >= MIN_PROBABILITY * count
     return _renumber(np.where(sure[ids], ids, 0))
-
-
-def _add_standing(found: PicturePrediction) -> PicturePrediction:
-    """Add to the objects what stands on the table and is, says the net, neither object nor table.
-
-    It rises over the table and ends at table and objects, or before what lies farther away, all around it: a wall, a
-    chair and an arm go on. It votes for its own middle.
-    """
-    label, votes = found.label.copy(), found.votes.copy()
-    kind = label.argmax(axis=0)
-    height = backproject(found.depth, found.camera) @ found.normal + found.distance_m
-    rises = (kind == OTHER) & (height > LOW_M)
-    parts, _ = ndimage.label(rises & (found.depth < STEP * ndimage.minimum_filter(found.depth, 3)))
-    sizes = np.bincount(parts.ravel())
-    for part in np.flatnonzero(sizes[1:] >= STANDING_PX) + 1:
-        mask = parts == part
-        around = ndimage.binary_dilation(mask, iterations=ACROSS_PX) & ~mask
-        nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
-        goes_on = around & rises & (found.depth <= STEP * found.depth[tuple(nearest)])
-        at_border = mask[[0, -1]].any() or mask[:, [0, -1]].any()
-        ended = (kind != OTHER)[around].mean() >= MIN_ENDED and goes_on[around].mean() <= MAX_GOING_ON
-        if at_border or not ended or np.median(height[mask]) <= STANDING_M:
-            continue
-        label[OBJECT][mask] += label[OTHER][mask]
-        label[OTHER][mask] = 0.0
-        at = np.argwhere(mask)
-        votes[::-1, mask] = (at.mean(axis=0) - at).T
-    return replace(found, label=label, votes=votes)
 
 
 def _merge_pieces(wanted: Sequence[tuple[_Border, float]], borders: Sequence[_Border], count: int) -> IdImage:

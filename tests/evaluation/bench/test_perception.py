@@ -121,20 +121,20 @@ def test_a_folder_without_truth_is_refused(tmp_path):
 
 
 def test_a_capture_that_cannot_be_read_costs_the_others_nothing(tmp_path):
-    for name, x in (("a", -0.12), ("b", 0.0), ("c", 0.12)):
+    for name, x in (("a", -0.12), ("b", 0.0), ("c", 0.12), ("my capture (1)", 0.05)):
         write_look(tmp_path / name, [Box(x, 0.05, (0.1, 0.06, 0.15))], {})
     Image.new("I;16", (8, 8)).save(tmp_path / "a" / "masks.png")
     Image.new("I;16", Image.open(tmp_path / "b" / "depth.png").size).save(tmp_path / "b" / "depth.png")
     scores = list(bench_masks(tmp_path, Config()))
-    assert [score.unread for score in scores] == [True, True, False]
+    assert [score.unread for score in scores] == [True, True, False, False]
     assert "8 x 8" in scores[0].reason
     assert "depth_all_zero" in scores[1].reason
-    assert merge_scores(scores).truth == 1
+    assert merge_scores(scores).truth == 2
     (tmp_path / "c" / "truth.json").unlink()
     shown = CliRunner().invoke(app, ["bench", "twin", str(tmp_path), "--jobs", "1"])
     assert shown.exit_code == 0, shown.output
     assert "depth_all_zero" in shown.output
-    assert "1 of 3 captures have a scene" in shown.output
+    assert "2 of 4 captures have a scene" in shown.output
 
 
 def test_what_lies_in_what_is_counted_by_the_masks_and_not_by_the_numbers():
@@ -176,5 +176,7 @@ def test_the_command_says_what_lies_in_what_in_json(tmp_path):
     assert "without seg.png or masks.png: untold" in said
     result = CliRunner().invoke(app, ["bench", "perception", str(tmp_path), "--json"])
     assert result.exit_code == 0, result.output
-    for row in json.loads(result.stdout):
+    said = json.loads(result.stdout)
+    assert [row["name"] for row in said["captures"]] == ["a"]
+    for row in (*said["captures"], said["together"]):
         assert row["containment"] == {"true": 1, "found": 1, "correct": 1, "precision": 1.0, "recall": 1.0}

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from schemas.geometry import Camera
-from tableverse_factory.models.picture.instances import MIN_OBJECT_PX, segment_prediction, upsample_ids
+from tableverse_factory.models.picture.instances import (
+    MIN_OBJECT_PX,
+    label_standing_parts,
+    segment_prediction,
+    upsample_ids,
+)
 from tableverse_factory.models.picture.predict import OBJECT, OTHER, TABLE, PicturePrediction
 
 ROWS, COLUMNS = 96, 128
@@ -197,33 +202,65 @@ def test_what_is_unlikely_to_be_an_object_is_none() -> None:
     assert segment(replace(found, label=label)).max() == 0
 
 
-ROOM = (slice(0, 36), slice(0, COLUMNS))  # behind the table's far end
+CHUCK = (slice(30, 76), slice(40, 70))  # a metre away; it begins over the horizon, in the middle row
+WALL = (slice(0, 48), slice(0, COLUMNS))  # behind the table's far end
+HALF_ABOVE = (slice(18, 76), slice(40, 70))
+
+
+def look_level(part: tuple[slice, slice], wall_m: float, doubt: float = 0.15, around: int = TABLE) -> PicturePrediction:
+    """A level look over a table 0.3 m below: a part that the net takes for the room, with a doubt, before a wall."""
+    kinds = np.eye(3, dtype=np.float32)[:, :, None, None]
+    rows = np.arange(ROWS)[:, None]
+    label = np.repeat(np.where(rows < WALL[0].stop, kinds[OTHER], kinds[TABLE]), COLUMNS, axis=2)
+    depth = np.repeat(np.where(rows < WALL[0].stop, wall_m, 36.0 / np.maximum(rows - 47.5, 0.5)), COLUMNS, axis=1)
+    frame = tuple(slice(its.start - 5, its.stop + 5) for its in part)
+    label[:, *frame] = label[:, *frame] if around == TABLE else kinds[around]
+    label[:, *part] = (1.0 - doubt) * kinds[OTHER] + doubt * kinds[OBJECT]
+    depth[part] = 1.0
+    made = replace(make_prediction(), label=label, depth=depth.astype(np.float32))
+    return replace(made, normal=np.array([0.0, -1.0, 0.0]), distance_m=0.3)
 
 
 @pytest.mark.parametrize(
-    ("thing", "distance_m", "room_m", "count"),
+    ("part", "found", "is_object"),
     [
-        pytest.param(LEFT, 0.95, None, 1, id="on the table"),
-        pytest.param(LEFT, 0.95, 1.5, 1, id="before the room, which is farther away"),
-        pytest.param(LEFT, 0.95, 0.95, 0, id="before what rises as far away and goes on, as a wall does"),
-        pytest.param(LEFT, 0.99, None, 0, id="flat: a hole in what is called table"),
-        pytest.param((slice(30, 60), slice(0, 30)), 0.95, None, 0, id="at the border of the picture, as an arm"),
-        pytest.param((slice(30, 38), slice(30, 38)), 0.95, None, 0, id="a speck"),
+        pytest.param(CHUCK, {"wall_m": 3.0}, True, id="before a wall that is far away"),
+        pytest.param(CHUCK, {"wall_m": 1.12}, True, id="before a near one"),
+        pytest.param(CHUCK, {"wall_m": 1.02}, False, id="it continues in the wall"),
+        pytest.param(CHUCK, {"wall_m": 3.0, "doubt": 0.05}, False, id="the net is sure"),
+        pytest.param(HALF_ABOVE, {"wall_m": 3.0}, False, id="mostly before the wall"),
+        pytest.param(CHUCK, {"wall_m": 3.0, "around": OBJECT}, False, id="a pocket in an object"),
+        pytest.param((slice(30, 76), slice(2, 32)), {"wall_m": 3.0}, False, id="two pixels from the border, as an arm"),
+        pytest.param((slice(60, 68), slice(40, 50)), {"wall_m": 3.0}, False, id="a speck"),
     ],
 )
-def test_what_the_net_calls_neither_object_nor_table_is_an_object_where_it_stands_on_the_table(
-    thing, distance_m, room_m, count
+def test_a_part_that_stands_on_the_table_is_an_object_though_the_net_takes_it_for_the_room(
+    part, found, is_object
 ) -> None:
-    found = make_prediction(thing)
-    label, depth = found.label.copy(), found.depth.copy()
-    for part, there in ((ROOM, room_m), (thing, distance_m)):
-        if there is not None:
-            label[:, *part] = np.eye(3, dtype=np.float32)[OTHER][:, None, None]
-            depth[part] = there
-    ids = segment(replace(found, label=label, depth=depth))
-    assert ids.max() == count
-    if count:
-        shown = np.zeros(ids.shape, dtype=bool)
-        shown[thing] = True
-        assert (ids == 1)[thing].mean() > 0.9
-        assert not (ids == 1)[~shown].any()
+    asked = look_level(part, **found)
+    said = label_standing_parts(asked)
+    changed = (said.label != asked.label).any(axis=0)
+    shown = np.zeros(changed.shape, dtype=bool)
+    shown[part] = is_object
+    np.testing.assert_array_equal(changed, shown)
+    ids = segment(said)
+    assert (ids[part] > 0).all() == is_object
+    assert (ids[part] == ids[part][0, 0]).all(), "one object"
+
+
+def test_a_hole_in_what_is_called_table_is_no_object() -> None:
+    found = make_prediction(LEFT)
+    label = found.label.copy()
+    label[:, *LEFT] = np.array([0.85, 0.0, 0.15])[:, None, None]
+    for distance_m, count in ((0.99, 0), (0.95, 1)):
+        depth = found.depth.copy()
+        depth[LEFT] = distance_m
+        assert segment(label_standing_parts(replace(found, label=label, depth=depth))).max() == count
+
+
+def test_where_the_room_fills_the_picture_nothing_is_added() -> None:
+    found = make_prediction((slice(0, ROWS), slice(0, COLUMNS)))
+    label = np.zeros_like(found.label)
+    label[OTHER] = 1.0
+    room = replace(found, label=label, depth=0.5 * found.depth)
+    assert segment(label_standing_parts(room)).max() == 0

@@ -48,19 +48,18 @@ def _setup(tmp_path: Path, **changes: object) -> SandboxSetup:
 
 def _run_line(sandbox: Sandbox, name: str):
     """The report of the last stage that ran, and the place of what the last one that is done gave."""
-    report = sandbox.run(_chain(name, range(4), _choose_deadline(name)))
+    report = sandbox.run(_chain(name, range(4)))
     return report.stages[-1], report.output
 
 
-def _choose_deadline(name: str) -> float:
-    """The deadline of a stage [s]: short for what hangs; on a busy machine all else may take seconds."""
-    return 1.5 if name == "hang" else 60.0
-
-
 def _chain(name: str, positions: Sequence[int], deadline_s: float = 60.0, **more: object) -> StageChain:
-    """These stages of the tiny pipeline on scene `a`; what they give is kept."""
+    """These stages of the tiny pipeline on scene `a`; what they give is kept.
+
+    Only the stage that hangs has a short deadline: on a busy machine each may take seconds.
+    """
     row = ImageRow(scene_id="a", kind="capture", uri="/x", name=name)
-    calls = tuple(StageCall(deadline_s, "" if position == 3 else str(position)) for position in positions)
+    deadlines = {position: 1.5 if (name, position) == ("hang", 1) else deadline_s for position in positions}
+    calls = tuple(StageCall(deadlines[position], "" if position == 3 else str(position)) for position in positions)
     return StageChain(row, 0, positions[0], calls, **more)
 
 
@@ -152,7 +151,7 @@ def test_a_failure_is_the_same_whatever_its_child_ran_before_and_costs_one_run_m
 
     def run(positions: Sequence[int], place: str) -> tuple[Failed, int, int]:
         (marks / "a.cut").unlink(missing_ok=True)
-        report = sandbox.run(_chain(name, positions, _choose_deadline(name), input=place)).stages[-1]
+        report = sandbox.run(_chain(name, positions, input=place)).stages[-1]
         return report.outcome, report.attempts, (marks / "a.cut").stat().st_size
 
     in_used = run(range(1, 4), place)

@@ -26,12 +26,6 @@ SMALL_AREA_M2 = 0.003  # of a region that may be an error of the depth [m²]
 UNSEEN_COLOR = 5.0  # median colour of a region that is that beside it, in CIELAB: 0.9 to 3.7 of three false objects
 SATURATED = 98.0  # lightness from which the picture tells nothing
 SURROUNDINGS_PX = 12
-# A shadow's most height by estimated depth [m], the logarithm of its light over that of the table around it, and how
-# much more or less that may be in one channel: 75 % of the pixels of a bowl's shadow, at most 27 % of 400 other regions
-SHADOW_M, DIMMED, TINTED = 0.015, (-1.4, -0.1), 0.2
-MIN_SHADOW = 0.5  # share of such pixels from which a region is a shadow
-AROUND_SHADOW_PX, SHADOW_BLUR_PX, SHADOW_SPECK_PX = 25, 1.5, 2
-GAMMA, DARKEST = 2.2, 6.0  # of colours, whose channels are noise below
 
 
 def keep_regions_over_table(ids: IdImage, view: TableView) -> IdImage:
@@ -89,33 +83,6 @@ def _is_unseen(ids: IdImage, k: int, view: TableView) -> bool:
     shown, beside = (np.median(lab[pixels], axis=0) for pixels in (own, around))
     alike = bool(np.linalg.norm(shown - beside) <= UNSEEN_COLOR and shown[0] < SATURATED)
     return alike and bool(known) and max(known) <= FAINT_EDGE  # an edge that is not known may be one
-
-
-def drop_shadows(ids: IdImage, view: TableView) -> IdImage:
-    """Drop the regions that are shadows on the table, renumbered from 1: flat, of the table's colour in less light.
-
-    For estimated depth: a net takes some for things.
-    """
-    count = int(ids.max(initial=0))
-    return renumber_regions(ids, [k for k in range(1, count + 1) if not _is_shadow(ids, k, view)])
-
-
-def _is_shadow(ids: IdImage, k: int, view: TableView) -> bool:
-    region = ids == k
-    if not region.any():
-        return False
-    window = expand_window(region, AROUND_SHADOW_PX)
-    own, heights = region[window], view.heights[window]
-    table = ndimage.binary_dilation(own, iterations=AROUND_SHADOW_PX) & view.on_plane[window] & (ids[window] == 0)
-    if not table.any():
-        return False
-    light = GAMMA * np.log(np.maximum(view.observation.color[window], DARKEST))
-    light = ndimage.gaussian_filter(light, (SHADOW_BLUR_PX, SHADOW_BLUR_PX, 0.0))
-    dimmed = light - np.median(light[table], axis=0)
-    mean = dimmed.mean(axis=2)
-    shaded = own & (heights < SHADOW_M) & (mean > DIMMED[0]) & (mean < DIMMED[1])
-    shaded &= np.abs(dimmed - mean[..., None]).max(axis=2) < TINTED
-    return float(ndimage.binary_opening(shaded, iterations=SHADOW_SPECK_PX).sum()) > MIN_SHADOW * own.sum()
 
 
 def renumber_regions(ids: IdImage, kept: list[int]) -> IdImage:

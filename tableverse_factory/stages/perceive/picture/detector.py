@@ -8,7 +8,12 @@ from scipy import ndimage
 from schemas.config import Config
 from schemas.geometry import TABLE_ID, IdImage, Mask
 from schemas.observation import Observation
-from tableverse_factory.models.picture.instances import segment_prediction, upsample_ids
+from tableverse_factory.models.picture.instances import (
+    SURELY_OTHER,
+    label_standing_parts,
+    segment_prediction,
+    upsample_ids,
+)
 from tableverse_factory.models.picture.predict import (
     OBJECT,
     OTHER,
@@ -19,7 +24,10 @@ from tableverse_factory.models.picture.predict import (
 )
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
-from tableverse_factory.stages.perceive.base.object_filter import drop_shadows, keep_objects, renumber_regions
+from tableverse_factory.stages.perceive.base.object_filter import (
+    keep_objects,
+    renumber_regions,
+)
 from tableverse_factory.stages.perceive.base.table_view import TableView, expand_window
 from tableverse_factory.stages.perceive.depth_segmenter.rims import find_rims
 from tableverse_factory.stages.perceive.depth_segmenter.segment import (
@@ -29,7 +37,6 @@ from tableverse_factory.stages.perceive.depth_segmenter.segment import (
 )
 from tableverse_factory.stages.perceive.depth_segmenter.vessels import find_containers
 
-SURELY_OTHER = 0.9  # probability of neither object nor table from which what rises over the table is no object
 MARGIN_SHARE = 0.05  # of the picture's length, on each side of what rises
 SPECK_PX = 2  # half the width of the holes that every sensor has between readings
 
@@ -41,13 +48,12 @@ def detect_in_picture(view: TableView, config: Config, _services: Services) -> D
 
 def detect_predicted(view: TableView, found: PicturePrediction) -> DetectionResult:
     """Detect the objects that the net has `found`, as `detect_in_picture`."""
-    seen = segment_prediction(found, view.valid.shape)
-    lit = drop_shadows(seen, view) if view.observation.bend else seen
-    regions = keep_objects(lit, view, by_depth=False)
+    found = label_standing_parts(found) if view.observation.bend else found
+    regions = keep_objects(segment_prediction(found, view.valid.shape), view, by_depth=False)
     sizes = np.bincount(regions.ravel())[1:]
     regions = fill_holes(renumber_regions(regions, [int(k) + 1 for k in np.argsort(-sizes, kind="stable")]))
     detections = to_detections(regions, find_containers(regions, find_rims(regions, view), view))
-    return replace(detections, shown=find_standing(view, found) & ((seen == 0) | (lit > 0)))
+    return replace(detections, shown=find_standing(view, found))
 
 
 def find_standing(view: TableView, found: PicturePrediction) -> Mask:

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from schemas.outcome import Dropped
-from tableverse_factory.stages.perceive.base.object_filter import drop_shadows, drop_unseen_regions, keep_objects
+from tableverse_factory.stages.perceive.base.object_filter import drop_unseen_regions, keep_objects
 from tableverse_factory.stages.perceive.table import find_table
 from tests.helpers.tabletop_views import Box, camera_above, look
 
@@ -80,25 +80,3 @@ def test_a_large_region_is_kept_whatever_the_picture_shows():
     view = find_table(replace(seen, color=np.full(seen.color.shape, CLOTH, np.uint8)), np.random.default_rng(0))
     assert not isinstance(view, Dropped), view
     assert drop_unseen_regions((ids == 2).astype(np.int32), view).max() == 1
-
-
-@pytest.mark.parametrize(
-    ("tint", "height", "kept"),
-    [
-        pytest.param((90, 84, 78), 0.0, 0, id="a shadow"),
-        pytest.param((85, 79, 74), 0.0, 0, id="a darker one"),
-        pytest.param((90, 84, 78), 0.05, 1, id="a thing of the table's wood"),
-        pytest.param((60, 70, 110), 0.0, 1, id="a mat of another colour"),
-        pytest.param((12, 11, 10), 0.0, 1, id="a black mat"),
-        pytest.param((150, 140, 130), 0.0, 1, id="a mat of the table's colour, as bright"),
-        pytest.param((190, 177, 165), 0.0, 1, id="sheet in the light"),
-    ],
-)
-def test_a_flat_region_of_the_tables_colour_in_less_light_is_a_shadow(tint, height, kept):
-    seen, ids = look([Box(0.0, 0.0, (0.1, 0.1, max(height, 0.0005)))], camera_above(0.6, 0.7))
-    region = ids == 2
-    noise = np.random.default_rng(0).normal(0.0, 3.0, seen.color.shape)
-    color = np.where(region[..., None], tint, (150, 140, 130)) + noise
-    view = find_table(replace(seen, color=np.clip(color, 0, 255).astype(np.uint8)), np.random.default_rng(0))
-    assert not isinstance(view, Dropped), view
-    assert drop_shadows(region.astype(np.int32), view).max() == kept

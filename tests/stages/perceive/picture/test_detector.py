@@ -16,7 +16,7 @@ from schemas.outcome import Done, Dropped, Outcome
 from tableverse_factory.core.errors import ConfigError, ModelAccessError
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.picture.instances import upsample_ids
-from tableverse_factory.models.picture.predict import OBJECT, PicturePrediction
+from tableverse_factory.models.picture.predict import OBJECT, TABLE, PicturePrediction
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
@@ -24,6 +24,7 @@ from tableverse_factory.stages.perceive.base.interfaces import Candidate, Detect
 from tableverse_factory.stages.perceive.perceive import perceive
 from tableverse_factory.stages.perceive.picture.detector import (
     detect_in_picture,
+    detect_predicted,
     find_standing,
     predict_view,
     segment_boxes_in_picture,
@@ -210,3 +211,26 @@ def test_the_boxes_of_a_detector_get_masks(tmp_path: Path) -> None:
         record_segmenter(named, {})
     with pytest.raises(ModelAccessError, match=r"own\.onnx' is no file"):
         perceive(seen.value, named, np.random.default_rng(0), Services(Path()))
+
+
+@pytest.mark.parametrize(("bend", "count"), [(0.02, 2), (0.0, 1)])
+def test_what_the_net_took_for_the_room_is_found_and_has_to_be_explained_in_a_bare_picture_alone(bend, count) -> None:
+    """A sensor's depth tells of itself what stands on the table."""
+    seen, ids = look(THINGS, POSE)
+    view = find_table(seen, np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    view = replace(view, observation=replace(view.observation, bend=bend))
+    label = np.zeros((3, *ids.shape), np.float32)
+    label[TABLE][ids < 2] = 1.0
+    label[OBJECT][ids == 2] = 1.0
+    label[:, ids == 3] = np.array([[0.8], [0.0], [0.2]])
+    votes, at = np.zeros((2, *ids.shape), np.float32), np.argwhere(ids == 2)
+    votes[::-1, ids == 2] = (at.mean(axis=0) - at).T
+    up = rotation_matrix(POSE.quaternion_wxyz)[2]
+    depth = np.where(seen.depth > 0.0, seen.depth, 10.0).astype(np.float32)
+    certain = np.full((6, *ids.shape), 5.0, np.float32), up, float(POSE.position[2]), 0.9, 0.1
+    found = PicturePrediction(CAMERA, depth, label, votes, np.zeros(ids.shape, np.float32), *certain)
+    answer = detect_predicted(view, found)
+    assert len(answer.candidates) == count
+    if bend:
+        assert answer.shown[ids == 3].mean() > 0.9
