@@ -82,7 +82,7 @@ SCENES = pa.schema(
         ("n_toppled", pa.int32()),  # since the picture, as the next
         ("n_slid", pa.int32()),
         ("n_left_out", pa.int32()),
-        ("twin_remarks", pa.list_(pa.string())),  # code:object, of what toppled, slid, is left out or poorly covered
+        ("twin_remarks", pa.list_(pa.string())),  # code:object: toppled, slid, left out, poorly covered, misfit
         ("at_rest", pa.bool_()),
         ("colliding", pa.bool_()),
         ("settle_time_s", pa.float64()),  # simulated

@@ -29,9 +29,7 @@ SURELY_OTHER = 0.9  # mean probability of neither from which they are none: of p
 MIN_PART_PX, MIN_PART_M = 100, 0.025  # least size and least median height over the table: lower ones are holes in it
 PART_PIXEL_M = 0.005  # least height of each pixel [m]
 DEPTH_STEP = 1.06  # least ratio of the depths on both sides of a depth discontinuity: the net's relief is flatter
-MIN_TABLE_AROUND = (
-    0.5  # least share of their surroundings that is table: of a pocket in an object or a chair it is less
-)
+MIN_TABLE_AROUND = 0.5  # least share of their surroundings that is table: a pocket in an object has less, and a chair
 MAX_CONTINUED = 0.1  # most share of their surroundings to which they continue
 FRAGMENT = 0.5  # least distance of a fragment's votes from its own middle, in radii of a disc of its area
 ONE_MIDDLE = 0.2  # most distance of two fragments' votes, as a share of the extent of both

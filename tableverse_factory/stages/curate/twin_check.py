@@ -10,6 +10,7 @@ from schemas.geometry import TriangleMesh
 from schemas.objects import PlacedObjects
 from schemas.scene import Coverage, SettledScene
 from tableverse_factory.geometry.relations.displacement import measure_displacement
+from tableverse_factory.geometry.relations.misfit import find_misfits
 from tableverse_factory.physics.render.silhouettes import measure_coverage
 
 LEAST_EXPLAINED = 0.9  # of the area above the table
@@ -25,7 +26,7 @@ class TwinCheck:
     coverage: Coverage | None
     n_things: int  # objects, without copies, and those that are left out
     n_lost: int  # those of them that toppled, slid or are left out
-    n_poor: int  # those of them that did not, and of whose masks too little is covered
+    n_poor: int  # those of them that did not, and of whose masks too little is covered, or whose shapes misfit
 
     @property
     def covered(self) -> float | None:
@@ -62,7 +63,7 @@ def check_twin(scene: SettledScene, meshes: tuple[TriangleMesh, ...]) -> TwinChe
         coverage,
         sum(displacement is not None for displacement in moved) + len(placed.left_out),
         sum(lost) + len(placed.left_out),
-        sum(not lost[index] for index in (coverage.poor if coverage else ())),
+        sum(not lost[index] for index in {*(coverage.poor if coverage else ()), *find_misfits(placed)}),
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from schemas.scene import CuratedScene
 from tableverse_factory.geometry.relations.displacement import measure_displacement
+from tableverse_factory.geometry.relations.misfit import find_misfits
 from tableverse_factory.physics.mjcf.spec import SceneBody
 
 
@@ -18,7 +19,7 @@ class Fidelity:
 
 
 def describe_fidelity(scene: CuratedScene, bodies: Sequence[SceneBody]) -> Fidelity:
-    """Describe what the exported bodies explain and cover, and what toppled, slid or is left out."""
+    """Describe what the exported bodies explain and cover, and what toppled, slid, is left out or misfits."""
     placed, coverage = scene.settled.rectified.placed, scene.coverage
     ids = [item.object_id for item in placed.objects]
     moved = [measure_displacement(item, body.pose) for item, body in zip(placed.objects, bodies, strict=True)]
@@ -29,6 +30,7 @@ def describe_fidelity(scene: CuratedScene, bodies: Sequence[SceneBody]) -> Fidel
         *(f"{kind}:{name}" for name, kind in zip(ids, kinds, strict=True) if kind),
         *(f"left_out:{name}" for name, _ in placed.left_out),
         *(f"poorly_covered:{ids[index]}" for index in (coverage.poor if coverage else ())),
+        *(f"misfit:{ids[index]}" for index in find_misfits(placed)),
     ]
     columns = {
         "explained_points": points,

@@ -11,8 +11,13 @@ from schemas.geometry import Pose
 from schemas.objects import Evidence, Explanation
 from schemas.outcome import Done
 from tableverse_factory.core.png import encode_png
-from tableverse_factory.geometry.math.transforms import multiply_quaternions, quaternion_from_rotation_vector
-from tableverse_factory.geometry.mesh.meshes import place_mesh
+from tableverse_factory.geometry.math.transforms import (
+    multiply_quaternions,
+    quaternion_from_rotation_vector,
+    transform_points,
+)
+from tableverse_factory.geometry.mesh.meshes import box_center, place_mesh
+from tableverse_factory.geometry.relations.misfit import MISFIT_SHARE
 from tableverse_factory.models.services import Services
 from tableverse_factory.physics.render.render import look_at, render
 from tableverse_factory.stages.curate.curate import curate
@@ -94,6 +99,22 @@ def test_things_that_the_twin_shows_elsewhere_cost_points_though_they_stayed():
     swapped = check(with_placed(scene, evidence=replace(evidence, object_pixels=(second, first, *others))))
     assert (swapped.n_lost, swapped.n_poor, swapped.n_things) == (0, 2, 7)
     assert swapped.most_points <= int(1.5 + 9 * 5 / 7) < check(scene).most_points
+
+
+@pytest.mark.parametrize(("far", "n_poor"), [(0.9, 0), (1.1, 1)])
+def test_a_shape_far_from_what_was_read_costs_points(far, n_poor):
+    scene = photographed(kitchen())
+    placed = scene.rectified.placed
+    first, *others = placed.objects
+    assert placed.evidence is not None
+    eye = placed.evidence.camera_to_table.position
+    middle = transform_points(first.pose, box_center(first.mesh)[None], first.scale)[0]
+    residual_m = far * MISFIT_SHARE * float(np.linalg.norm(middle - eye))
+    answer = check(with_placed(scene, objects=(replace(first, fit_residual_m=residual_m), *others)))
+    assert (answer.n_lost, answer.n_poor) == (0, n_poor)
+    assert (answer.most_points < check(scene).most_points) == bool(n_poor)
+    seen_nowhere = with_placed(scene, objects=(replace(first, fit_residual_m=residual_m), *others), evidence=None)
+    assert check(seen_nowhere).n_poor == 0, "a layout has no readings"
 
 
 def test_a_quarter_of_the_things_may_topple_slide_or_be_left_out():

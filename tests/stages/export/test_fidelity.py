@@ -1,32 +1,37 @@
 """Columns about what toppled, slid, is left out, explained and covered."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from schemas.config import Config
 from schemas.geometry import Pose
-from schemas.objects import Explanation
+from schemas.objects import Evidence, Explanation
 from schemas.outcome import Done
 from schemas.scene import Coverage
+from tableverse_factory.core.png import encode_png
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.export.export import export
 from tests.helpers.simple_scenes import Solid, as_settled, box, curated, layout
+from tests.helpers.tabletop_views import CAMERA, camera_above
 
 SOLIDS = [Solid(box(0.08, 0.08, 0.08), (x, 0.0, 0.04)) for x in (-0.15, 0.0, 0.15)]
 STRAIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def exported(**changes):
+def exported(residual_m=0.0, **changes):
     """The scene of three boxes, of which the picture placed the second lying and the third elsewhere."""
     settled = as_settled(layout(SOLIDS))
     scene = curated(settled)
     placed = settled.rectified.placed
     lying = quaternion_from_rotation_vector(np.array([np.pi / 2, 0.0, 0.0]))
     stays, second, third = placed.objects
+    stays = replace(stays, fit_residual_m=residual_m)
     moved = Pose(np.array([0.15, 0.06, 0.04]), STRAIGHT)
     objects = (stays, replace(second, pose=Pose(np.array([0.0, 0.0, 0.04]), lying)), replace(third, pose=moved))
     placed = replace(placed, objects=objects, **changes)
@@ -47,6 +52,16 @@ def test_rows_tell_what_moved_away_and_what_is_shown():
     assert row["coverage"] == 0.7
     assert [item["coverage"] for item in items] == [0.9, 0.8, 0.3]
     assert [item["tilt_rad"] for item in items] == pytest.approx([0.0, np.pi / 2, 0.0], abs=1e-3)
+
+
+@pytest.mark.parametrize(("residual_m", "remarks"), [(0.009, []), (0.025, ["misfit:obj_000"])])
+def test_a_shape_far_from_what_was_read_is_named(residual_m, remarks):
+    masks, eye = encode_png(np.zeros((CAMERA.height, CAMERA.width), np.uint16)), camera_above(1.0)
+    picture = io.BytesIO()
+    Image.new("RGB", (CAMERA.width, CAMERA.height)).save(picture, "JPEG")
+    evidence = Evidence(picture.getvalue(), masks, (1, 2, 3), CAMERA, eye)
+    named = exported(residual_m, evidence=evidence).scene_row["twin_remarks"]
+    assert [name for name in named if name.startswith("misfit")] == remarks
 
 
 def test_a_layout_has_no_photograph_to_explain():
