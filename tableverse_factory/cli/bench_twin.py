@@ -38,7 +38,7 @@ def bench_twin(
 
     Example: `tableverse bench twin captures --pictures twins`
     """
-    from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.core.process_pool import count_available_cpus, parallel_map
     from tableverse_factory.evaluation.bench.twin import find_captures, measure_twin, summarize_twins
@@ -46,11 +46,8 @@ def bench_twin(
     settings = load_config(config, overrides or [])
     rows = find_captures(captures, settings, dataset)
     measure = partial(measure_twin, config=settings, dataset=dataset, pictures=pictures)
-    scores = []
-    with count_progress("captures", len(rows)) as done:
-        for score in parallel_map(measure, rows, jobs or count_available_cpus(), "compares twins"):
-            scores.append(score)
-            done()
+    measured = parallel_map(measure, rows, jobs or count_available_cpus(), "compares twins")
+    scores = list(track_progress("captures", measured, len(rows)))
     if as_json:
         of_each = [asdict(score) | {"number": score.number} for score in scores]
         print_json({"captures": of_each, "together": summarize_twins(scores)})

@@ -1,9 +1,9 @@
 """`tableverse evaluate`: collisions, judge's marks and layout errors of the scenes of any methods."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from tableverse_factory.evaluation.methods.layout import SceneLayout
     from tableverse_factory.evaluation.methods.score import VoteResults
 
-T = TypeVar("T")
 _SHOWN_LINES = 3
 
 evaluate = typer.Typer(name="evaluate", help="Compare the scenes of any methods.", no_args_is_help=True)
@@ -53,6 +52,7 @@ def evaluate_collisions(
 
     Example: `tableverse evaluate collisions --method ours=out --method midi=midi/ --epsilon 0.001`
     """
+    from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.evaluation.methods.collisions import measure_method
     from tableverse_factory.evaluation.methods.sources import count_dropped_scenes, find_scenes, parse_methods
 
@@ -60,7 +60,7 @@ def evaluate_collisions(
     methods = parse_methods(paths or [], method or [])
     sources = {name: find_scenes(path) for name, path in methods.items()}
     measured = [
-        measure_method(name, _track(its, name), epsilon_m, cache, count_dropped_scenes(methods[name]))
+        measure_method(name, track_progress(name, its, len(its)), epsilon_m, cache, count_dropped_scenes(methods[name]))
         for name, its in sources.items()
     ]
     if as_json:
@@ -121,6 +121,7 @@ def evaluate_gpt_score(
     Example: `tableverse evaluate gpt-score --method ours=out --method midi=midi/ --reference pictures --out score
     --rounds 2 --set curate.judge=gemini --set curate.model=gemini-2.5-pro --set curate.key_env=GEMINI_API_KEY`
     """
+    from tableverse_factory.cli.progress_bar import track_progress
     from tableverse_factory.core.config import load_config
     from tableverse_factory.evaluation.methods.comparison import check_shared_scenes, match_methods
     from tableverse_factory.evaluation.methods.grid_judges import make_grid_judge
@@ -137,7 +138,7 @@ def evaluate_gpt_score(
         return
     settings = load_config(config, overrides or [])
     judge = make_grid_judge(settings.curate, Services(get_cache_dir(), settings.asking))
-    votes = ask_all(comparison, judge, rounds, seed, out, lambda asked: _track(asked, "judge"))
+    votes = ask_all(comparison, judge, rounds, seed, out, lambda asked: track_progress("judge", asked, len(asked)))
     _report_score(votes, seed, out, as_json)
     if votes.refused or not votes.votes:
         raise typer.Exit(1)
@@ -255,16 +256,6 @@ def evaluate_tables(
             print(path.read_text())
     if not tables.complete:
         raise typer.Exit(1)
-
-
-def _track(items: Sequence[T], name: str) -> Iterator[T]:
-    """Yield the items with a progress bar on stderr."""
-    from tableverse_factory.cli.progress_bar import count_progress
-
-    with count_progress(sanitize_line(name, 300), len(items)) as done:
-        for item in items:
-            yield item
-            done()
 
 
 def _print_first(lines: Iterable[str]) -> None:

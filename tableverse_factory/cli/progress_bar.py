@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
+from tableverse_factory.core.text import sanitize_line
 from workers.progress.console import choose_log_interval_s
 
 if TYPE_CHECKING:
@@ -18,8 +19,8 @@ class ProgressCounter:
     """Counter of finished items."""
 
     def __init__(self, what: str, total: int | None, bar: "Progress | None") -> None:
-        self._what, self._total, self._bar, self._done = what, total, bar, 0
-        self._task = None if bar is None else bar.add_task(what, total=total)
+        self._what, self._total, self._bar, self._done = sanitize_line(what, 300), total, bar, 0
+        self._task = None if bar is None else bar.add_task(self._what, total=total)
         self._started = self._shown = time.monotonic()
         self._shown_done = 0
 
@@ -68,7 +69,7 @@ def count_progress(what: str, total: int | None = None) -> Iterator[ProgressCoun
 
 
 def track_progress(what: str, items: Iterable[T], total: int) -> Iterator[T]:
-    """Yield the items, `total` of them, and show how many there were; `what` names them in the plural."""
+    """Yield the items, `total` of them, and show how many are finished: one is when the next is asked for."""
     with count_progress(what, total) as done:
         for item in items:
             yield item

@@ -227,10 +227,10 @@ def sync_folder(folder: Path) -> None:
 
 def make_missing_build_error(path: StoragePath) -> BuildError:
     """Make the error for a missing file that every build has."""
-    folder = path.parent
+    folder, shown = path.parent, sanitize_line(str(path.parent))
     if isinstance(folder, Path) and not folder.exists():
-        return BuildError(f"{sanitize_line(str(folder))}: there is no such folder; give the OUT of `tableverse build`")
-    return BuildError(f"{folder} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
+        return BuildError(f"{shown}: there is no such folder; give the OUT of `tableverse build`")
+    return BuildError(f"{shown} holds no build: {path.name} is missing; give the OUT of `tableverse build`")
 
 
 def make_write_error(path: StoragePath, error: OSError) -> BuildError:

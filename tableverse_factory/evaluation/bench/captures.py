@@ -1,9 +1,10 @@
 """Captures of a benchmark: one folder that has the files it needs, or a folder of such folders."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from schemas.identity import SAFE_ID, content_hash
+from schemas.identity import check_id, content_hash
 
 
 def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
@@ -20,8 +21,10 @@ def list_captures_lacking(folder: Path, needed: Iterable[str], missing: Iterable
 
 def make_scene_id(capture: Path) -> str:
     """Make the id of a capture's scene: the folder's name, or a hash of it where that cannot be an id."""
-    name = capture.name
-    return name if SAFE_ID.fullmatch(name) and ".." not in name else content_hash(name.encode())[:12]
+    try:
+        return check_id(capture.name)
+    except ValueError:
+        return content_hash(os.fsencode(capture.name))[:12]
 
 
 def find_file(capture: Path, names: Iterable[str]) -> Path | None:

@@ -63,7 +63,7 @@ def segment_prediction(found: PicturePrediction, shape: tuple[int, int]) -> IdIm
 def label_standing_parts(found: PicturePrediction) -> PicturePrediction:
     """Label as objects the parts of a bare picture that stand on the table, though the net has labelled them otherwise.
 
-    The net leaves out parts of objects and small ones far away. Such a part rises over the table and is surrounded by
+    The net leaves out parts of objects, and objects far away. Such a part rises over the table and is surrounded by
     table for the most part, and elsewhere by objects or a depth discontinuity: walls, furniture and arms continue. It
     votes for its own middle.
     """
@@ -91,6 +91,7 @@ def label_standing_parts(found: PicturePrediction) -> PicturePrediction:
 
 
 def _ends_all_around(mask: Mask, depth: DepthImage, kind: IdImage, rises: Mask) -> bool:
+    """Whether table surrounds a part for the most part, and it continues nowhere in what else rises at its depth."""
     around = ndimage.binary_dilation(mask, iterations=ACROSS_PX) & ~mask
     nearest = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     continued = rises & (depth <= DEPTH_STEP * depth[tuple(nearest)])
