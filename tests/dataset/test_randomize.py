@@ -196,6 +196,24 @@ def test_somebody_elses_xml_is_refused_in_words(xml, words):
             Scene("scene", {}, {"scene.xml": xml}).model(**look)
 
 
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        ('<camera name="observation" pos="0 0"/>', "pos='0 0' of <camera>: 3 finite numbers"),
+        ('<camera name="observation" quat="1 0 0"/>', "quat='1 0 0' of <camera>: 4 finite numbers"),
+        ('<camera name="observation" quat="0 0 0 0"/>', "no rotation"),
+        ('<camera name="observation" fovy="1 2"/>', "fovy='1 2'"),
+        ('<light diffuse="1 1"/>', "diffuse='1 1' of <light>"),
+        ('<light pos="0 1"/>', "pos='0 1' of <light>"),
+    ],
+)
+def test_cameras_and_lights_of_too_few_numbers_are_refused_in_words(extra, words):
+    xml = (BOX % b"1 1 0.01").replace(b"<worldbody>", b"<worldbody>" + extra.encode())
+    with pytest.raises(InputError, match=words) as caught:
+        Scene("scene", {}, {"scene.xml": xml}).model(lights=1, camera=1)
+    assert caught.value.reason == "bad_mjcf"
+
+
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-7"])
 def test_entities_hide_in_no_encoding(encoding):
     bomb = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE m [<!ENTITY a "{"x" * 1000}">]>'

@@ -12,7 +12,7 @@ from tableverse_factory.geometry.mesh.height_maps import measure_inscribed_width
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.geometry.relations.containers import make_hollow_vessel
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import TABLE, make_scene_body, make_scene_spec
+from tableverse_factory.physics.mjcf.spec import TABLE, make_scene_body, make_simulation_spec
 from tableverse_factory.physics.simulate.at_rest import simulate_to_rest
 
 PROBE_SHARE = 0.2
@@ -46,9 +46,7 @@ def holds_probe(mesh: TriangleMesh, hulls: Sequence[TriangleMesh], pose: Pose, s
         raise GeometryError("the mesh has no cavity that opens upwards as it stands")
     deepest = _deepest_cell(cavity.cells, heights.top)
     radius = min(PROBE_SHARE * measure_inscribed_width(cavity.cells, heights.cell) / 2, MAX_PROBE_RADIUS_M)
-    spec, _ = make_scene_spec(
-        [container], Slab(np.zeros(2), np.ones(2), 0.0, (0, 0, 0)), timestep_s=PROBE_TIMESTEP_S, visuals=False
-    )
+    spec = make_simulation_spec([container], Slab(np.zeros(2), np.ones(2), 0.0, (0, 0, 0)), PROBE_TIMESTEP_S)
     spec.delete(spec.body(TABLE))
     spec.delete(spec.joint(container.object_id))
     start = np.array([*((deepest + heights.corner + 0.5) * heights.cell), cavity.rim_z + 1.5 * radius])

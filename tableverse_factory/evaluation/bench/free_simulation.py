@@ -14,7 +14,7 @@ from schemas.geometry import ConvexPieces, Frozen, Pose
 from schemas.objects import PlacedObjects
 from schemas.scene import RectifiedLayout
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_spec
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_simulation_spec
 from tableverse_factory.physics.simulate.at_rest import Drift, find_free_bodies, make_quiet_data, measure_drift
 from tableverse_factory.physics.simulate.certificate import DRIFT_LIMIT_M, DRIFT_LIMIT_RAD, DRIFT_TIME_S
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, find_fallen, move_bodies
@@ -45,7 +45,7 @@ class ReleasedScene(Frozen):
 
     def model(self, timestep_s: float) -> mujoco.MjModel:
         """Compile the scene without visual geometry."""
-        return make_scene_spec(self.bodies, self.slab, timestep_s=timestep_s, visuals=False)[0].compile()
+        return make_simulation_spec(self.bodies, self.slab, timestep_s).compile()
 
 
 def make_scene(item: PlacedObjects, pieces: Sequence[ConvexPieces], poses: Sequence[Pose]) -> ReleasedScene:

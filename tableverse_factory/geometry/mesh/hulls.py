@@ -8,6 +8,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Points, TriangleMesh
+from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.mesh.manifold_threads import limit_manifold_threads
 
 limit_manifold_threads()
@@ -112,11 +113,11 @@ def _expand_hull(hull: TriangleMesh, points: Points) -> TriangleMesh:
 
 
 def make_hull_mesh(points: Points) -> TriangleMesh:
-    """Make the convex hull as triangles, counter-clockwise seen from outside; flat points are a `ValueError`."""
+    """Make the convex hull as triangles, counter-clockwise seen from outside; flat points are a `GeometryError`."""
     try:
         return TriangleMesh(*orient_faces_outward(ConvexHull(points)))
     except QhullError as error:
-        raise ValueError(f"{len(points)} points span no volume") from error
+        raise GeometryError(f"{len(points)} points span no volume") from error
 
 
 def orient_faces_outward(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +143,7 @@ def _find_simplex(points: Points) -> list[int]:
     heights = np.abs((points - points[a]) @ np.cross(points[b] - points[a], points[c] - points[a]))
     d = int(np.argmax(heights))
     if heights[d] <= 0.0:
-        raise ValueError(f"{len(points)} points span no volume")
+        raise GeometryError(f"{len(points)} points span no volume")
     return [a, b, c, d]
 
 

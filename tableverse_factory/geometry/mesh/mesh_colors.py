@@ -1,6 +1,7 @@
 """Merge the meshes of a file with their colours: textures, plain materials, or vertex colours."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,11 +10,13 @@ from jaxtyping import Float64
 from PIL import Image
 
 from schemas.geometry import Colors, Matrix4, Picture, Points, Texture, TriangleMesh
+from schemas.identity import content_hash
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.core.storage.untrusted import IMAGE_FORMATS
 
 MAX_SIDE = 2048  # larger pictures are reduced
 MAX_SHEET = 4096  # side of the atlas that holds the pictures of several materials
+MOST_PICTURES = 4  # pixels of all pictures of a mesh, as a multiple of the most that one may have
 DEFAULT_COLOR = (178, 178, 184)  # sRGB of uncoloured parts beside coloured ones
 
 
@@ -56,37 +59,47 @@ def merge_parts(parts: Sequence[MaterialPart], max_pixels: int) -> TriangleMesh:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     vertices = np.concatenate([part.vertices() for part in parts])
     faces = np.concatenate([part.faces() + start for part, start in zip(parts, starts, strict=True)])
-    paints = [_read_paint(mesh, max_pixels) for mesh in meshes]
+    paints = _read_paints(meshes, max_pixels)
     if any(paint is not None and paint.uv is not None for paint in paints):
         vertices, index = _weld_vertices(vertices)
         return TriangleMesh(vertices, index[faces].astype(np.int32), None, _merge_textures(parts, paints))
     return TriangleMesh(vertices, faces.astype(np.int32), _merge_vertex_colors(meshes, paints))
 
 
-def _read_paint(mesh: trimesh.Trimesh, max_pixels: int) -> _Paint | None:
+def _read_paints(meshes: Sequence[trimesh.Trimesh], max_pixels: int) -> list[_Paint | None]:
+    """Read the materials; their pictures are reduced to fit into the atlas together."""
+    images = {id(image): image for mesh in meshes if (image := _get_picture(mesh)) is not None}
+    pixels = [math.prod(image.size) for image in images.values()]
+    for some, count, most in (("a texture", max(pixels, default=0), 1), ("all textures", sum(pixels), MOST_PICTURES)):
+        if count > most * max_pixels:
+            raise GeometryError(f"{some} of {count} pixels; at most {most * max_pixels} are decoded")
+    side = min(MAX_SIDE, MAX_SHEET // max(1, math.ceil(math.sqrt(len(images)))))
+    pictures = {key: _shrink(image.convert("RGB"), side) for key, image in images.items()}
+    return [_read_paint(mesh, pictures) for mesh in meshes]
+
+
+def _get_picture(mesh: trimesh.Trimesh) -> Image.Image | None:
+    """Get the picture of a mesh with uv coordinates; trimesh supplies one of its own, without a format, elsewhere."""
+    material, uv = getattr(mesh.visual, "material", None), getattr(mesh.visual, "uv", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    has_uv = uv is not None and len(uv) == len(mesh.vertices)
+    is_picture = isinstance(image, Image.Image) and image.format in IMAGE_FORMATS and 0 not in image.size
+    return image if is_picture and has_uv else None
+
+
+def _read_paint(mesh: trimesh.Trimesh, pictures: Mapping[int, Picture]) -> _Paint | None:
     """Read a material, if there is one; an OBJ's plain colour does not tint its picture."""
     if mesh.visual.kind != "texture":
         return None
-    material, uv = mesh.visual.material, mesh.visual.uv
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    material, picture = mesh.visual.material, pictures.get(id(_get_picture(mesh)))
     linear, plain = getattr(material, "baseColorFactor", None), getattr(material, "kwargs", {}).get("kd")
-    # trimesh supplies a picture of its own, without a format, where there is none
-    has_uv = uv is not None and len(uv) == len(mesh.vertices)
-    if isinstance(image, Image.Image) and image.format in IMAGE_FORMATS and has_uv:
-        picture = _apply_tint(_decode_picture(image, max_pixels), linear)
-        return _Paint(picture, np.nan_to_num(np.asarray(uv, dtype=np.float64)))
+    if picture is not None:
+        return _Paint(_apply_tint(picture, linear), np.nan_to_num(np.asarray(mesh.visual.uv, dtype=np.float64)))
     if linear is not None:
         return _Paint(_apply_tint(np.full((1, 1, 3), 255, dtype=np.uint8), linear), None)
     if plain is not None and len(plain) >= 3:
         return _Paint(_round_to_bytes(255.0 * np.asarray(plain[:3], dtype=np.float64)).reshape(1, 1, 3), None)
     return None
-
-
-def _decode_picture(image: Image.Image, max_pixels: int) -> Picture:
-    width, height = image.size
-    if not 0 < width * height <= max_pixels:
-        raise GeometryError(f"a texture of {width} x {height} pixels; at most {max_pixels} are decoded")
-    return _shrink(image.convert("RGB"), MAX_SIDE)
 
 
 def _apply_tint(picture: Picture, factor: np.ndarray | None) -> Picture:
@@ -119,7 +132,7 @@ def _make_vertex_colors(mesh: trimesh.Trimesh, paint: _Paint | None) -> Colors:
 
 
 def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | None]) -> Texture:
-    """Stack all pictures into an atlas and map each part's uv coordinates to its own.
+    """Arrange all pictures in an atlas and map each part's uv coordinates to its own.
 
     Coordinates that wrap around are brought back face by face; a face over several repetitions shows one.
     """
@@ -129,23 +142,37 @@ def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | Non
         else paint.picture
         for part, paint in zip(parts, paints, strict=True)
     ]
-    keys = [(picture.shape, picture.tobytes()) for picture in pictures]
+    keys = [content_hash(repr(picture.shape).encode(), picture.tobytes()) for picture in pictures]
     unique = dict(zip(keys, pictures, strict=True))
-    rows = dict(zip(unique, np.cumsum([0, *(p.shape[0] for p in unique.values())])[:-1].tolist(), strict=True))
-    sheet_size = np.array([max(p.shape[1] for p in unique.values()), sum(p.shape[0] for p in unique.values())])
+    places, sheet_size = _arrange_pictures(unique)
     sheet = np.zeros((sheet_size[1], sheet_size[0], 3), dtype=np.uint8)
     corners = []
     for part, paint, picture, key in zip(parts, paints, pictures, keys, strict=True):
-        height, width = picture.shape[:2]
-        sheet[rows[key] : rows[key] + height, :width] = picture
+        (height, width), (left, top) = picture.shape[:2], places[key]
+        sheet[top : top + height, left : left + width] = picture
         uv = _wrap_corner_uv(part, paint)
         if len(unique) > 1:  # to the centres of the outer pixels, so that no neighbour bleeds in
-            pixel = 0.5 + np.stack([uv[..., 0] * (width - 1), rows[key] + (1.0 - uv[..., 1]) * (height - 1)], axis=-1)
+            across, down = left + uv[..., 0] * (width - 1), top + (1.0 - uv[..., 1]) * (height - 1)
+            pixel = 0.5 + np.stack([across, down], axis=-1)
             uv = np.array([0.0, 1.0]) + pixel / sheet_size * np.array([1.0, -1.0])
         corners.append(uv)
     if max(sheet.shape[:2]) > MAX_SHEET:
         sheet = _shrink(Image.fromarray(sheet), MAX_SHEET)
     return Texture(sheet, np.concatenate(corners))
+
+
+def _arrange_pictures(pictures: Mapping[str, Picture]) -> tuple[dict[str, tuple[int, int]], np.ndarray]:
+    """Arrange pictures in rows, the highest first; returns the left upper pixel of each, and width and height."""
+    sizes = {key: picture.shape[:2] for key, picture in pictures.items()}
+    area = sum(height * width for height, width in sizes.values())
+    across = max(math.isqrt(area), *(width for _, width in sizes.values()))
+    places, left, top, bottom = {}, 0, 0, 0
+    for key, (height, width) in sorted(sizes.items(), key=lambda each: (-each[1][0], -each[1][1])):
+        if left + width > across:
+            left, top = 0, bottom
+        places[key] = left, top
+        left, bottom = left + width, max(bottom, top + height)
+    return places, np.array([across, bottom])
 
 
 def _wrap_corner_uv(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Matrix3, Points, TriangleMesh, Vector3
-from tableverse_factory.geometry.math.transforms import cross_matrix
+from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector, rotation_matrix
 from tableverse_factory.geometry.mesh.surface_samples import sample_surface
 
 SAMPLES = 3000
@@ -113,7 +113,7 @@ def run_icp(
         change = np.linalg.solve(weighted.T @ step.rows + step.prior, weighted.T @ step.gaps + step.pull)
         size = fit.size * np.exp(np.clip(change[6:], -0.1, 0.1))
         fit = Fit(
-            fit.rotation @ rotation_from_vector(np.clip(change[:3], -0.2, 0.2)),
+            fit.rotation @ rotation_matrix(quaternion_from_rotation_vector(np.clip(change[:3], -0.2, 0.2))),
             np.clip(size, SIZE_RANGE[0] * start.size, SIZE_RANGE[1] * start.size),
             fit.shift + fit.rotation @ change[3:6],
         )
@@ -209,12 +209,3 @@ def _number_cells(points: Points) -> Int64[np.ndarray, " n"]:
     cell = max(float(np.ptp(points, axis=0).max()) / CELLS, 1e-9)
     _, which = np.unique(np.floor((points - low) / cell).astype(np.int64), axis=0, return_inverse=True)
     return which.ravel()
-
-
-def rotation_from_vector(vector: Vector3) -> Matrix3:
-    """Rotation about a vector by its length [rad] (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    k = cross_matrix(vector / angle)
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)

@@ -115,7 +115,7 @@ def _make_thick_piece(piece: TriangleMesh) -> TriangleMesh | None:
     if not _is_convex(piece):
         try:
             piece = make_hull_mesh(piece.vertices)
-        except ValueError:
+        except GeometryError:
             return None
     return None if 2 * compute_signed_volume(piece) < MIN_PIECE_THICKNESS_M * compute_surface_area(piece) else piece
 

@@ -165,25 +165,15 @@ def compute_irradiance(normal: Vector3, to_eye: Vector3) -> float:
     return LIGHT * (1.0 + max(float(normal @ to_eye), 0.0) + max(float(normal @ to_light), 0.0))
 
 
-def make_scene_spec(
-    bodies: Sequence[SceneBody],
-    slab: Slab,
-    *,
-    model_name: str = "scene",
-    timestep_s: float = 0.002,
-    visuals: bool = True,
-) -> tuple[mujoco.MjSpec, dict[str, bytes]]:
-    """Make the scene as an MjSpec, and its asset files by their path beside the XML.
-
-    Without `visuals` the model simulates the same and compiles faster.
-    """
-    spec, assets = _make_spec(bodies, slab, model_name, timestep_s, visuals)
+def make_simulation_spec(bodies: Sequence[SceneBody], slab: Slab, timestep_s: float = 0.002) -> mujoco.MjSpec:
+    """Make the scene without its looks: it simulates the same and compiles faster."""
+    spec, assets = _make_spec(bodies, slab, "scene", timestep_s, visuals=False)
     spec.assets = assets
-    return spec, assets
+    return spec
 
 
 def _make_spec(
-    bodies: Sequence[SceneBody], slab: Slab, model_name: str, timestep_s: float, visuals: bool
+    bodies: Sequence[SceneBody], slab: Slab, model_name: str, timestep_s: float, *, visuals: bool
 ) -> tuple[mujoco.MjSpec, dict[str, bytes]]:
     """Make the spec, and its files, which it has not got yet."""
     spec = mujoco.MjSpec()

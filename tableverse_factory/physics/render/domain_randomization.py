@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
@@ -59,7 +60,7 @@ def randomize_appearance(
 
 def _cover_table(root: ET.Element, tile_m: float) -> None:
     _, geom = _find_table(root)
-    half = _numbers(geom.get("size", ""))
+    half = _read_numbers(geom, "size", 3)
     asset = find_or_add_child(root, "asset")
     for element in [e for e in asset if e.tag in ("texture", "material") and e.get("name") == TABLE]:
         asset.remove(element)
@@ -77,21 +78,21 @@ def _relight(root: ET.Element, rng: np.random.Generator) -> None:
     head = find_or_add_child(find_or_add_child(root, "visual"), "headlight")
     for key, default in (("ambient", 0.1), ("diffuse", 0.4)):
         strength = rng.uniform(*LIGHT_STRENGTH)
-        head.set(key, _text(strength * np.array(_numbers(head.get(key, "")) or [default] * 3)))
+        head.set(key, _text(strength * _read_numbers(head, key, 3, [default] * 3)))
     world = find_or_add_child(root, "worldbody")
     lamps = list(world.iter("light")) or [ET.SubElement(world, "light", pos="0 0 2", dir="0 0 -1")]
     for lamp in lamps:
         strength, warmth = rng.uniform(*LIGHT_STRENGTH), rng.uniform(-LIGHT_WARMTH, LIGHT_WARMTH)
         tint = strength * np.array([1 + warmth, 1.0, 1 - warmth])
-        lamp.set("diffuse", _text(tint * np.array(_numbers(lamp.get("diffuse", "")) or [0.7] * 3)))
+        lamp.set("diffuse", _text(tint * _read_numbers(lamp, "diffuse", 3, [0.7] * 3)))
         _turn_lamp(lamp, rng.uniform(0.0, 2 * np.pi), rng.uniform(*LIGHT_ELEVATION_RAD))
 
 
 def _turn_lamp(lamp: ET.Element, azimuth: float, elevation: float) -> None:
     """Turn a light about its target, at the same distance."""
-    place = np.array(_numbers(lamp.get("pos", "")) or [0.0, 0.0, 0.0])
-    direction = np.array(_numbers(lamp.get("dir", "")) or [0.0, 0.0, -1.0])
-    if len(place) != 3 or len(direction) != 3 or place[2] <= 0.0 or direction[2] >= 0.0:
+    place = _read_numbers(lamp, "pos", 3, [0.0, 0.0, 0.0])
+    direction = _read_numbers(lamp, "dir", 3, [0.0, 0.0, -1.0])
+    if place[2] <= 0.0 or direction[2] >= 0.0:
         return  # it does not shine down on the table: only its colour changes
     target = place + direction * (place[2] / -direction[2])
     distance = np.linalg.norm(place - target)
@@ -109,21 +110,23 @@ def _move_camera(root: ET.Element, rng: np.random.Generator) -> None:
         return
     shift, turn = rng.uniform(-CAMERA_SHIFT_M, CAMERA_SHIFT_M, 3), rng.uniform(-CAMERA_TURN_RAD, CAMERA_TURN_RAD, 3)
     zoom = 1 + rng.uniform(-CAMERA_ZOOM, CAMERA_ZOOM)
-    eye.set("pos", _text(np.array(_numbers(eye.get("pos", "")) or [0.0] * 3) + shift))
+    eye.set("pos", _text(_read_numbers(eye, "pos", 3, [0.0] * 3) + shift))
     if not any(name in eye.attrib for name in _OTHER_ORIENTATIONS):
-        before = np.array(_numbers(eye.get("quat", "")) or [1.0, 0.0, 0.0, 0.0])
+        before = _read_numbers(eye, "quat", 4, [1.0, 0.0, 0.0, 0.0])
+        if not before.any():
+            raise InputError(f"scene.xml: quat {eye.get('quat')!r} of a camera is no rotation", "bad_mjcf")
         small = normalize_quaternion(np.array([1.0, *(turn / 2)]))
         eye.set("quat", _text(multiply_quaternions(normalize_quaternion(before), small)))
-    for angle_or_focal, factor in (("fovy", zoom), ("focalpixel", 1 / zoom)):
-        if angle_or_focal in eye.attrib:
-            eye.set(angle_or_focal, _text(factor * np.array(_numbers(eye.get(angle_or_focal, "")))))
+    for key, count, factor in (("fovy", 1, zoom), ("focalpixel", 2, 1 / zoom)):
+        if key in eye.attrib:
+            eye.set(key, _text(factor * _read_numbers(eye, key, count)))
 
 
 def _add_camera(root: ET.Element, world: ET.Element, rng: np.random.Generator) -> None:
     """Add a camera in front, raised, with the whole table in view."""
     body, geom = _find_table(root)
-    center = np.array(_numbers(body.get("pos", "")) or [0.0] * 3)
-    half_x, half_y, _ = _numbers(geom.get("size", ""))
+    center = _read_numbers(body, "pos", 3, [0.0] * 3)
+    half_x, half_y, _ = _read_numbers(geom, "size", 3)
     distance = 2.2 * float(np.hypot(half_x, half_y))
     azimuth, elevation = rng.uniform(-0.4, 0.4), rng.uniform(0.6, 1.0)
     right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -135,18 +138,23 @@ def _add_camera(root: ET.Element, world: ET.Element, rng: np.random.Generator) -
 def _find_table(root: ET.Element) -> tuple[ET.Element, ET.Element]:
     for body in root.iter("body"):
         geom = next((g for g in body.findall("geom") if g.get("type") == "box"), None)
-        if body.get("name") == TABLE and geom is not None and len(_numbers(geom.get("size", ""))) == 3:
+        if body.get("name") == TABLE and geom is not None:
             return body, geom
     raise InputError(f"scene.xml has no body {TABLE!r} with a box: there is no table to change", "bad_mjcf")
 
 
-def _numbers(text: str) -> list[float]:
+def _read_numbers(
+    element: ET.Element, key: str, count: int, default: Sequence[float] = ()
+) -> Float64[np.ndarray, " n"]:
+    """Read the `count` numbers of an attribute, or the default where it is missing or empty."""
+    text = element.get(key, "")
     try:
-        values = [float(word) for word in text.split()]
+        values = np.array([float(word) for word in text.split()] or default, dtype=np.float64)
     except ValueError:
-        raise InputError(f"scene.xml: {text[:60]!r} are no numbers", "bad_mjcf") from None
-    if not np.isfinite(values).all():
-        raise InputError(f"scene.xml: {text[:60]!r} are not all finite", "bad_mjcf")
+        values = np.full(0, np.nan)
+    if len(values) != count or not np.isfinite(values).all():
+        why = f"scene.xml: {key}={text[:60]!r} of <{element.tag}>: {count} finite numbers are wanted"
+        raise InputError(why, "bad_mjcf")
     return values
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from schemas.geometry import Camera, IdImage, Picture, Points, Pose
-from tableverse_factory.geometry.math.camera import PosedCamera
+from tableverse_factory.geometry.math.camera import PosedCamera, rescale_camera
 from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.physics.mjcf.scenery import Scenery
 from tableverse_factory.physics.render.preview import PreviewRenderer
@@ -64,10 +64,7 @@ def make_top_camera(scenery: Scenery, width: int, height: int) -> PosedCamera:
 
 def resize_camera(camera: Camera, width: int) -> Camera:
     """Scale a camera to a picture `width` pixels wide."""
-    share = width / camera.width
-    height = max(1, round(camera.height * share))
-    cx, cy = (camera.cx + 0.5) * share - 0.5, (camera.cy + 0.5) * share - 0.5
-    return Camera(camera.fx * share, camera.fy * share, cx, cy, width, height)
+    return rescale_camera(camera, width, max(1, round(camera.height * width / camera.width)))
 
 
 def draw_judge_sheet(scenery: Scenery, labels: Sequence[str], side: int = SHEET_SIDE) -> Picture:

@@ -151,8 +151,12 @@ def set_poses(model: mujoco.MjModel, data: mujoco.MjData, bodies: Sequence[int],
 
 
 def make_quiet_data(model: mujoco.MjModel) -> mujoco.MjData:
-    """Make simulation data without MuJoCo's log file in the current folder; warnings are read from the data."""
-    mujoco.set_mju_user_warning(lambda _: None)
+    """Make simulation data without MuJoCo's log file in the current folder; warnings are read from the data.
+
+    A handler of warnings that the process has set stays.
+    """
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(lambda _: None)
     return mujoco.MjData(model)
 
 

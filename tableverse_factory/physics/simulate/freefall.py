@@ -11,7 +11,7 @@ import numpy as np
 
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import TABLE, SceneBody, make_scene_spec
+from tableverse_factory.physics.mjcf.spec import TABLE, SceneBody, make_simulation_spec
 from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 
 # Of contents that are shaken down: at the friction of everyday surfaces they bridge the void below.
@@ -41,7 +41,7 @@ def simulate_fall(
     """
     if slippery:
         fixed, falling = [_make_slippery(body) for body in fixed], [_make_slippery(body) for body in falling]
-    spec, _ = make_scene_spec([*fixed, *falling], _EMPTY_SLAB, timestep_s=timestep_s, visuals=False)
+    spec = make_simulation_spec([*fixed, *falling], _EMPTY_SLAB, timestep_s)
     spec.delete(spec.body(TABLE))
     for body in fixed:
         spec.delete(spec.joint(body.object_id))

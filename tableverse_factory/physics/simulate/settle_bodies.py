@@ -9,7 +9,7 @@ from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_spec, quantize_pose
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_simulation_spec, quantize_pose
 from tableverse_factory.physics.simulate.at_rest import Rest, simulate_to_rest
 
 # For a body that rocks forever on the rounded edge of a piece, kicked by contacts that jump between its ends. It is
@@ -57,6 +57,6 @@ def simulate_bodies(
     bodies: Sequence[SceneBody], slab: Slab, timestep_s: float, max_time_s: float, gentle: bool
 ) -> tuple[tuple[SceneBody, ...], Rest]:
     """Simulate once, until `max_time_s` is up; returns the bodies where they ended."""
-    spec, _ = make_scene_spec(bodies, slab, timestep_s=timestep_s, visuals=False)
+    spec = make_simulation_spec(bodies, slab, timestep_s)
     rest = simulate_to_rest(spec.compile(), max_time_s, gentle)
     return move_bodies(bodies, rest.poses), rest

@@ -22,7 +22,7 @@ from tableverse_factory.geometry.math.transforms import (
     translate_pose,
 )
 from tableverse_factory.physics.mjcf.slab import Slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_spec
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_simulation_spec
 from tableverse_factory.physics.simulate.at_rest import GENTLE_RATE, Rest, make_quiet_data
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest, find_fallen, simulate_bodies
 
@@ -106,7 +106,7 @@ def _put_down(
 
 def _freeze(bodies: Sequence[SceneBody], slab: Slab, timestep_s: float) -> mujoco.MjModel:
     """Compile a scene in which the first body is free and the others stand still."""
-    spec, _ = make_scene_spec(bodies, slab, timestep_s=timestep_s, visuals=False)
+    spec = make_simulation_spec(bodies, slab, timestep_s)
     for body in bodies[1:]:
         spec.delete(spec.joint(body.object_id))
     return spec.compile()

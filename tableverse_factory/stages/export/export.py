@@ -147,7 +147,8 @@ def _settle_and_certify(
         )
         model = files.model()
         certificate, measured = certify(model, history, config.export.epsilon_m)
-        if not settles or certificate.at_rest or certificate.fell or measured.warnings:
+        last = attempt == SETTLINGS - 1
+        if last or not settles or certificate.at_rest or certificate.fell or measured.warnings:
             break
         bodies, rests = increase_rolling_friction(move_bodies(bodies, measured.end_poses), set(measured.moved)), False
     return _CertifiedFiles(tuple(bodies), files, certificate, measured, measure_sizes(model))
@@ -193,7 +194,7 @@ def _assemble(scene: CuratedScene, written: _CertifiedFiles) -> ExportedScene:
         members["observation/masks.png"] = evidence.masks_png
     fidelity = describe_fidelity(scene, written.bodies)
     rows = build_object_rows(scene, written.bodies, written.certificate)
-    members["meta.json"] = build_meta_json(scene, written.bodies, written.certificate, members)
+    members["meta.json"] = build_meta_json(scene, written.bodies, written.certificate, fidelity, members)
     return ExportedScene(
         scene.scene_id,
         tuple(sorted(members.items())),

@@ -14,19 +14,23 @@ from schemas.objects import PlacedObjects
 from schemas.scene import Certificate, CuratedScene
 from tableverse_factory.dataset.scene_meta import FORMAT
 from tableverse_factory.physics.mjcf.spec import TORSIONAL_FRICTION, SceneBody
-from tableverse_factory.stages.export.fidelity import describe_fidelity
+from tableverse_factory.stages.export.fidelity import Fidelity
 from tableverse_factory.stages.export.rows import describe_metric
 
 
 def build_meta_json(
-    scene: CuratedScene, bodies: Sequence[SceneBody], certificate: Certificate, files: Mapping[str, bytes]
+    scene: CuratedScene,
+    bodies: Sequence[SceneBody],
+    certificate: Certificate,
+    fidelity: Fidelity,
+    files: Mapping[str, bytes],
 ) -> bytes:
     """Build the file with sorted keys and shortest exact floats, so that equal scenes give equal bytes.
 
     It keeps the digests of `files`, all other files of the scene.
     """
     placed = scene.settled.rectified.placed
-    evidence, fidelity = placed.evidence, describe_fidelity(scene, bodies)
+    evidence = placed.evidence
     content = {
         "format": FORMAT,
         "scene_id": scene.scene_id,

@@ -188,7 +188,7 @@ def test_few_points_are_their_own_hull() -> None:
 
 
 def test_coplanar_points_span_no_volume() -> None:
-    with pytest.raises(ValueError, match="no volume"):
+    with pytest.raises(GeometryError, match="no volume"):
         make_bounded_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]), 64, 1e-4)
 
 

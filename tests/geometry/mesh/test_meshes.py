@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
@@ -198,3 +199,35 @@ def test_scanned_meshes_are_whole(shared_dir):
         mesh = read_mesh(path.read_bytes(), path.name)
         low, high = aabb(mesh.vertices)
         assert 0.005 < (high - low).max() < 0.6, path.name  # metres: hand-sized things
+
+
+def paint_many(count: int, side: int) -> bytes:
+    """A GLB of `count` squares, each with a picture of its own."""
+    scene = trimesh.Scene()
+    for k in range(count):
+        color = (10 * k, 255 - 10 * k, 40)
+        square = trimesh.Trimesh([[k, 0, 0], [k + 0.9, 0, 0], [k, 0.9, 0]], [[0, 1, 2]], process=False)
+        image = Image.new("RGB", (side, side), color)
+        square.visual = trimesh.visual.TextureVisuals(
+            np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
+            trimesh.visual.material.PBRMaterial(baseColorTexture=image),
+        )
+        scene.add_geometry(square, geom_name=f"square_{k}")
+    return scene.export(file_type="glb")
+
+
+def test_many_pictures_fit_into_one_sheet_and_stay_sharp():
+    mesh = read_mesh(paint_many(20, 512), "many.glb")
+    assert mesh.texture is not None
+    height, width = mesh.texture.picture.shape[:2]
+    assert max(height, width) <= 4096
+    assert height * width >= 20 * 512 * 512  # none was reduced
+    middles = mesh.texture.corner_uv.mean(axis=1)
+    columns, rows = np.int64(middles[:, 0] * width), np.int64((1.0 - middles[:, 1]) * height)
+    own = np.int64(mesh.vertices[mesh.faces][:, :, 0].min(axis=1) + 1e-6)
+    assert np.abs(mesh.texture.picture[rows, columns, 0].astype(int) - 10 * own).max() <= 1
+
+
+def test_pictures_of_too_many_pixels_together_are_refused():
+    with pytest.raises(GeometryError, match="all textures of 5242880 pixels; at most 4800000"):
+        read_mesh(paint_many(20, 512), "many.glb", max_pixels=1_200_000)

@@ -8,7 +8,7 @@ import pytest
 
 from schemas.geometry import Pose, TriangleMesh
 from tableverse_factory.physics.mjcf.slab import fit_slab
-from tableverse_factory.physics.mjcf.spec import make_scene_body, make_scene_spec
+from tableverse_factory.physics.mjcf.spec import make_scene_body, make_simulation_spec
 from tableverse_factory.physics.simulate import at_rest
 from tableverse_factory.physics.simulate.at_rest import SPEED_LIMIT, measure_drift, simulate_to_rest
 from tableverse_factory.physics.simulate.certificate import find_deepest_contact
@@ -27,7 +27,7 @@ def model_of(
         )
         for k, (mesh, at) in enumerate(things)
     ]
-    return make_scene_spec(bodies, SLAB)[0].compile()
+    return make_simulation_spec(bodies, SLAB).compile()
 
 
 def test_free_fall_takes_the_time_and_has_the_energy_of_free_fall() -> None:
@@ -206,3 +206,15 @@ def test_what_falls_past_the_floor_ends_the_simulation() -> None:
     assert rest.time_s < 0.6
     assert not rest.at_rest
     assert rest.moving.tolist() == [True]
+
+
+def test_the_handler_of_warnings_of_a_user_stays() -> None:
+    heard: list[str] = []
+    model = model_of([(CUBE, (0.0, 0.0, 0.025))])
+    model.opt.gravity[:] = [0, 0, -1e12]
+    mujoco.set_mju_user_warning(heard.append)
+    try:
+        mujoco.mj_step(model, at_rest.make_quiet_data(model), nstep=50)
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert heard

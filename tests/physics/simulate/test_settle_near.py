@@ -8,7 +8,7 @@ import pytest
 from schemas.geometry import Pose
 from tableverse_factory.geometry.math.transforms import quaternion_from_rotation_vector
 from tableverse_factory.physics.mjcf.slab import fit_slab
-from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_body, make_scene_spec
+from tableverse_factory.physics.mjcf.spec import SceneBody, make_scene_body, make_simulation_spec
 from tableverse_factory.physics.simulate.certificate import find_deepest_contact
 from tableverse_factory.physics.simulate.settle_bodies import bring_to_rest
 from tableverse_factory.physics.simulate.settle_near import NEAR, STRAY, measure_deviation, settle_near
@@ -41,7 +41,7 @@ def test_what_toppled_stands_where_it_was_seen() -> None:
     assert rest.at_rest
     assert measure_deviation(book, SEEN) < NEAR
     assert measure_deviation(foot, SEEN) < 0.1
-    model = make_scene_spec((foot, book), SLAB)[0].compile()
+    model = make_simulation_spec((foot, book), SLAB).compile()
     assert find_deepest_contact(model, [foot.pose, book.pose])[0] < 1e-4
 
 

@@ -126,14 +126,25 @@ def _is_carried(mask: Mask, ids: IdImage, view: TableView) -> bool:
         return True
     columns = np.flatnonzero(mask.any(axis=0))
     lowest = mask.shape[0] - 1 - np.argmax(mask[::-1, columns], axis=0)
-    below = lowest + BELOW_PX
+    below = _find_next_reading(view.valid, lowest + BELOW_PX, columns)
     at_border = below >= mask.shape[0]
     below = np.minimum(below, mask.shape[0] - 1)
     points, under = view.points_camera[lowest, columns], view.points_camera[below, columns]
     touches = np.linalg.norm(points - under, axis=1) < CONTACT_M
-    seen = view.valid[below, columns] & ((ids[below, columns] > 0) | ~view.raised[below, columns])
+    seen = (ids[below, columns] > 0) | ~view.raised[below, columns]
     carried = at_border | (seen & (touches | view.on_plane[below, columns] | (under[:, 2] < points[:, 2])))
     return float(carried.mean()) >= MIN_CARRIED
+
+
+def _find_next_reading(valid: Mask, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Find the first row from each of `rows` downwards with a reading in its column; the height where there is none.
+
+    Sensors read nothing beside the edges of objects, often over more pixels than a filter looks past.
+    """
+    height = valid.shape[0]
+    own = np.pad(valid[:, columns], ((0, 1), (0, 0)), constant_values=True)
+    from_rows = own & (np.arange(height + 1)[:, None] >= np.minimum(rows, height))
+    return np.argmax(from_rows, axis=0)
 
 
 def _is_ragged_edge(mask: Mask, inner: Mask, view: TableView) -> bool:

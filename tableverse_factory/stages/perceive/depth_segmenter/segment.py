@@ -55,6 +55,8 @@ def segment_boxes_from_depth(view: TableView, found: DetectionResult, _config: C
 
 def assign_regions_to_boxes(regions: IdImage, found: DetectionResult) -> IdImage:
     """Return an image of `k + 1` in the regions of the k-th box, as `segment_boxes_from_depth` assigns them."""
+    if not found.candidates:
+        return np.zeros_like(regions)
     sizes = np.bincount(regions.ravel())
     parts = [_slice_box(candidate.box, regions.shape) for candidate in found.candidates]
     counts = np.array([np.bincount(regions[part].ravel(), minlength=len(sizes)) for part in parts])

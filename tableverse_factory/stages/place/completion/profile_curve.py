@@ -93,10 +93,11 @@ def _find_cavity_cells(votes: RingVotes, least: float) -> Cells | None:
     # Contents hide parts of a cavity: what they hide counts as open if it joins what was seen to be open.
     labels, _ = ndimage.label((empty | votes.hidden) & within)
     at_mouth = labels[:2, max(rim - 3, 0) : rim + 1]
-    mouth = int(at_mouth.max(initial=0))
-    if mouth == 0:
+    open_at_mouth = np.unique(at_mouth[at_mouth > 0])
+    if len(open_at_mouth) == 0:
         return None
-    cavity: Cells = np.asarray(labels == mouth)
+    largest = open_at_mouth[np.argmax(np.bincount(labels.ravel())[open_at_mouth])]
+    cavity: Cells = np.asarray(labels == largest)
     seen_rows = np.flatnonzero((cavity & empty).sum(axis=0) >= 2)
     if votes.cell * len(seen_rows) < least:
         return None

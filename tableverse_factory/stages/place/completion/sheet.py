@@ -81,6 +81,9 @@ def _continue_hidden(view: ObjectView, middle: Points) -> Points:
     between = between[cKDTree(middle[:, :2]).query(between)[0] > BRIDGE_M]
     if len(between) == 0:
         return middle
-    heights = LinearNDInterpolator(middle[:, :2], middle[:, 2])(between)
+    try:
+        heights = LinearNDInterpolator(middle[:, :2], middle[:, 2])(between)
+    except QhullError:  # all of the points on one line
+        return middle
     added = np.column_stack([between, heights])[np.isfinite(heights)]
     return np.concatenate([middle, added[measure_free_space(view, added) > 0.0]])

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float64
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import minimize
+from scipy.spatial import QhullError
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
@@ -36,6 +37,7 @@ from tableverse_factory.stages.place.view.object_view import ObjectView, measure
 
 CELLS_ON_LONGEST_SIDE = 60
 CELL_RANGE_M = (0.0012, 0.006)
+MAX_CELLS = 3_000_000  # of a grid, at most 20 numbers each: furniture that is taken for an object has coarser cells
 MIN_THICKNESS_M = 0.003
 COLUMN_CELLS = 50_000
 CELLS_UP = 30
@@ -98,6 +100,7 @@ def carve_half_turn(view: ObjectView) -> CarvedSurface:
     rectangle = fit_min_rectangle(np.concatenate([view.points[:, :2], turned]))
     pose, half = place_frame(view, rectangle, center)
     cell = float(np.clip((2 * half).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
+    cell = max(cell, float(np.cbrt((2 * half).prod() / MAX_CELLS)))
     grid = make_grid(-half - cell, half + cell, cell)
     local = grid.points()
     turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
@@ -176,6 +179,7 @@ def build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]:
     pixel = float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) / view.camera.fx
     cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
     cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
+    cell = max(cell, float(np.sqrt(size[:2].prod() * CELLS_UP / MAX_CELLS)), float(np.cbrt(size.prod() / MAX_CELLS)))
     stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
     scale = np.array([1.0, 1.0, stretch])
     return make_grid(-half * scale - cell, half * scale + cell, cell), stretch
@@ -228,7 +232,10 @@ def _bridge_gaps(
 ) -> tuple[Bool[np.ndarray, "nx ny"], Float64[np.ndarray, "nx ny"]]:
     """Join separate parts over the hidden columns between them; return the columns and their tops."""
     between = np.argwhere(~closed)
-    heights = LinearNDInterpolator(np.argwhere(closed), top[closed])(between)
+    try:
+        heights = LinearNDInterpolator(np.argwhere(closed), top[closed])(between)
+    except QhullError:  # all columns on one line, as of a pen
+        return closed, top
     spanned = np.isfinite(heights)
     between, heights = between[spanned], heights[spanned]
     level = np.clip(np.searchsorted(z, heights), 0, len(z) - 1)

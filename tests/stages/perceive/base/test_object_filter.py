@@ -80,3 +80,15 @@ def test_a_large_region_is_kept_whatever_the_picture_shows():
     view = find_table(replace(seen, color=np.full(seen.color.shape, CLOTH, np.uint8)), np.random.default_rng(0))
     assert not isinstance(view, Dropped), view
     assert drop_unseen_regions((ids == 2).astype(np.int32), view).max() == 1
+
+
+def test_a_tall_thing_whose_foot_a_sensor_does_not_read_stands_on_the_table():
+    """Stereo loses readings on what is black, and a band beside each edge."""
+    seen, ids = look([Box(0.0, 0.0, (0.1, 0.1, 0.15))], camera_above(0.6, 0.7))
+    view = find_table(seen, np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    foot = (ids == 2) & (view.heights < 0.06)
+    unread = foot | (ndimage.binary_dilation(ids == 2, iterations=8) & (ids != 2))
+    view = find_table(replace(seen, depth=np.where(unread, 0, seen.depth)), np.random.default_rng(0))
+    assert not isinstance(view, Dropped), view
+    assert keep_objects((ids == 2).astype(np.int32), view).max() == 1

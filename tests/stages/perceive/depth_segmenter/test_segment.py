@@ -10,7 +10,8 @@ from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.observe.observe import observe
-from tableverse_factory.stages.perceive.depth_segmenter.segment import fill_holes
+from tableverse_factory.stages.perceive.base.interfaces import DetectionResult
+from tableverse_factory.stages.perceive.depth_segmenter.segment import assign_regions_to_boxes, fill_holes
 from tableverse_factory.stages.perceive.perceive import perceive
 from tests.helpers.tabletop_views import GEOMETRIC, Bowl, Box, best_overlaps, camera_above, look
 
@@ -168,3 +169,8 @@ def test_small_holes_close_only_within_one_object():
     assert (closed[5:8, 5:8] == 1).all()
     assert (closed[20:22, 14:16] == 0).all(), "between two objects"
     assert (closed[10:20, 20:29] == 0).all(), "too large for a lost reading"
+
+
+def test_no_boxes_have_no_regions():
+    regions = np.array([[0, 1], [2, 2]], dtype=np.int32)
+    assert not assign_regions_to_boxes(regions, DetectionResult(())).any()
