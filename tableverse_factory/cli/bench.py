@@ -112,12 +112,12 @@ def bench_decompose(
     Example: `tableverse bench decompose meshes --most 8`
     """
     from tableverse_factory.cli.progress_bar import count_progress
+    from tableverse_factory.evaluation.bench.completion import read_solids
     from tableverse_factory.evaluation.bench.decompose import bench_decompose, check_methods, summarize_pieces
-    from tableverse_factory.evaluation.bench.measurement import read_meshes
 
     names = [name.strip() for name in methods.split(",")]
     check_methods(names)
-    meshes = read_meshes(folder, most)
+    meshes = read_solids(folder, most)
     with count_progress("meshes", len(meshes)) as done:
         scores = bench_decompose(meshes, names, done)
     overall = summarize_pieces(scores, names)

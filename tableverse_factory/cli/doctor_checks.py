@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -100,13 +100,7 @@ def run_checks(cache_dir: Path, out_dir: Path) -> Iterator[Check]:
     yield from _check_libraries()
     yield _check_script("simulator (MuJoCo)", _SIMULATOR, "pip install --force-reinstall mujoco")
     yield _check_script("renderer (Embree, on the CPU)", _RENDERER, "install the system libraries above")
-    yield _check_script(
-        "MuJoCo's own renderer",
-        _GL_RENDERER,
-        "not needed; for pictures by MuJoCo: sudo apt-get install libegl1 libgl1-mesa-dri, and MUJOCO_GL=egl",
-        required=False,
-        environment={"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")},
-    )
+    yield _check_mujoco_renderer()
     yield _check_script("Ray", _RAY, "see the message; `tableverse build --executor local` works without it")
     yield _check_gpu()
     yield from _check_extras()
@@ -137,6 +131,18 @@ def _check_script(
     ok = ended.returncode == 0
     words = (ended.stdout if ok else ended.stderr).strip() or f"exit code {ended.returncode}"
     return Check(name, required, ok, sanitize_line(words.splitlines()[-1]), "" if ok else advice)
+
+
+def _check_mujoco_renderer() -> Check:
+    """Check the renderer as the environment has it, or else, where it names none, with EGL."""
+    name, own = "MuJoCo's own renderer", os.environ.get("MUJOCO_GL")
+    advice = "not needed; for pictures by MuJoCo: sudo apt-get install libegl1 libgl1-mesa-dri, and MUJOCO_GL=egl"
+    check = _check_script(name, _GL_RENDERER, advice, required=False, environment={"MUJOCO_GL": own or "egl"})
+    return (
+        replace(check, found=f"{check.found} with MUJOCO_GL=egl, which is not set here")
+        if check.ok and not own
+        else check
+    )
 
 
 def _check_gpu() -> Check:

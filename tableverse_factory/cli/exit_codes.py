@@ -117,7 +117,10 @@ def _describe_usage_error(error: Any) -> str:
     if parameter is None:
         message = f"{hint}: {message}" if (hint := getattr(error, "param_hint", None)) else message
         return f"{message[:1].lower()}{message[1:]}{shown}"
-    return f"{' / '.join(_list_names(parameter))}: {_format_refused_value(error)}{message}\nsee: {help_of_it}"
+    refused = _format_refused_value(error)
+    if refused.lower().strip("'+- ") == "nan":  # of which it would be wrong to say that it is too large
+        message = "is not a number"
+    return f"{' / '.join(_list_names(parameter))}: {refused}{message}\nsee: {help_of_it}"
 
 
 def _describe_unknown_option(option: str, context: Any) -> str:

@@ -27,8 +27,8 @@ def extract(
         ),
     ] = "",
     where: Annotated[
-        str, typer.Option("--where", "-w", metavar="CONDITION", help="Over scenes/, as of `tableverse query`.")
-    ] = "",
+        str | None, typer.Option("--where", "-w", metavar="CONDITION", help="Over scenes/, as of `tableverse query`.")
+    ] = None,
     file_format: Annotated[
         Literal["mjcf", "glb", "urdf", "usd"], typer.Option("--format", help="What to write.")
     ] = "mjcf",
@@ -56,7 +56,7 @@ def extract(
     from tableverse_factory.delivery.formats.extract_scenes import Appearance, extract_scenes
 
     if scene_id:
-        if where:
+        if where is not None:
             raise typer.BadParameter("--scene is one scene and --where many: give one of them")
         scene = open_dataset(out).scene(scene_id).restyle(texture, lights, camera)
         print(f"{pluralize(len(extract_scene(scene, dest, file_format)), 'file')} in {dest}")

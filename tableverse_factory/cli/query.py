@@ -37,7 +37,7 @@ def query(
     table: Annotated[
         Literal["scenes", "objects", "tasks", "trajectories"], typer.Option("--table", "-t", help="Which table.")
     ] = "scenes",
-    where: Annotated[str, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = "",
+    where: Annotated[str | None, typer.Option("--where", "-w", metavar="CONDITION", help="As above.")] = None,
     columns: Annotated[
         str,
         typer.Option("--columns", "-c", metavar="A,B", autocompletion=complete_columns, help="Names; `all` for all."),
@@ -67,7 +67,7 @@ def query(
     asked = [name.strip() for name in columns.split(",") if name.strip()]
     default = SHOWN_COLUMNS[table] if output == "table" else rows_of.schema.names
     names = rows_of.schema.names if asked == ["all"] else check_columns(asked or default, rows_of.schema)
-    scanner = rows_of.scanner(columns=names, filter=condition(where, rows_of.schema) if where else None)
+    scanner = rows_of.scanner(columns=names, filter=None if where is None else condition(where, rows_of.schema))
     if output == "table":
         _print_table(list(_iter_rows(scanner, SHOWN_ROWS + 1 if limit is None else limit)), names, limit is None)
     elif output == "json":

@@ -84,6 +84,8 @@ class _Parser:
         self._next = 0
 
     def parse(self) -> pc.Expression:
+        if self._token.kind == "end":
+            raise self._make_error("the condition is empty: expected a column or a value", self._token)
         expression = self._parse_expression(0)
         if self._token.kind != "end":
             raise self._make_error(f"expected and, or, or the end; found {self._token.shown}", self._token)

@@ -19,6 +19,7 @@ from tableverse_factory.physics.mjcf.pose_history import PoseHistory
 
 FORMAT = "tableverse-scene-1"
 FARTHEST_M = 1e3
+_LONGEST_NAME = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,33 @@ def read_meta(data: bytes) -> SceneMeta:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"meta.json is not of a scene: {type(error).__name__}: {error}"[:300], "bad_meta") from error
+
+
+def read_object_names(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Read the name of every object by id: the judge's `relabel_name`, else the detector's label; printable."""
+    verdicts = _read_verdicts(meta)
+    ids = {str(item["object_id"]): item for item in meta["objects"]}
+    names = {key: verdicts.get(key, {}).get("relabel_name") or item.get("label") for key, item in ids.items()}
+    return {key: sanitize_line(str(name or ""), _LONGEST_NAME) for key, name in names.items()}
+
+
+def read_object_phrases(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Read a phrase of every object by id: its first distinguishing phrase, else its name after *the*; printable."""
+    verdicts = _read_verdicts(meta)
+    phrases = {key: f"the {name or 'object'}" for key, name in read_object_names(meta).items()}
+    for key in phrases:
+        given = verdicts.get(key, {}).get("distinguishing_phrases")
+        if isinstance(given, list) and given:
+            phrases[key] = sanitize_line(str(given[0]), _LONGEST_NAME)
+    return phrases
+
+
+def _read_verdicts(meta: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Read the judge's verdict on every object by id; none where the scene was not judged."""
+    assessment = meta.get("assessment")
+    rows = assessment.get("objects") if isinstance(assessment, Mapping) else None
+    listed = [row for row in rows if isinstance(row, Mapping)] if isinstance(rows, list) else []
+    return {str(row.get("object_id")): row for row in listed}
 
 
 def read_meta_camera(meta: Mapping[str, Any]) -> PosedCamera | None:

@@ -50,7 +50,7 @@ class ManifestEntry:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """Entries, sorted by uri, each once, and numbers of ignored files and hidden folders by kind."""
+    """Entries, sorted by uri, each once, and numbers of unused files and hidden folders by kind."""
 
     entries: tuple[ManifestEntry, ...]
     ignored: dict[str, int]
@@ -184,11 +184,13 @@ def _classify_folder(folder: _Folder, captures: set[str], ignored: Counter[str])
     parts = map(posixpath.splitext, folder.files)
     pictures = [stem for stem, suffix in parts if suffix.lower() in IMAGE_SUFFIXES]
     recorded = {stem + suffix for stem in pictures for suffix in (DEPTH_SUFFIX, CAMERA_SUFFIX)}
+    kinds = {name: RECORDED if name in recorded else _classify_file(folder.uri, name, in_assets) for name in files}
+    used = _find_used_sources([name for name, kind in kinds.items() if isinstance(kind, SceneKind)], files)
     for name in folder.files:
-        kind = RECORDED if name in recorded else _classify_file(folder.uri, name, in_assets)
+        kind = kinds[name]
         if isinstance(kind, SceneKind):
             yield _make_entry(kind, posixpath.join(folder.uri, name))
-        else:
+        elif name not in used:
             ignored[kind] += 1
 
 
@@ -205,6 +207,17 @@ def _classify_file(folder: str, name: str, in_assets: bool) -> SceneKind | str:
         layout = not sidecar and _looks_like_layout(posixpath.join(folder, name))
         return SceneKind.LAYOUT if layout else "JSON that is no layout"
     return "mesh" if suffix in (*MESH_SUFFIXES, ".mtl") else "other file"
+
+
+def name_source_files(name: str) -> tuple[str, str]:
+    """Name the files that may state source and licence of a file beside them: its own, else that of the folder."""
+    return f"{posixpath.splitext(name)[0]}.source.json", "source.json"
+
+
+def _find_used_sources(entries: Sequence[str], files: set[str]) -> set[str]:
+    """Find the first of its source files of each entry that is there."""
+    named = (next((source for source in name_source_files(name) if source in files), "") for name in entries)
+    return set(named)
 
 
 def is_source_file(name: str) -> bool:

@@ -22,7 +22,7 @@ from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.sources.capture import read_capture
 from tableverse_factory.sources.content_hash import hash_entry
-from tableverse_factory.sources.discovery import ManifestEntry, discover_entries
+from tableverse_factory.sources.discovery import ManifestEntry, discover_entries, name_source_files
 from tableverse_factory.sources.focal import read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
 from tableverse_factory.sources.known_length import REASON, check_pixels, read_known_length
@@ -218,7 +218,7 @@ def _read_provenance(entry: ManifestEntry, origin: Origin) -> tuple[str, str, Kn
     if entry.kind is SceneKind.CAPTURE:
         candidates = [f"{entry.uri}/source.json"]
     else:
-        candidates = [f"{folder}/{name.rpartition('.')[0]}.source.json", f"{folder}/source.json"]
+        candidates = [f"{folder}/{source}" for source in name_source_files(name)]
     uri = next((candidate for candidate in candidates if exists(candidate)), None)
     if uri is None:
         return "", "", None

@@ -67,6 +67,14 @@ def test_query_shows_the_names_that_tasks_use_and_says_where_nothing_is(tablever
     assert "0 rows" not in answer.out
 
 
+@pytest.mark.parametrize("condition", ["", " "])
+def test_an_empty_condition_is_not_taken_for_none(tableverse, out, tmp_path, condition):
+    for command in (("query", out), ("extract", out, tmp_path / "dest")):
+        answer = tableverse(*command, "--where", condition)
+        assert (answer.code, answer.out) == (1, "")
+        assert "the condition is empty" in answer.err
+
+
 @pytest.mark.heavy
 def test_query_takes_no_more_than_asked(tableverse, out, monkeypatch):
     assert len(json.loads(tableverse("query", out, "--limit", "2", "--json").out)) == 2

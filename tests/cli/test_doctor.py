@@ -42,6 +42,18 @@ def test_whatever_crashes_or_hangs_is_a_finding(monkeypatch, code, found):
 
 
 @pytest.mark.heavy
+def test_a_renderer_that_needed_a_setting_says_which(monkeypatch):
+    monkeypatch.setattr(doctor_checks, "_GL_RENDERER", "import os; print('by', os.environ['MUJOCO_GL'])")
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert doctor_checks._check_mujoco_renderer().found == "by osmesa"
+    monkeypatch.delenv("MUJOCO_GL")
+    assert doctor_checks._check_mujoco_renderer().found == "by egl with MUJOCO_GL=egl, which is not set here"
+    monkeypatch.setattr(doctor_checks, "_GL_RENDERER", "raise SystemExit('no driver')")
+    check = doctor_checks._check_mujoco_renderer()
+    assert (check.ok, check.found) == (False, "no driver")
+
+
+@pytest.mark.heavy
 def test_what_works_needs_no_advice():
     assert doctor_checks._check_script("trial", "print('fine')", "do this") == doctor_checks.Check(
         "trial", True, True, "fine", ""

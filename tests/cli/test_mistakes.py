@@ -56,6 +56,8 @@ def home(tmp_path_factory) -> Path:
         ("build images.parquet new --stages trajectories", 1, ["'trajectories'", "+trajectories"]),
         ("build images.parquet new --shards a-b", 1, ["'a-b'", "3-7,9"]),
         ("build images.parquet new --address host", 1, ["host"]),
+        ("bench completion --error-mm nan", 2, ["--error-mm: 'nan' is not a number"]),
+        ("bench completion --error-mm 51", 2, ["--error-mm: '51' should be less than or equal to 50"]),
         ("manifest nowhere --out m.parquet", 1, ["nowhere: no such file or folder"]),
         ("manifest photos --out m.parquet", 1, ["photos", "color.png"]),
         ("manifest  --out m.parquet", 1, ["an empty path"]),

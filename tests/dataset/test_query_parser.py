@@ -159,8 +159,8 @@ def test_conditions_reach_the_files(tmp_path):
 
 
 ERRORS = [
-    ("", 0, "expected a column"),
-    ("   ", 0, "expected a column"),
+    ("", 0, "the condition is empty"),
+    ("   ", 0, "the condition is empty"),
     ("mas < 1", 0, "no column 'mas'"),
     ("i < 'a'", 4, "i holds numbers, not texts"),
     ("'a' < i", 0, "i holds numbers, not texts"),

@@ -7,7 +7,7 @@ import pytest
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.randomize import randomize_files
 from tableverse_factory.dataset.scene import Scene
-from tableverse_factory.dataset.scene_meta import read_meta, read_meta_camera
+from tableverse_factory.dataset.scene_meta import read_meta, read_meta_camera, read_object_names, read_object_phrases
 from tableverse_factory.dataset.splits import get_split
 from tableverse_factory.delivery.episodes.cameras import load_scene_camera
 
@@ -24,6 +24,18 @@ def test_a_deeply_nested_meta_is_refused_in_words():
 def test_a_deeply_nested_meta_does_not_stop_a_restyling():
     with pytest.raises(InputError, match=r"meta\.json"):
         randomize_files({"scene.xml": XML, "meta.json": b"[" * 200_000}, None, None, None)
+
+
+def test_names_are_the_judges_else_the_detectors_whatever_else_is_there():
+    objects = [{"object_id": "a", "label": "object"}, {"object_id": "b", "label": "mug\x1b"}, {"object_id": "c"}]
+    assert list(read_object_names({"objects": objects}).values()) == ["object", "mug\\x1b", ""]
+    for strange in (None, [], {"objects": None}, {"objects": [3, {"relabel_name": "x"}]}):
+        assert read_object_names({"objects": objects, "assessment": strange})["a"] == "object"
+    told = [{"object_id": "a", "relabel_name": "red box", "distinguishing_phrases": ["the largest box"]}]
+    told.append({"object_id": "b", "relabel_name": "cup", "distinguishing_phrases": []})
+    meta = {"objects": objects, "assessment": {"objects": told}}
+    assert read_object_names(meta) == {"a": "red box", "b": "cup", "c": ""}
+    assert read_object_phrases(meta) == {"a": "the largest box", "b": "the cup", "c": "the object"}
 
 
 @pytest.mark.parametrize(

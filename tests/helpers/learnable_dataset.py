@@ -33,14 +33,20 @@ TASKED = (("task_000", "next to", True), ("task_001", "to the right of", True), 
 
 
 def write_learnable_dataset(
-    out: Path, scenes: int = 6, shard_size: int = 2, moved: int = 1, splits: tuple[str, ...] = ()
+    out: Path,
+    scenes: int = 6,
+    shard_size: int = 2,
+    moved: int = 1,
+    splits: tuple[str, ...] = (),
+    names: tuple[str, ...] = (),
 ) -> Path:
     """Scenes `s-0`, `s-1`, … that differ in where a bystander stands; `moved` have a motion for each of two tasks.
 
-    The first ones are of `splits`, where given.
+    The first ones are of `splits`, where given; a judge calls the objects `names`, else as they are labelled.
     """
     exported = [
-        _exported(k, with_motions=k < moved, split=splits[k] if k < len(splits) else None) for k in range(scenes)
+        _exported(k, with_motions=k < moved, split=splits[k] if k < len(splits) else None, names=names)
+        for k in range(scenes)
     ]
     for number in range(0, scenes, shard_size):
         _write_shard(out, number // shard_size, exported[number : number + shard_size])
@@ -48,7 +54,7 @@ def write_learnable_dataset(
     return out
 
 
-def _exported(k: int, with_motions: bool, split: str | None) -> ExportedScene:
+def _exported(k: int, with_motions: bool, split: str | None, names: tuple[str, ...]) -> ExportedScene:
     solids = [
         Solid(box(0.04, 0.04, 0.06), (0.0, 0.0, 0.03), LABELS[0]),
         Solid(box(0.08, 0.08, 0.04), (0.18, 0.1, 0.02), LABELS[1]),
@@ -62,7 +68,7 @@ def _exported(k: int, with_motions: bool, split: str | None) -> ExportedScene:
         )
         for task_id, relation, accepted in TASKED
     )  # fmt: skip
-    made = curated(as_settled(layout(solids, scene_id=f"s-{k}")), 0.1 * (k + 1), tasks)
+    made = curated(as_settled(layout(solids, scene_id=f"s-{k}")), 0.1 * (k + 1), tasks, names)
     outcome = export(made, Config(), np.random.default_rng(0), Services(Path("unused")))
     assert isinstance(outcome, Done)
     value = outcome.value

@@ -69,16 +69,20 @@ def as_settled(rectified: RectifiedLayout) -> SettledScene:
     return SettledScene(rectified.scene_id, rectified, rectified.poses, 0.2)
 
 
-def curated(settled: SettledScene, mass_kg: float = 0.2, tasks: tuple[TaskAssessment, ...] = ()) -> CuratedScene:
+def curated(
+    settled: SettledScene, mass_kg: float = 0.2, tasks: tuple[TaskAssessment, ...] = (), names: Sequence[str] = ()
+) -> CuratedScene:
+    """As if a judge had called the objects `names`, by default as they are labelled."""
+    objects = settled.rectified.placed.objects
     verdicts = tuple(
         ObjectAssessment(
             object_id=item.object_id,
-            relabel_name=item.label,
-            distinguishing_phrases=(f"the {item.label}",),
+            relabel_name=name,
+            distinguishing_phrases=(f"the {name}",),
             label_confidence=1.0,
             mass_kg=mass_kg * (1 + 0.1 * index),
         )
-        for index, item in enumerate(settled.rectified.placed.objects)
+        for index, (item, name) in enumerate(zip(objects, names or [item.label for item in objects], strict=True))
     )
     assessment = Assessment(usable=True, quality_score=7, criterion_scores={}, objects=verdicts, tasks=tasks)
     return CuratedScene(settled.scene_id, settled, "rules", assessment)

@@ -54,6 +54,22 @@ def test_depth_and_camera_beside_a_picture_are_counted_together(tmp_path):
     assert make_manifest([str(tmp_path)], BOUNDS).ignored == {RECORDED: 2, "other file": 1}
 
 
+def test_only_sources_that_state_nothing_are_counted(tmp_path):
+    for name in ("a.png", "b.png", "all/c.png", "all/d.png", "each/e.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_picture(tmp_path / name, ord(name[-5]))
+    for name in ("a.source.json", "gone.source.json", "all/d.source.json", "all/source.json", "each/e.source.json"):
+        (tmp_path / name).write_text(json.dumps({"licence": f"of {name}"}))
+    made = make_manifest([str(tmp_path)], BOUNDS)
+    assert {row.name: row.licence for row in made.rows} == {
+        "a.png": "of a.source.json", "b.png": "", "c.png": "of all/source.json", "d.png": "of all/d.source.json",
+        "e.png": "of each/e.source.json",
+    }  # fmt: skip
+    assert made.ignored == {"source.json": 1}
+    (tmp_path / "each" / "source.json").write_text("{}")
+    assert make_manifest([str(tmp_path)], BOUNDS).ignored == {"source.json": 2}, "every picture there has its own"
+
+
 def test_what_lies_in_a_capture_or_beside_meshes_belongs_to_it(tmp_path):
     capture = write_capture(tmp_path / "c", 1)
     write_picture(capture / "seg.png", 2)
@@ -270,7 +286,7 @@ def test_what_a_capture_or_a_licence_is_kept_in_is_never_a_layout(tmp_path, name
     (tmp_path / name).write_text('{"objects": [{"mesh')
     found = make_manifest([str(tmp_path)], BOUNDS)
     assert [row.name for row in found.rows] == ["b.png"]
-    assert sum(found.ignored.values()) == 1
+    assert sum(found.ignored.values()) == (name != "source.json"), "which is the picture's"
 
 
 @pytest.mark.parametrize(("picture", "layouts"), [("table.jpg", 0), ("table.PNG", 0), ("other.png", 1)])

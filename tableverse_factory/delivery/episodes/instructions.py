@@ -23,6 +23,11 @@ def read_instruction(row: Mapping[str, Any]) -> str:
     return sanitize_line(str(row.get("instruction") or ""), _MAX_INSTRUCTION)
 
 
+def write_instruction(x: str, relation: Relation, y: str) -> str:
+    """Write the instruction of a task as the factory words its own, from phrases such as *the red mug*."""
+    return sanitize_line(INSTRUCTION.format(x=x, relation=relation.value, y=y), _MAX_INSTRUCTION)
+
+
 def paraphrase_instruction(instruction: str) -> tuple[str, ...]:
     """Say an instruction of the usual template in three other ways; none of another template."""
     found = _TEMPLATE.fullmatch(instruction)

@@ -62,7 +62,7 @@ def extract_scenes(
     out: str,
     dest: Path,
     file_format: str = "mjcf",
-    where: str = "",
+    where: str | None = None,
     appearance: Appearance = Appearance(),
     jobs: int = 1,
     progress: Callable[[int, int], object] = lambda _done, _all: None,
@@ -75,7 +75,7 @@ def extract_scenes(
     check_format(file_format)
     dataset = open_dataset(out)
     record = {"dataset": _identify(dataset), "format": file_format, "appearance": asdict(appearance)}
-    condition = parse_filter(where, dataset.scenes.schema) if where else pc.scalar(True)
+    condition = pc.scalar(True) if where is None else parse_filter(where, dataset.scenes.schema)
     finished = pc.field("status") == "done"
     columns = ["scene_id", *_PLACE]
     rows = dataset.scenes.to_table(columns=columns, filter=finished & condition).to_pylist()

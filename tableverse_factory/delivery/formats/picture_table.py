@@ -6,7 +6,7 @@ Its card leads `load_dataset` to data/SPLIT-00000.parquet and further files, wit
 import json
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from tableverse_factory.core.text import pluralize, sanitize_line
 from tableverse_factory.dataset.card_yaml import make_license_keys, name_size
 from tableverse_factory.dataset.dataset import Dataset, Scene
 from tableverse_factory.dataset.preview_image import PHOTOGRAPH
+from tableverse_factory.dataset.scene_meta import read_object_names
 from tableverse_factory.dataset.splits import SPLITS, get_split
 
 MASKS = "observation/masks.png"
@@ -77,22 +78,23 @@ def _build_row(scene: Scene) -> dict[str, Any] | None:
     if PHOTOGRAPH not in files:
         return None
     tasks = [row["instruction"] for row in scene.task_rows() if row["accepted"]]
-    objects, values = scene.object_rows(), _read_mask_values(scene)
+    meta = scene.meta
+    names, values = read_object_names(meta), _read_mask_values(meta)
     masks = {"bytes": files[MASKS], "path": "masks.png"} if MASKS in files else None
     return {
         **{name: sanitize_line(str(scene.row[name] or ""), 300) for name in _TEXTS},
         "quality_score": scene.row["quality_score"],
-        "labels": [sanitize_line(str(row["relabel_name"] or row["label"]), 200) for row in objects],
-        "mask_values": [values.get(row["object_id"]) for row in objects],
+        "labels": list(names.values()),
+        "mask_values": [values[name] for name in names],
         "instructions": [sanitize_line(str(text), 500) for text in tasks],
         "photograph": {"bytes": files[PHOTOGRAPH], "path": "color.jpg"},
         "masks": masks,
     }
 
 
-def _read_mask_values(scene: Scene) -> dict[str, int | None]:
+def _read_mask_values(meta: Mapping[str, Any]) -> dict[str, int | None]:
     """Read the pixel value of every object in its scene's masks, which 16 bits bound."""
-    values = {str(item["object_id"]): item.get("mask_value") for item in scene.meta["objects"]}
+    values = {str(item["object_id"]): item.get("mask_value") for item in meta["objects"]}
     return {name: value if isinstance(value, int) and 0 < value < 2**16 else None for name, value in values.items()}
 
 

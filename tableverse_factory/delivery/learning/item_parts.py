@@ -10,6 +10,7 @@ from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.storage.untrusted import decode_image, open_image, parse_finite
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.dataset.scene_meta import read_object_names
 
 _BOUNDS = ObserveConfig()
 _RECORDED = ("command", "phase", "qpos", "qvel", "tcp", "object_pose")
@@ -31,6 +32,12 @@ def _load_picture(scene: Scene, name: str, mode: str | None) -> np.ndarray | Non
 def _list_poses(scene: Scene) -> np.ndarray:
     rows = [_read_settled_pose(scene, item) for item in scene.meta["objects"]]
     return np.array(rows, dtype=np.float64).reshape(-1, 7)
+
+
+def _list_names(scene: Scene) -> list[str]:
+    meta = scene.meta
+    names = read_object_names(meta)
+    return [names[str(item["object_id"])] for item in meta["objects"]]
 
 
 def _read_settled_pose(scene: Scene, item: Mapping[str, Any]) -> list[float]:
@@ -61,7 +68,7 @@ PARTS: Mapping[str, Callable[[Scene], Any]] = {
     "photograph": lambda scene: _load_picture(scene, "observation/color.jpg", "RGB"),  # (h, w, 3) uint8, sRGB
     "masks": _load_masks,  # instance ids, 0 = background, (h, w) int32
     "ids": lambda scene: [str(item["object_id"]) for item in scene.meta["objects"]],  # in the order of `poses`
-    "labels": lambda scene: [sanitize_line(str(item.get("label", "")), 200) for item in scene.meta["objects"]],
+    "labels": _list_names,  # the judge's, else the detector's, in the order of `poses`
     "poses": _list_poses,  # settled, in the table frame: position [m] and quaternion wxyz, (n, 7) float64
     "meta": lambda scene: scene.meta,
     "xml": lambda scene: scene.xml,

@@ -16,7 +16,8 @@ from schemas.trajectories import Numbers
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.delivery.episodes.instructions import read_instruction
+from tableverse_factory.dataset.scene_meta import read_object_phrases
+from tableverse_factory.delivery.episodes.instructions import read_instruction, write_instruction
 from tableverse_factory.delivery.episodes.observation import order_objects
 from tableverse_factory.delivery.episodes.subtasks import SUBTASKS, estimate_phase
 from tableverse_factory.delivery.learning.reward import compute_goal_distance, compute_progress
@@ -67,7 +68,8 @@ class PickPlaceSim:
 
         Args:
             scene: Of a dataset.
-            task: Id of one of its tasks, or one of your own: `x_id`, `y_id` and `relation`.
+            task: Id of one of its tasks, or one of your own: `x_id`, `y_id`, `relation` and, if you like,
+                `instruction`; without one it is worded as those of the factory.
             robot: As in `robots.registry.load_arm`.
             base: Pose of the arm's base in the table frame; by default that of the task's recorded trajectory, else the
                 best one from which both objects are reached (`no_base` if there is none).
@@ -80,7 +82,7 @@ class PickPlaceSim:
             raise ConfigError(f"max_disturbed_m {max_disturbed_m}: give a length from 0 m on")
         files, row = scene.files(), _find_task(scene, task)
         self.goal = load_goal(files, row, max_disturbed_m)
-        self.instruction = read_instruction(row)
+        self.instruction = read_instruction(row) or self._write_instruction(scene)
         self.step_s = step_s
         self.station = Station(files, load_arm(robot))
         check_simulation_settings(self.station.model)
@@ -175,6 +177,11 @@ class PickPlaceSim:
             held = self.goal.holds(*map(pose_from_row, now))
             self._relation_cache = (now, held)
         return held
+
+    def _write_instruction(self, scene: Scene) -> str:
+        phrases = read_object_phrases(scene.meta)
+        x, y = (phrases.get(name, f"the {name}") for name in (self.goal.x_id, self.goal.y_id))
+        return write_instruction(x, self.goal.relation, y)
 
     def _find_recorded_base(self, scene: Scene, row: Mapping[str, Any]) -> Pose | None:
         for tried in scene.trajectory_rows():

@@ -59,9 +59,9 @@ class CompletionScore:
     cpu_s: float = 0.0  # CPU time of the place stage; 0 for the other methods [s]
 
 
-def read_solids(folder: Path | None) -> list[tuple[str, TriangleMesh]]:
-    """Read the named meshes of a folder, errors as of `read_meshes`; without one, make the solids of `make_solids`."""
-    return [*make_solids()] if folder is None else read_meshes(folder, check=_check_size)
+def read_solids(folder: Path | None, most: int | None = None) -> list[tuple[str, TriangleMesh]]:
+    """Read named solids of a folder, at most `most`, errors as of `read_meshes`; without one, make `make_solids`."""
+    return [*make_solids()] if folder is None else read_meshes(folder, most, _check_size)
 
 
 def bench_completion(

@@ -22,6 +22,7 @@ from tableverse_factory.geometry.convex.decompose import decompose
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
 from tableverse_factory.geometry.relations.preserved import Relations, find_relations
 from tableverse_factory.models.services import Services
+from tableverse_factory.sources.discovery import is_source_file
 from tableverse_factory.stages.observe.observe import read_layout
 from tableverse_factory.stages.rectify.groups import Group
 from tableverse_factory.stages.rectify.lccr import rectify_lccr
@@ -73,7 +74,8 @@ def make_parts(
 
 def find_layouts(path: Path, most: int | None) -> list[Path]:
     """Find the layouts of a folder by name, at most `most`, spread evenly; or return the one file."""
-    found = [path] if path.is_file() else sorted(path.glob("*.json"))
+    inside = (file for file in path.glob("*.json") if not is_source_file(file.name))
+    found = [path] if path.is_file() else sorted(inside)
     if not found:
         raise InputError(f"{path} holds no layout: give a folder of *.json files", "no_layouts")
     return sample_evenly(found, most)

@@ -22,6 +22,7 @@ from tableverse_factory.geometry.math.transforms import (
 )
 from tableverse_factory.geometry.mesh.meshes import box_center
 from tableverse_factory.physics.mjcf.obj_assets import encode_obj, scale_and_quantize
+from tableverse_factory.sources.synthetic.capture import SOURCE
 from tableverse_factory.sources.synthetic.recipes import PlacedModel
 from tableverse_factory.sources.synthetic.scene import arrange_scene, find_container
 from tableverse_factory.sources.synthetic.synthesize import check_numbers, check_origin, check_output_folder
@@ -41,10 +42,15 @@ def synthesize_layouts(
 ) -> list[Path]:
     """Write layouts to `out/layouts/synth_000000.json` and so on, meshes to `out/meshes`, truth to `out/truth`.
 
+    `out/layouts/source.json` states their licence.
+
     Layout k has the same bytes whatever the number of layouts; those that are there already, of the same seed, stay.
     """
     check_numbers(scenes, seed)
     check_output_folder(out, lambda path: path.name in (LAYOUTS, MESHES, TRUTH))
+    source = out / LAYOUTS / "source.json"
+    if not source.exists():
+        write_atomic(source, _encode_json(SOURCE))
     paths = []
     for index in range(scenes):
         path = out / LAYOUTS / f"synth_{index:06d}.json"

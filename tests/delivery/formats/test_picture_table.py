@@ -8,6 +8,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from tableverse_factory import SceneStream
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.dataset.dataset import open_dataset
 from tableverse_factory.delivery.formats.picture_table import MASKS, export_pictures
@@ -47,6 +48,15 @@ def test_every_scene_is_a_row_of_its_split_with_its_own_bytes(out, made):
     for files in head["configs"][0]["data_files"]:
         assert list(made.glob(files["path"]))
     assert head["license"] == ["cc-by-4.0", "cc-by-nc-4.0", "cc0-1.0"]
+
+
+def test_streams_and_tables_give_the_judges_names_where_the_detector_had_none(tmp_path):
+    names = ("red block", "white bowl", "tea box")
+    out = write_learnable_dataset(tmp_path / "out", scenes=1, moved=0, names=names)
+    export_pictures(open_dataset(out), tmp_path / "made")
+    (row,) = pq.read_table(next((tmp_path / "made" / "data").iterdir())).to_pylist()
+    (item,) = SceneStream(out, ("labels",))
+    assert row["labels"] == item["labels"] == list(names)
 
 
 def test_the_same_bytes_again_and_nothing_overwritten(out, made, tmp_path):

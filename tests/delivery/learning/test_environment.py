@@ -50,6 +50,14 @@ def test_gymnasium_finds_nothing_to_complain_about(out):
     assert env.unwrapped.sim.instruction == "Pick up the wooden block and place it next to the bowl"
 
 
+def test_a_task_of_ones_own_is_worded_as_those_of_the_factory(scene):
+    own = {"x_id": "obj_002", "y_id": "obj_001", "relation": "to the left of"}
+    _, info = TableEnv(scene, own).reset(seed=0)
+    assert info["instruction"] == "Pick up the tea box and place it to the left of the bowl"
+    assert len(info["paraphrases"]) == 3
+    assert TableEnv(scene, {**own, "instruction": "Tidy up"}).sim.instruction == "Tidy up"
+
+
 def test_a_recorded_success_is_one_and_a_recorded_failure_is_none(scene):
     done, failed = scene.trajectories()
     env = TableEnv(scene, "task_000")

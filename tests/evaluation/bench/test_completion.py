@@ -53,19 +53,20 @@ def test_a_folder_without_meshes_is_one_line_and_no_table(tmp_path, run, bench):
     assert "holds no meshes: give a folder of .obj, .ply, .stl, .glb files\n" in err
 
 
+@pytest.mark.parametrize("bench", ["completion", "decompose"])
 @pytest.mark.parametrize(
     ("size", "why"),
     [((60.0, 50.0, 40.0), "60 x 50 x 40 m: give a solid in metres, 0.005 to 1 m along"), ((0.06, 0.05, 0.0), "flat")],
     ids=["millimetres", "flat"],
 )
-def test_what_is_no_solid_in_metres_is_one_line(tmp_path, run, size, why):
+def test_what_is_no_solid_in_metres_is_one_line(tmp_path, run, bench, size, why):
     box = trimesh.creation.box()
     box.vertices *= size
     (tmp_path / "BOX.OBJ").write_text(box.export(file_type="obj"))
     (tmp_path / "torn.stl").write_bytes(b"solid")
     (tmp_path / "folder.obj").mkdir()
     (tmp_path / "gone.obj").symlink_to(tmp_path / "nowhere")
-    code, out, err = run("bench", "completion", tmp_path)
+    code, out, err = run("bench", bench, tmp_path)
     assert (code, out) == (1, "")
     assert f"BOX.OBJ is {why}" in err
     assert "torn.stl" in err

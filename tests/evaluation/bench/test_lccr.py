@@ -73,6 +73,12 @@ def scene(folder: Path, boxes: Boxes) -> ReleasedScene:
     return make_scene(case.item, case.pieces, [placed.pose for placed in case.item.objects])
 
 
+def test_a_licence_beside_layouts_is_no_layout(folder: Path) -> None:
+    before = find_layouts(folder, None)
+    (folder / "source.json").write_text('{"licence": "CC0-1.0"}')
+    assert find_layouts(folder, None) == before
+
+
 @pytest.mark.heavy
 def test_the_table_of_three_layouts(folder: Path, tmp_path: Path) -> None:
     config = Config()

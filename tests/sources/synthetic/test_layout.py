@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.config import Config
+from schemas.config import Config, ObserveConfig
 from schemas.geometry import Pose
 from schemas.manifest import ImageRow, SceneKind
 from schemas.outcome import Done
@@ -15,6 +15,7 @@ from tableverse_factory.geometry.collision.penetration import measure_mesh_penet
 from tableverse_factory.geometry.math.transforms import normalize_quaternion, rotation_angle, transform_points
 from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
 from tableverse_factory.models.services import Services
+from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.layout import synthesize_layouts
 from tableverse_factory.sources.synthetic.synthesize import make_synthetic_scene
 from tableverse_factory.stages.observe.observe import read_layout
@@ -45,7 +46,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_layouts_are_read_and_wrong_by_the_noise_alone(folder: Path) -> None:
     shifts, angles, scales = [], [], []
-    for path in sorted((folder / "layouts").glob("*.json")):
+    for path in sorted((folder / "layouts").glob("synth_*.json")):
         row = ImageRow(scene_id=path.stem, kind=SceneKind.LAYOUT, uri=str(path))
         outcome = read_layout(row, Config(), np.random.default_rng(0), Services(Path()))
         assert isinstance(outcome, Done)
@@ -59,6 +60,12 @@ def test_layouts_are_read_and_wrong_by_the_noise_alone(folder: Path) -> None:
     assert np.std(shifts, axis=0) == pytest.approx([0.007, 0.007, 0.0035], rel=0.35)
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(np.deg2rad(np.sqrt(4**2 + 2 * 1**2)), rel=0.35)
     assert np.std(scales) == pytest.approx(0.03, rel=0.35)
+
+
+def test_layouts_have_the_licence_of_captures(folder: Path) -> None:
+    made = make_manifest([str(folder)], ObserveConfig())
+    assert {(row.source, row.licence, row.rejected) for row in made.rows} == {("synthetic", "CC0-1.0", "")}
+    assert len(made.rows) == SCENES
 
 
 def test_the_truth_is_the_scene_of_the_capture_and_rests_free_of_collision(folder: Path) -> None:

@@ -36,6 +36,7 @@ DECAY_FROM = 0.4  # share of the steps after which the rate falls linearly
 MAX_NORM = 1.0
 AVERAGE = 0.999  # of the weights that are kept
 LOG_STEPS = 200
+HARDLY_TRAINED = 0.1  # share of the steps below which the weights are of no use
 
 Log = Callable[[str], object]
 
@@ -140,7 +141,8 @@ class _Trainer:
 
     def train(self) -> int:
         """Take the steps that are left, or as many as the minutes allow, but one at least; return the last one."""
-        settings, run, first, saved = self._settings, self._run, self._step, time.monotonic()
+        settings, run, first = self._settings, self._run, self._step
+        self._first_step_at = saved = time.monotonic()
         while self._step < settings.steps:
             self._step += 1
             losses = self._take_step(self._step)
@@ -152,7 +154,9 @@ class _Trainer:
                 self._save()
                 saved = time.monotonic()
         if self._step > first:
+            step_s = self._measure_step(self._step - first)
             self._save()
+            self._warn_if_hardly_trained(step_s)
         return self._step
 
     def _take_step(self, step: int) -> dict[str, Tensor]:
@@ -215,10 +219,26 @@ class _Trainer:
         parts = {name: float(each) for name, each in losses.items()}
         if not all(math.isfinite(each) for each in parts.values()):
             raise ModelError(f"the loss of step {self._step} is not finite: {parts}; the last checkpoint is kept")
-        rate = done / max(time.monotonic() - self._started, 1e-6)
-        self._say(
-            f"step {self._step}: {' '.join(f'{name} {each:.4f}' for name, each in parts.items())}; {rate:.1f} steps/s"
-        )
+        words = " ".join(f"{name} {each:.4f}" for name, each in parts.items())
+        self._say(f"step {self._step}: {words}; {_format_pace(self._measure_step(done))}")
+
+    def _measure_step(self, done: int) -> float:
+        """Measure the time of a step, of so many that were taken in this run [s]."""
+        return (time.monotonic() - self._first_step_at) / max(done, 1)
+
+    def _warn_if_hardly_trained(self, step_s: float) -> None:
+        """Warn where few of the steps were taken, and say how long all would take."""
+        steps = self._settings.steps
+        if self._step < HARDLY_TRAINED * steps:
+            self._say(
+                f"warning: {self._step} of {steps} steps, so the weights are hardly trained: at {_format_pace(step_s)} "
+                f"all steps take {steps * step_s / 3600:.2g} h"
+                + (" (a GPU is far faster)" if self._run.device == "cpu" else "")
+            )
+
+
+def _format_pace(step_s: float) -> str:
+    return f"{1 / max(step_s, 1e-6):.1f} steps/s" if step_s < 1.0 else f"{step_s:.1f} s/step"
 
 
 def compute_rate(step: int, settings: PolicySettings) -> float:

@@ -22,6 +22,7 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 from tableverse_factory.evaluation.training.checkpoint import CHECKPOINT, WEIGHTS  # noqa: E402
 from tableverse_factory.evaluation.training.policy import network, validate  # noqa: E402
+from tableverse_factory.evaluation.training.policy import train as training  # noqa: E402
 from tableverse_factory.evaluation.training.policy.settings import PolicySettings  # noqa: E402
 from tableverse_factory.evaluation.training.policy.state_policy import StatePolicy  # noqa: E402
 from tableverse_factory.evaluation.training.policy.train import TrainRun, train_state_policy  # noqa: E402
@@ -58,6 +59,20 @@ def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(packed: 
     train(tmp_path / "other", packed, replace(SETTINGS, seed=1))
     with pytest.raises(AssertionError):
         assert_same(tmp_path / "whole", tmp_path / "other")
+
+
+def test_weights_that_are_hardly_trained_are_said_to_be_with_the_time_of_all_steps(
+    packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = iter(range(0, 10_000, 30))
+    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(now)))  # every look at the clock takes 30 s
+    lines = train(tmp_path / "few", packed, replace(SETTINGS, steps=3_000), minutes=0.0)
+    (warning,) = [line for line in lines if "warning" in line]
+    pace, hours = re.search(r"1 of 3000 steps, so the .* at (\S+) s/step all steps take (\S+) h", warning).groups()
+    assert float(pace) >= 30.0
+    assert float(hours) == pytest.approx(3_000 * float(pace) / 3_600, rel=0.05)
+    assert "steps/s" not in "".join(lines)
+    assert not any("warning" in line for line in train(tmp_path / "all", packed))
 
 
 def _differing(name: str, old: Path, new: Path) -> str:
