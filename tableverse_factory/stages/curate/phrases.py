@@ -18,7 +18,8 @@ from tableverse_factory.stages.curate.lexicon import (
 
 MAX_PHRASES = 8
 OWN_COLOR = 0.55  # least surface share of a colour for an object to be called by it
-FOREIGN_COLOR = 0.25  # least share from which a colour might be said of an object: it distinguishes no other then
+FOREIGN_COLOR = 0.25  # least share from which a colour might be said of an object: who counts may count it then
+SECOND_COLOR = 0.4  # the same of one that has most of another colour, where only one object is asked for
 MARGIN_M = 0.02
 MARGIN_RATIO = 1.25
 _MIN_STEP_M = 0.01
@@ -73,6 +74,12 @@ class ObjectNamer:
             return True
         return item.colors[color] >= FOREIGN_COLOR
 
+    def _has_other_color(self, noun: str, j: int) -> bool:
+        """Whether an object has a colour that a noun does not name: shading and prints of it have smaller shares."""
+        own, main = self._items[j].colors, find_main_color(self._items[j])
+        foreign = [color for color in find_color_words(noun) if color not in find_color_words(self.names[j])]
+        return main is not None and any(color != main and own[color] < SECOND_COLOR for color in foreign)
+
     def _is_called(self, noun: str, j: int) -> bool:
         """Whether the object clearly goes by this noun; everything on the table is an `object`."""
         own, main = self.names[j], find_main_color(self._items[j])
@@ -92,7 +99,7 @@ class ObjectNamer:
         """Propose phrases that refer to no other object."""
         nouns = self._list_nouns(index)
         for noun, group in nouns:
-            yield f"the {noun}", group
+            yield f"the {noun}", [j for j in group if not self._has_other_color(noun, j)]
         for noun, group in nouns:
             if len(group) > 1:
                 yield from self._propose_superlatives(index, noun, group)

@@ -91,6 +91,8 @@ def test_nobody_counts_what_only_may_be_meant() -> None:
     assert "the second blue cup from the left" in phrases_of(clear)[1]
     assert not any("blue cup from the left" in phrase for phrase in phrases_of([*clear, doubtful])[1])
     assert "the second cup from the left" in phrases_of([*clear, doubtful])[1]
+    # Asked for the blue cup, nobody takes the red one that is blue in part.
+    assert phrases_of([clear[0], doubtful])[0][0] == "the blue cup"
 
 
 def lump(x: float) -> Thing:
