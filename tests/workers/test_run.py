@@ -169,7 +169,7 @@ def test_another_configuration_or_manifest_refuses_and_says_what_differs(mixed, 
         build(other, out)
     assert "sha256" not in str(told.value)
     moved = write_manifest(tmp_path / "m.parquet", MIXED, root="/elsewhere")
-    with pytest.raises(BuildError, match=r"same scenes .* where they lie"):
+    with pytest.raises(BuildError, match=r"same scenes with other values of uri, first in scene_000\. "):
         build(moved, out)
     assert digests(out) == before
 
