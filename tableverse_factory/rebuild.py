@@ -63,7 +63,7 @@ def manifest_from_dataset(out: StoragePath, run: Mapping[str, Any], plan: Plan) 
 def _iterate_rows(out: StoragePath, plan: Plan) -> Iterator[ImageRow]:
     """Read the rows of one shard after the other, each in the plan's order."""
     for shard, ranks in enumerate(plan.members()):
-        rows = {row.scene_id: row for row in _read_manifest_rows(out, shard)}
+        rows = {row.scene_id: row for row in read_manifest_rows(out, shard)}
         for scene_id in plan.scene_ids[ranks.start : ranks.stop]:
             if scene_id not in rows:
                 raise _make_restore_error(out, f"{scene_id} has no row")
@@ -77,7 +77,8 @@ def _make_restore_error(out: StoragePath, why: str) -> BuildError:
     )
 
 
-def _read_manifest_rows(out: StoragePath, shard: int) -> list[ImageRow]:
+def read_manifest_rows(out: StoragePath, shard: int) -> list[ImageRow]:
+    """Read the manifest rows of the scenes of a committed shard."""
     try:
         return [_make_manifest_row(record) for record in read_shard(out, "scenes", shard, _COLUMNS).to_pylist()]
     except ValidationError as error:

@@ -93,8 +93,7 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
 
     `signals` stops the run at SIGINT or SIGTERM, which then returns; without it Ctrl-C raises `KeyboardInterrupt`.
     """
-    if request.executor == "local" and request.workers not in (None, 1):
-        raise BuildError(f"--executor local has one worker, not {request.workers}: give --executor ray for more")
+    _check_workers(request)
     given = _read_rows(request)
     pipelines = load_pipelines(request.pipeline)
     check_output_dir(request.out)
@@ -137,6 +136,15 @@ def run_build(request: BuildRequest, display: Display, signals: StopSignals | No
             ledger.close()
             _finish_dataset(request.out, plan)
     return BuildSummary(request.out, tally, 0, budget.spent if over else None)
+
+
+def _check_workers(request: BuildRequest) -> None:
+    """Refuse more workers than this machine can hold before anything starts; a cluster is asked once it is joined."""
+    workers, cpus = request.workers, os.cpu_count() or 1
+    if request.executor == "local" and workers not in (None, 1):
+        raise BuildError(f"--executor local has one worker, not {workers}: give --executor ray for more")
+    if request.executor == "ray" and request.address is None and (workers or 0) > cpus:
+        raise BuildError(f"{workers} workers need {workers} CPUs and this machine has {cpus}: give --workers {cpus}")
 
 
 def _read_rows(request: BuildRequest) -> Sequence[ImageRow] | None:

@@ -1,6 +1,5 @@
 """Process pool whose results come in the order of the items and do not depend on the number of processes."""
 
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -17,11 +16,11 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.parent_death import die_with_parent
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_PR_SET_PDEATHSIG = 1
 CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
 
@@ -91,10 +90,8 @@ def _translate_death(doing: str) -> Iterator[None]:
 
 def prepare_child() -> None:
     """Limit a child to one thread, and end it with its parent: it would wait for work forever."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
-    if parent is None or os.getppid() != parent.pid:
-        os._exit(1)  # it was killed just before
+    die_with_parent(0 if parent is None or parent.pid is None else parent.pid)
     threadpool_limits(1)
 
 

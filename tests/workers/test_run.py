@@ -1,10 +1,12 @@
 """A build accounts for every row, refuses what would mix two builds, and does again only what it is told to."""
 
 import json
+import os
 import random
 import signal
 import tarfile
 import time
+from dataclasses import replace
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -12,9 +14,22 @@ import pytest
 
 from schemas.tables import OBJECTS, SCENES, TASKS, TIMINGS
 from tableverse_factory.core.errors import BuildError, InputError
-from tests.helpers.builds import build, crowd, digests, finish, kill, scenes, start, wait_until, write_manifest
+from tests.helpers.builds import (
+    Silent,
+    build,
+    crowd,
+    digests,
+    finish,
+    kill,
+    request,
+    scenes,
+    start,
+    wait_until,
+    write_manifest,
+)
 from workers.plan.invalidate import reopen_scenes
 from workers.progress.build_state import read_build_state
+from workers.run import run_build
 from workers.state.lock import create_writer_lock
 
 pytestmark = pytest.mark.heavy
@@ -154,9 +169,19 @@ def test_another_configuration_or_manifest_refuses_and_says_what_differs(mixed, 
         build(other, out)
     assert "sha256" not in str(told.value)
     moved = write_manifest(tmp_path / "m.parquet", MIXED, root="/elsewhere")
-    with pytest.raises(BuildError, match=r"same scenes .* where they lie"):
+    with pytest.raises(BuildError, match=r"same scenes with other values of uri, first in scene_000\. "):
         build(moved, out)
     assert digests(out) == before
+
+
+def test_more_workers_than_this_machine_has_are_refused_before_ray_starts(mixed, tmp_path):
+    display = Silent()
+    asked = replace(request(mixed[0], tmp_path / "out"), executor="ray", workers=1_000_000)
+    words = rf"1000000 workers need 1000000 CPUs and this machine has \d+: give --workers {os.cpu_count()}$"
+    with pytest.raises(BuildError, match=words):
+        run_build(asked, display)
+    assert display.notes == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_of_somebody_else_is_left_alone(mixed, tmp_path):

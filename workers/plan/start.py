@@ -9,7 +9,6 @@ from schemas.config import Config
 from schemas.manifest import ImageRow, SceneKind
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, list_names
-from tableverse_factory.core.text import pluralize
 from tableverse_factory.dataset.journals import WORK
 from tableverse_factory.dataset.shard_plan import Plan, digest_manifest, make_plan, read_plan, write_plan
 from tableverse_factory.run_record import (
@@ -24,6 +23,7 @@ from tableverse_factory.run_record import (
 from tableverse_factory.stage import Pipelines
 from workers.plan.checkpoint_from_shards import checkpoint_exported_scenes
 from workers.plan.invalidate import invalidate_scenes
+from workers.plan.manifest_change import describe_manifest_change
 from workers.plan.rerun import (
     check_upstream_unchanged,
     clear_rerun_marker,
@@ -95,7 +95,7 @@ def start_or_resume(
 
     if before is not None:
         differing = diff_run_records(before, record)
-        _check_same_build(out, plan, pipelines, points, differing, section, "" if base is None else AGAIN_OPTION)
+        _check_same_build(out, plan, rows, pipelines, points, differing, section, "" if base is None else AGAIN_OPTION)
         if section is None or (not added and not differing and is_rerun_under_way(out, section, record)):
             return plan, lambda: None
         _invalidate_from(out, plan, rows, pipelines, points, fingerprints, guard)
@@ -139,6 +139,7 @@ def _find_added_stage(out: StoragePath, before: Mapping[str, Any], record: Mappi
 def _check_same_build(
     out: StoragePath,
     plan: Plan,
+    rows: Sequence[ImageRow],
     pipelines: Pipelines,
     points: Mapping[str, int],
     differing: Mapping[str, tuple[Any, Any]],
@@ -149,21 +150,12 @@ def _check_same_build(
     earliest = suggest_restart_stage(pipelines, plan.kinds, differing)
     if section is None and differing:
         is_other = any(key.startswith("manifest.") for key in differing)
-        manifest = _describe_manifest_change(read_plan(out / "plan.parquet"), plan) if is_other else ""
+        manifest = describe_manifest_change(out, plan, rows) if is_other else ""
         raise resume_refused_error(str(out), differing, earliest, option, manifest)
     if read_plan(out / "plan.parquet") != plan:
         raise BuildError(f"{out / 'plan.parquet'} was changed after the build began: give another OUT")
     if section is not None:
         check_upstream_unchanged(pipelines, points, differing, section, earliest)
-
-
-def _describe_manifest_change(began: Plan, now: Plan) -> str:
-    """Describe in words how the scenes of the manifest differ from those that the build began with."""
-    old, new = set(began.scene_ids), set(now.scene_ids)
-    if old == new:
-        return "its manifest has the same scenes in another order, or says other things of them, such as where they lie"
-    both = len(old & new)
-    return f"its manifest has {pluralize(len(old), 'scene')} and this one {len(new)}, with {both} in both"
 
 
 def _invalidate_from(

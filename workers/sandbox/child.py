@@ -1,11 +1,8 @@
 """Process inside a sandbox: runs stages and reports their outcomes. Started as `python -m workers.sandbox.child`."""
 
-import ctypes
 import faulthandler
 import importlib
-import os
 import resource
-import signal
 import socket
 import sys
 import time
@@ -23,6 +20,7 @@ from schemas.outcome import Done, Dropped, Failed
 from schemas.scene import ExportedScene
 from schemas.work import SandboxSetup, ScenePart, StageChain, StageReport
 from tableverse_factory.core.errors import BuildError, TableverseError
+from tableverse_factory.core.parent_death import die_with_parent
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.core.storage.files import parse_path
 from tableverse_factory.dataset.parts import PartWriter
@@ -36,13 +34,12 @@ from workers.sandbox.messages import InputMissing, StageDone, encode_message
 from workers.state.checkpoint_store import CheckpointStore, name_checkpoint, name_cost_checkpoint
 from workers.state.cost_log import CostLog
 
-_PR_SET_PDEATHSIG = 1
-
 
 def main() -> None:
     """Serve one sandbox until it closes the channel: `workers.sandbox.child SOCKET_DESCRIPTOR PARENT_PID`."""
     descriptor, parent = int(sys.argv[1]), int(sys.argv[2])
-    _die_with_parent(parent)
+    die_with_parent(parent)
+    _limit_process()
     faulthandler.enable()
     channel = Channel(socket.socket(fileno=descriptor))
     setup: SandboxSetup = decode(channel.receive())
@@ -167,11 +164,8 @@ def _serve(channel: Channel, runner: StageRunner) -> None:
             channel.send(encode_message(Failed(type(error).__name__, str(error))))
 
 
-def _die_with_parent(parent: int) -> None:
-    """End this process with its parent, even in native code; disable core dumps; run arrow on one thread."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        sys.exit(0)
+def _limit_process() -> None:
+    """Disable core dumps; run arrow on one thread."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     pa.set_cpu_count(1)
     pa.set_io_thread_count(1)

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import BinaryIO
@@ -19,11 +20,12 @@ from schemas.codec import decode, encode
 from schemas.outcome import Failed
 from schemas.work import SandboxSetup, StageChain, StageChainReport, StageReport
 from tableverse_factory.core.errors import BuildError
-from workers.sandbox.channel import Channel, ChannelClosedError
+from workers.sandbox.channel import POLL_S, Channel, ChannelClosedError
 from workers.sandbox.messages import InputMissing, StageDone, decode_message
 from workers.sandbox.retries import ChainRun, ChildResult, may_retry
 
 START_TIMEOUT_S = 180.0  # timeout for a child to import the pipeline [s]
+_EXIT_S = 10.0  # time that a child has to end after it closed its channel [s]
 _MB = 1_000_000
 _TRACE_CHARS = 4000
 _STDERR_TAIL_BYTES = 64 * 1024
@@ -159,7 +161,10 @@ class _Child:
 
     def is_alive(self) -> bool:
         """Whether the process can take work; one whose threads are still ending exists but is dead."""
-        return self._process.poll() is None and self._usage.status() != psutil.STATUS_ZOMBIE
+        try:
+            return self._usage.status() != psutil.STATUS_ZOMBIE  # `poll` would reap it, see `_end`
+        except psutil.NoSuchProcess:
+            return False
 
     def is_lean(self) -> bool:
         """Whether the idle child holds less than half of the limit, so that the next scene has room."""
@@ -168,10 +173,15 @@ class _Child:
     def kill(self) -> None:
         """Kill the process and everything it started."""
         self._channel.close()
-        if self._process.poll() is None:
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
+        self._end()
         self._errors.close()
+
+    def _end(self) -> int:
+        """Kill the process and its group, and return its exit code; only once it is reaped may others get its id."""
+        if self._process.returncode is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        return self._process.wait()
 
     def _wait_until_ready(self, watch: Callable[[], None]) -> None:
         try:
@@ -195,10 +205,12 @@ class _Child:
 
     def _describe_exit(self) -> str | None:
         """Describe the exit; None for an outside cause (SIGKILL or SIGTERM, which no stage raises by accident)."""
-        try:
-            code = self._process.wait(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            return "closed its channel"
+        until = time.monotonic() + _EXIT_S
+        while self.is_alive():
+            if time.monotonic() > until:
+                return "closed its channel"
+            time.sleep(POLL_S)
+        code = self._end()
         if code in (-signal.SIGKILL, -signal.SIGTERM):
             return None
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"

@@ -15,9 +15,9 @@ from tableverse_factory.core.storage.append_files import append_whole
 from tableverse_factory.core.storage.files import (
     StoragePath,
     get_store,
-    make_write_error,
     remove_folder,
     sync_folder,
+    translate_write_errors,
 )
 from tableverse_factory.dataset.journals import REOPEN, RESULT, read_journal, segment_name
 
@@ -33,7 +33,8 @@ class Journal(ABC):
 
     def __init__(self, path: StoragePath) -> None:
         """Open or create the journal."""
-        self._end = read_journal(path).end
+        with translate_write_errors(path):
+            self._end = read_journal(path).end
 
     def record(self, result: SceneResult) -> None:
         """Append a result; it survives a kill at once on the disk, after about a second in a store."""
@@ -72,39 +73,35 @@ class FileJournal(Journal):
         """Open or create the journal and cut off a torn last frame."""
         super().__init__(path)
         self._path = path
-        try:
+        with translate_write_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("ab", buffering=0)
             self._file.truncate(self._end)
-        except OSError as error:
-            raise make_write_error(path, error) from error
 
     def tick(self) -> None:
         """Do nothing: every result is on the disk when it is recorded."""
 
     def flush(self) -> None:
         """Flush the file and its name; before, other machines of a network file system may not see all of it."""
-        try:
+        with translate_write_errors(self._path):
             os.fsync(self._file.fileno())
             sync_folder(self._path.parent)
-        except OSError as error:
-            raise make_write_error(self._path, error) from error
 
     def close(self) -> None:
         """Close the file, which stays."""
-        self._file.close()
+        with translate_write_errors(self._path):
+            self._file.close()
 
     def remove(self) -> None:
         """Close and delete the file."""
-        self._file.close()
-        self._path.unlink()
+        with translate_write_errors(self._path):
+            self._file.close()
+            self._path.unlink()
 
     def _append(self, frame: bytes) -> None:
         """Append a frame; if the disk is full, the journal stays as before."""
-        try:
+        with translate_write_errors(self._path):
             append_whole(self._file.fileno(), [frame], self._end)
-        except OSError as error:
-            raise make_write_error(self._path, error) from error
         self._end += len(frame)
 
 
@@ -143,10 +140,8 @@ class ObjectJournal(Journal):
             return
         path = self._folder / segment_name(self._end)
         self._refused = True
-        try:
+        with translate_write_errors(path):
             etag = get_store(path).put_if_absent(path.path, bytes(self._buffer))
-        except OSError as error:
-            raise make_write_error(path, error) from error
         if etag is None:
             raise BuildError(
                 f"{path} was written by another process, so this one stops. Finished scenes are kept: when no other "

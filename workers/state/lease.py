@@ -16,7 +16,7 @@ from upath import UPath
 
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import get_store, list_names, make_write_error
-from workers.state.lock_owner import decode_owner, describe_owner, encode_owner, identify_process
+from workers.state.lock_owner import decode_owner, describe_owner, encode_owner, explain_refusal, identify_process
 
 if TYPE_CHECKING:
     from tableverse_factory.core.storage.s3 import VersionedObject
@@ -54,7 +54,7 @@ class Lease:
                 if found is None:
                     continue
                 if first is not None and found.etag != first.etag:
-                    raise BuildError(describe_owner(self._path.parent.parent, found.data))
+                    raise BuildError(explain_refusal(self._path.parent.parent, found.data))
                 if _is_abandoned(found) and self._replace(found.etag):
                     break
                 if first is None and self._note is not None:
@@ -133,7 +133,7 @@ def describe_lease(path: UPath) -> str | None:
     found = get_store(path).head_and_get(path.path) if path.name in list_names(path.parent) else None
     if found is None or found.age_s > LEASE_S:
         return None
-    return describe_owner(path.parent.parent, found.data)
+    return describe_owner(found.data)
 
 
 def _is_abandoned(found: "VersionedObject") -> bool:

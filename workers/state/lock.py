@@ -2,8 +2,9 @@
 
 import fcntl
 import os
+import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -12,9 +13,10 @@ from upath import UPath
 from tableverse_factory.core.errors import BuildError
 from tableverse_factory.core.storage.files import StoragePath, make_write_error
 from workers.state.lease import Lease, describe_lease
-from workers.state.lock_owner import describe_owner, encode_owner, identify_process
+from workers.state.lock_owner import describe_owner, encode_owner, explain_refusal, identify_process
 
 LOCK = "lock"  # its name in the folder of the work
+_PATIENCE_S = 0.2  # `describe_writer` takes the lock for a moment, which is no writer [s]
 
 
 class WriterLock(Protocol):
@@ -59,25 +61,37 @@ class FileLock:
 
     def _acquire(self) -> bool:
         """Lock the file; False if its last holder removed it meanwhile, so that a new one must be created."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        folder = self._path.parent
         try:
-            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
-        except FileNotFoundError:  # its last holder removed the folder since
-            return False
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            same = self._path.exists() and os.path.samestat(os.fstat(descriptor), self._path.stat())
-        except BlockingIOError:
-            owner = os.read(descriptor, 1000)
-            os.close(descriptor)
-            raise BuildError(describe_owner(self._path.parent.parent, owner)) from None
-        if not same:
-            os.close(descriptor)
-            return False
-        os.truncate(descriptor, 0)
-        os.write(descriptor, encode_owner(identify_process()))
-        self._descriptor = descriptor
-        return True
+            folder.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:  # also if its last holder removed the folder in this moment
+            if folder.is_symlink() or folder.is_file():
+                raise
+        with ExitStack() as undo:
+            try:
+                descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+                undo.callback(os.close, descriptor)
+                self._lock(descriptor)
+                same = os.path.samestat(os.fstat(descriptor), self._path.stat())
+            except FileNotFoundError:  # its last holder removed the file or the folder since
+                return False
+            if same:
+                os.truncate(descriptor, 0)
+                os.write(descriptor, encode_owner(identify_process()))
+                self._descriptor = descriptor
+                undo.pop_all()
+            return same
+
+    def _lock(self, descriptor: int) -> None:
+        until = time.monotonic() + _PATIENCE_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            except BlockingIOError:
+                if time.monotonic() > until:
+                    raise BuildError(explain_refusal(self._path.parent.parent, os.read(descriptor, 1000))) from None
+                time.sleep(0.01)
 
 
 def create_writer_lock(path: StoragePath, note: Callable[[str], None] | None = None) -> WriterLock:
@@ -86,7 +100,7 @@ def create_writer_lock(path: StoragePath, note: Callable[[str], None] | None = N
 
 
 def describe_writer(path: StoragePath) -> str | None:
-    """Describe who holds the lock at `path`; None if it is free."""
+    """Describe who holds the lock at `path`, such as `process 4711 on host`; None if it is free."""
     return describe_lease(path) if isinstance(path, UPath) else _describe_file_lock(path)
 
 
@@ -98,7 +112,7 @@ def _describe_file_lock(path: Path) -> str | None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return describe_owner(path.parent.parent, os.read(descriptor, 1000))
+        return describe_owner(os.read(descriptor, 1000))
     finally:
         os.close(descriptor)
     return None

@@ -53,16 +53,17 @@ def decode_owner(data: bytes) -> LockOwner | None:
         return None
 
 
-def describe_owner(out: StoragePath, data: bytes) -> str:
-    """Describe who holds a lock with this content, and what to do."""
+def describe_owner(data: bytes) -> str:
+    """Describe who holds a lock with this content."""
     owner = decode_owner(data)
-    if owner is None:
-        return f"{out} is being written by another process: wait for it, or stop it and run this again"
-    how = f" (kill {owner.pid})" if owner.host == platform.node() else ""
-    return (
-        f"{out} is being written by process {owner.pid} on {owner.host}: wait for it, or stop it{how} "
-        "and run this again"
-    )
+    return "another process" if owner is None else f"process {owner.pid} on {owner.host}"
+
+
+def explain_refusal(out: StoragePath, data: bytes) -> str:
+    """Explain to another writer who holds the lock of `out`, and what to do."""
+    owner = decode_owner(data)
+    how = f" (kill {owner.pid})" if owner is not None and owner.host == platform.node() else ""
+    return f"{out} is being written by {describe_owner(data)}: wait for it, or stop it{how} and run this again"
 
 
 def _read_pid_namespace() -> str:

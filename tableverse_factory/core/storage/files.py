@@ -102,12 +102,13 @@ def list_sizes(folder: StoragePath) -> dict[str, int]:
 def atomic_file(path: StoragePath) -> Iterator[BinaryIO]:
     """Open a file, in folders made if missing, that replaces `path` only if the block ends without an error."""
     write = _write_multipart(path) if isinstance(path, UPath) else _write_and_rename(path)
-    with _translate_write_errors(path), write as file:
+    with translate_write_errors(path), write as file:
         yield file
 
 
 @contextmanager
-def _translate_write_errors(path: StoragePath) -> Iterator[None]:
+def translate_write_errors(path: StoragePath) -> Iterator[None]:
+    """Raise an OSError of the block as the error that stops a build."""
     try:
         yield
     except OSError as error:
@@ -148,7 +149,7 @@ def _write_multipart(path: UPath) -> Iterator[BinaryIO]:
 def write_atomic(path: StoragePath, data: bytes) -> None:
     """Write a small file, whole or not at all."""
     if isinstance(path, UPath):
-        with _translate_write_errors(path):
+        with translate_write_errors(path):
             path.fs.pipe_file(path.path, data)
         return
     with atomic_file(path) as file:
@@ -157,7 +158,7 @@ def write_atomic(path: StoragePath, data: bytes) -> None:
 
 def move(source: StoragePath, target: StoragePath) -> None:
     """Move a finished file over `target` in one step; in a store it is copied, and `source` stays."""
-    with _translate_write_errors(target):
+    with translate_write_errors(target):
         if isinstance(source, UPath) and isinstance(target, UPath):
             source.fs.cp_file(source.path, target.path)
         elif isinstance(source, Path) and isinstance(target, Path):
@@ -170,7 +171,7 @@ def move(source: StoragePath, target: StoragePath) -> None:
 
 def remove(path: StoragePath) -> None:
     """Remove a file if it exists."""
-    with _translate_write_errors(path):
+    with translate_write_errors(path):
         if isinstance(path, UPath):
             get_store(path).remove(path.path)
         else:
@@ -179,7 +180,7 @@ def remove(path: StoragePath) -> None:
 
 def remove_folder(folder: StoragePath, keep: str = "") -> None:
     """Remove a folder and everything below it, if it exists, except the entry named `keep`."""
-    with _translate_write_errors(folder):
+    with translate_write_errors(folder):
         if isinstance(folder, UPath):
             get_store(folder).remove_all(folder.path, keep)
         elif not keep and folder.exists():

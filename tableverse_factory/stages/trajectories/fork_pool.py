@@ -5,7 +5,6 @@ or memory, the current item fails and a new child, forked from the same untouche
 Forks share the compiled scene and the robot's reach map, which spawned workers would have to build again.
 """
 
-import ctypes
 import faulthandler
 import multiprocessing
 import os
@@ -29,9 +28,9 @@ from tableverse_factory.core.errors import (
     TableverseError,
     WeightsError,
 )
+from tableverse_factory.core.parent_death import die_with_parent
 
 _DONE, _RAISED, _FATAL = b"d", b"r", b"f"
-_PR_SET_PDEATHSIG = 1
 _POLL_S, _EXIT_S = 0.2, 10.0
 _MAX_ANSWER, _MAX_MESSAGE = 1 << 30, 500
 # Errors that every item would raise again, by exact class name: `AnswerInvalidError` concerns one item only
@@ -68,7 +67,7 @@ def _run_child(
     """Collect answers from one child until all items are done or the child is lost."""
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_serve, args=(work, items, sender))
+    child = context.Process(target=_serve, args=(os.getpid(), work, items, sender))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # about threads beside a fork: the child starts none
         child.start()
@@ -119,11 +118,11 @@ def _measure_resident_mb(child: ForkProcess) -> float:
         return 0.0
 
 
-def _serve(work: Callable[[int], bytes], items: range, sender: Connection) -> None:
+def _serve(parent: int, work: Callable[[int], bytes], items: range, sender: Connection) -> None:
     """Answer the items in the child, which never returns from here."""
     status = 1
     try:
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        die_with_parent(parent)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends the child
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         faulthandler.disable()  # the parent reports how the child ended; no trace on the terminal

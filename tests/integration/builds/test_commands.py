@@ -1,6 +1,8 @@
 """`build`, `status` and `failures` as a user and a script see them."""
 
 import json
+import os
+import platform
 import re
 import socket
 
@@ -10,6 +12,7 @@ import pytest
 
 from tests.helpers.builds import build as build_tiny
 from tests.helpers.builds import write_manifest
+from workers.state.lock import create_writer_lock
 
 NAMES = ["fine", "empty", "sad", "fell", "fine"]
 
@@ -33,6 +36,14 @@ def test_status_for_people_and_for_scripts(run, out):
     assert {row["why"]: row["scenes"] for row in found["funnel"]} == {
         "nothing_there": 1, "not_at_rest": 1, "GeometryError": 1,
     }  # fmt: skip
+
+
+def test_status_names_the_build_that_runs_and_gives_no_advice_for_a_second_one(run, out):
+    with create_writer_lock(out / ".work" / "lock"):
+        code, text, _ = run("status", out)
+    assert code == 0
+    assert f"a build is running: process {os.getpid()} on {platform.node()}" in text.splitlines()
+    assert "wait for it" not in text
 
 
 def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):

@@ -2,6 +2,8 @@
 
 import ctypes
 import os
+import subprocess
+import sys
 import time
 
 import psutil
@@ -114,3 +116,19 @@ def test_errors_of_an_item_stay_its_own(kind):
     assert (first, third) == (b"x", b"x")
     assert isinstance(second, ItemFailure)
     assert (second.kind, second.detail.partition(":")[0]) == ("exception", kind.__name__)
+
+
+def test_no_item_is_begun_for_a_parent_that_was_killed_while_it_forked(tmp_path):
+    script = f"""
+import os, time
+from pathlib import Path
+from tableverse_factory.stages.trajectories.fork_pool import map_in_fork
+os.register_at_fork(after_in_child=lambda: time.sleep(1.0))
+map_in_fork(lambda item: Path({str(tmp_path / "begun")!r}).touch() or b"", 1, 30.0, {MEMORY_MB})
+"""
+    with subprocess.Popen([sys.executable, "-c", script]) as parent:
+        while not (children := psutil.Process(parent.pid).children()):
+            time.sleep(0.01)
+        parent.kill()
+    assert psutil.wait_procs(children, timeout=20)[1] == []
+    assert not (tmp_path / "begun").exists()

@@ -213,6 +213,20 @@ def test_close_leaves_no_process(sandbox):
     assert not any(child.is_running() for child in children)
 
 
+@pytest.mark.parametrize("name", ["leave", "leave_and_exit"])
+def test_what_a_child_started_does_not_outlive_it(tmp_path, monkeypatch, name):
+    monkeypatch.setenv("TINY_LINE_MARKS", str(tmp_path))
+    sandbox = Sandbox(_setup(tmp_path, attempts=1))
+    sandbox.run(_chain(name, range(2)))
+    pid = int((tmp_path / "left").read_text())
+    for child in _children():  # it dies while it is idle, unless it has exited
+        child.send_signal(signal.SIGSEGV)
+        wait_until(lambda child=child: child.status() == psutil.STATUS_ZOMBIE, 10.0)
+    assert _run_line(sandbox, "fine")[0].outcome is None
+    wait_until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE, 10.0)
+    sandbox.close()
+
+
 def test_the_child_dies_with_its_parent_even_inside_a_hang(tmp_path):
     script = f"""
 import sys; sys.path.insert(0, {str(ROOT)!r})

@@ -132,3 +132,23 @@ def test_a_damaged_journal_is_said_and_costs_what_stood_there_alone(tmp_path):
     assert len(notes) == 1
     assert f"{len(data)} bytes hold no whole result" in notes[0]
     assert digests(tmp_path / "out") == digests(tmp_path / "whole")
+
+
+def test_a_journal_that_cannot_be_read_is_a_clear_error(tmp_path):
+    (tmp_path / "j").mkdir()
+    with pytest.raises(BuildError, match=r"cannot write .*j: Is a directory"):
+        FileJournal(tmp_path / "j")
+
+
+def test_a_journal_that_does_not_close_is_a_clear_error(tmp_path):
+    journal = FileJournal(tmp_path / "j")
+    os.close(journal._file.fileno())  # a network disk reports its failures when a file is closed, as this one now
+    with pytest.raises(BuildError, match=r"cannot write .*j: Bad file descriptor"):
+        journal.close()
+
+
+def test_a_journal_that_cannot_be_removed_is_a_clear_error(tmp_path):
+    journal = FileJournal(tmp_path / "j")
+    (tmp_path / "j").unlink()
+    with pytest.raises(BuildError, match=r"cannot write .*j: No such file"):
+        journal.remove()

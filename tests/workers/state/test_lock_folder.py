@@ -1,6 +1,19 @@
 """Locks of two commands on one folder that end and begin at the same time."""
 
-from workers.state.lock import FileLock
+import fcntl
+import os
+import platform
+import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from tableverse_factory.core.errors import BuildError
+from workers.state.lock import FileLock, describe_writer
+from workers.state.lock_owner import LockOwner, encode_owner
 
 
 def test_a_lock_ends_although_another_command_writes_into_its_folder(tmp_path, monkeypatch):
@@ -18,3 +31,75 @@ def test_a_lock_ends_although_another_command_writes_into_its_folder(tmp_path, m
     monkeypatch.undo()
     with FileLock(folder / "lock"):
         pass
+
+
+def test_a_look_at_the_lock_refuses_no_build(tmp_path):
+    path = tmp_path / "out" / ".work" / "lock"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(encode_owner(LockOwner(4711, "gone")))
+    looking = os.open(path, os.O_RDWR)
+    fcntl.flock(looking, fcntl.LOCK_SH)  # as `describe_writer` does, but for longer
+    end = threading.Timer(0.05, os.close, [looking])
+    end.start()
+    with FileLock(path):
+        assert describe_writer(path) == f"process {os.getpid()} on {platform.node()}"
+    end.join()
+
+
+def test_a_second_build_is_refused_and_told_what_to_do(tmp_path):
+    path = tmp_path / "out" / ".work" / "lock"
+    words = f"{tmp_path / 'out'} is being written by process {os.getpid()} on {platform.node()}: wait for it"
+    with FileLock(path), pytest.raises(BuildError, match=re.escape(words)):
+        FileLock(path).__enter__()
+    assert describe_writer(path) is None
+
+
+def test_a_lock_that_cannot_be_written_is_not_held(tmp_path):
+    """The limit on file size stands for the disk, in a process of its own."""
+    script = f"""
+import resource, signal
+from pathlib import Path
+from tableverse_factory.core.errors import BuildError
+from workers.state.lock import FileLock
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+_, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, most))
+path = Path({str(tmp_path / "lock")!r})
+try:
+    FileLock(path).__enter__()
+except BuildError as error:
+    print(error)
+resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+with FileLock(path):
+    print("held")
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert "cannot write" in ran.stdout
+    assert ran.stdout.endswith("held\n"), ran.stderr
+
+
+@pytest.mark.heavy
+def test_commands_that_end_and_begin_at_once_are_refused_by_name_alone(tmp_path):
+    script = f"""
+import time
+from pathlib import Path
+from tableverse_factory.core.errors import BuildError
+from workers.state.lock import FileLock
+until = time.monotonic() + 2.0
+while time.monotonic() < until:
+    try:
+        with FileLock(Path({str(tmp_path)!r}) / ".work" / "lock"):
+            pass
+    except BuildError as error:
+        if "is being written by" not in str(error):
+            raise
+"""
+    commands = [subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True) for _ in range(4)]
+    assert [command.communicate()[1] for command in commands] == [""] * 4
+
+
+@pytest.mark.parametrize("way", [Path.touch, lambda path: path.symlink_to("gone")])
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path, way):
+    way(tmp_path / ".work")
+    with pytest.raises(BuildError, match=r"cannot write .*File exists"):
+        FileLock(tmp_path / ".work" / "lock").__enter__()
