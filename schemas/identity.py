@@ -9,6 +9,7 @@ from pydantic import AfterValidator
 
 MAX_LABEL_CHARS = 120
 MAX_STEM_CHARS = 80
+UNNAMED = "object"  # label of what nobody has named
 RESERVED_IDS = ("backdrop", "scene", "sky", "table", "world")  # names of a scene's own parts, which no object can have
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,79}")
@@ -35,7 +36,7 @@ def make_object_id(index: int) -> str:
 def clean_label(text: str) -> str:
     """Clean an untrusted label to one line of at most 120 printable characters; `object` if nothing is left."""
     printable = "".join(c if c.isprintable() else " " for c in text)
-    return " ".join(printable.split())[:MAX_LABEL_CHARS].strip() or "object"
+    return " ".join(printable.split())[:MAX_LABEL_CHARS].strip() or UNNAMED
 
 
 def content_hash(*parts: bytes) -> str:

@@ -61,7 +61,7 @@ def read_meta(data: bytes) -> SceneMeta:
 def read_object_names(meta: Mapping[str, Any]) -> dict[str, str]:
     """Read the name of every object by id: the judge's `relabel_name`, else the detector's label; printable."""
     verdicts = _read_verdicts(meta)
-    ids = {str(item["object_id"]): item for item in meta["objects"]}
+    ids = {str(item["object_id"]): item for item in meta.get("objects", ())}
     names = {key: verdicts.get(key, {}).get("relabel_name") or item.get("label") for key, item in ids.items()}
     return {key: sanitize_line(str(name or ""), _LONGEST_NAME) for key, name in names.items()}
 

@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from schemas.identity import clean_label
+from schemas.identity import UNNAMED, clean_label
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.optional_imports import import_extra
 from tableverse_factory.dataset.dataset import Scene
+from tableverse_factory.dataset.scene_meta import read_object_names
 from tableverse_factory.delivery.formats.folders import SCENE_GLB, SCENE_XML, check_body_name
 from tableverse_factory.delivery.formats.glb import encode_glb
 from tableverse_factory.delivery.formats.model_contents import ModelContents, read_model_contents
@@ -40,9 +41,10 @@ def check_format(file_format: str) -> None:
 
 
 def read_labels(meta: Mapping[str, Any]) -> dict[str, str]:
-    """Read labels of the objects by id from a `meta.json`; the default is the id."""
-    entries = [(str(entry["object_id"]), entry) for entry in meta.get("objects", ())]
-    return {object_id: clean_label(str(entry.get("label", object_id))) for object_id, entry in entries}
+    """Read labels of the objects by id from a `meta.json`: the detector's, the judge's name without one, or the id."""
+    names = read_object_names(meta)
+    labels = {str(entry["object_id"]): clean_label(str(entry.get("label") or "")) for entry in meta.get("objects", ())}
+    return {key: clean_label(names[key] or key) if label == UNNAMED else label for key, label in labels.items()}
 
 
 FORMATS: dict[str, Callable[[Scene, ModelContents, Mapping[str, str]], dict[str, bytes]]] = {

@@ -358,5 +358,12 @@ def test_a_meta_of_no_scene_is_refused(meta, scene, tmp_path):
         extract_scene(Scene("scene", {}, {**scene.files(), "meta.json": meta}), tmp_path / "new", "urdf")
 
 
-def test_what_has_no_label_is_called_as_its_id():
-    assert read_labels({"objects": [{"object_id": "obj_000"}]}) == {"obj_000": "obj_000"}
+def test_what_no_detector_named_is_called_by_the_judge_or_as_its_id():
+    objects = [
+        {"object_id": "obj_000", "label": "object"},
+        {"object_id": "obj_001"},
+        {"object_id": "obj_002", "label": "mug"},
+    ]
+    judged = {"objects": [{"object_id": f"obj_00{k}", "relabel_name": "white bowl"} for k in (0, 2)]}
+    labels = read_labels({"objects": objects, "assessment": judged})
+    assert labels == {"obj_000": "white bowl", "obj_001": "obj_001", "obj_002": "mug"}
