@@ -365,5 +365,8 @@ def test_what_no_detector_named_is_called_by_the_judge_or_as_its_id():
         {"object_id": "obj_002", "label": "mug"},
     ]
     judged = {"objects": [{"object_id": f"obj_00{k}", "relabel_name": "white bowl"} for k in (0, 2)]}
-    labels = read_labels({"objects": objects, "assessment": judged})
-    assert labels == {"obj_000": "white bowl", "obj_001": "obj_001", "obj_002": "mug"}
+    assert read_labels({"objects": objects, "assessment": judged}) == {
+        "obj_000": "white bowl",
+        "obj_001": "obj_001",
+        "obj_002": "mug",
+    }
