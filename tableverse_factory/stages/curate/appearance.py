@@ -13,19 +13,26 @@ from tableverse_factory.geometry.mesh.hulls import cross_rows
 from tableverse_factory.geometry.relations.relations import BodyFeatures
 from tableverse_factory.stages.curate.lexicon import COLORS
 
+# Colours without a hue, by sRGB from 0 to 1. Black has less value; grey and white have less saturation, or a
+# smaller difference of the largest and the smallest channel; white has more value than grey
 _DARK = 0.16
-_PALE = 0.18
-_DULL = 0.1
-_LIGHT = 80.0
-_TINT = 20.0  # lightness and chroma in CIELAB: a light surface with less chroma is white in tinted light
+_PALE, _DULL = 0.18, 0.1
+_WHITE = 0.72
+_LIGHT, _TINT = 80.0, 20.0  # in CIELAB: a lighter surface with less chroma is white in tinted light
 # Upper end of each hue [degrees]; red wraps around.
 _HUES = ((15, "red"), (40, "orange"), (68, "yellow"), (165, "green"), (255, "blue"), (290, "purple"), (335, "pink"))
-_LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}
 _DIGITS = np.array([65_536, 256, 1])  # weights that pack an sRGB colour into one number
-_ELONGATED = 3.5
-_FLAT = 0.15
-_BASE_M = 0.001
-_NARROW_BASE = 0.35
+
+# Shapes by the sides of a tight box and the share of it that they fill: a box 1, a cylinder 0.79, a ball 0.52
+_CUP_DEPTH = 0.6  # depth from which a vessel is a cup and no bowl, in widths of its opening
+_ELONGATED = 3.5  # longest side of a long object, in middle ones
+_FLAT = 0.15  # shortest side of a flat object, in longest ones
+_BOX_FILL, _CYLINDER_FILL, _BALL_FILL = 0.83, 0.68, (0.42, 0.64)  # least of a box and of a cylinder; range of a ball
+_BALL_SIDES, _CYLINDER_SIDES = 1.2, 1.25  # longest side of a ball and middle one of a cylinder, in shortest ones
+_LEAST_FILL = {"box": 0.55, "can": 0.45, "cylinder": 0.45, "ball": 0.35}  # of what may be called so by someone else
+
+_BASE_M = 0.001  # height over its lowest point of what an object stands on
+_NARROW_BASE = 0.35  # width of that, in widths of the object, below which it can roll
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +82,7 @@ def _classify_colors(rgb: np.ndarray) -> np.ndarray:
     brownish = (hue >= 10) & (hue < 45) & ((value < 0.6) | ((saturation < 0.5) & (value < 0.75)))
     names = np.where(brownish, COLORS.index("brown"), names)
     names = np.where((names == COLORS.index("red")) & (saturation < 0.45) & (value > 0.8), COLORS.index("pink"), names)
-    grey = np.where(value > 0.72, COLORS.index("white"), COLORS.index("grey"))
+    grey = np.where(value > _WHITE, COLORS.index("white"), COLORS.index("grey"))
     names = np.where((saturation < _PALE) | (spread < _DULL), grey, names)
     lightness, *ab = rgb2lab(rgb).T
     names = np.where((lightness >= _LIGHT) & (np.hypot(*ab) < _TINT), COLORS.index("white"), names)
@@ -86,18 +93,18 @@ def name_shape(body: BodyFeatures, size: Vector3, volume_m3: float) -> str:
     """Choose a noun for an unnamed object from its dimensions alone."""
     if body.cavity is not None:
         opening = measure_inscribed_width(body.cavity.cells, body.heights.cell)
-        return "cup" if body.cavity.depth > 0.6 * opening else "bowl"
+        return "cup" if body.cavity.depth > _CUP_DEPTH * opening else "bowl"
     short, middle, long = _measure_tight_box(body, size)
     fill = volume_m3 / max(short * middle * long, 1e-12)
     if long > _ELONGATED * middle:
         return "long object"
     if short < _FLAT * long:
         return "flat object"
-    if fill > 0.83:
+    if fill > _BOX_FILL:
         return "box"
-    if long < 1.2 * short and 0.42 < fill < 0.64:
+    if long < _BALL_SIDES * short and _BALL_FILL[0] < fill < _BALL_FILL[1]:
         return "ball"
-    return "cylinder" if fill > 0.68 and middle < 1.25 * short else "object"
+    return "cylinder" if fill > _CYLINDER_FILL and middle < _CYLINDER_SIDES * short else "object"
 
 
 def may_be_called(noun: str, body: BodyFeatures, size: Vector3, volume_m3: float) -> bool:

@@ -4,16 +4,28 @@ from schemas.curation import CriterionScore, PerCriterion
 from tableverse_factory.stages.curate.judge_input import JudgedObject, JudgeInput
 from tableverse_factory.stages.curate.lexicon import find_head_noun, is_generic
 
+# Weights of the criteria, and the score of an unusable scene at most: those of the paper (appendix, part E and A). It
+# also asks for a penalty below five objects, but does not say which
 WEIGHTS = {"category_diversity": 0.45, "geometric_plausibility": 0.15, "graspability": 0.15, "layout_clarity": 0.25}
-FEW_OBJECTS = 5
 UNUSABLE_CAP = 4
-_MANY_OBJECTS = 10
-_MANY_CATEGORIES = 8
-_BAD_FIT_M = 0.012
-_SHEET_M = 0.0015
-_STRAYED_M = 0.02
-_DEEP_M = 0.02
-_OFF_TABLE_M = -0.005
+FEW_OBJECTS = 5
+_FEW_BONUS = 2  # points that a scene of few objects may have beyond their number
+
+# Numbers of objects and of categories from which more earn nothing, and their weights
+_MANY_OBJECTS, _MANY_CATEGORIES = 10, 8
+_OBJECTS_WEIGHT, _CATEGORIES_WEIGHT = 0.6, 0.4
+
+# Geometry that is bad, and its cost per share of the objects
+_BAD_FIT_M = 0.012  # median distance of a mesh from the observed points
+_SHEET_M = 0.0015  # shortest side of a mesh
+_BAD_GEOMETRY_COST = 1.5
+
+# A layout that is unclear: deepest penetration of the placed pieces that costs all that penetration can, and per share
+# of the objects those whose centre has moved from where it was placed, and whose lowest point is below the table
+_DEEP_M, _DEEP_COST = 0.02, 0.3
+_STRAYED_M, _STRAYED_COST = 0.02, 1.0
+_OFF_TABLE_M, _OFF_TABLE_COST = -0.005, 0.6
+_PARTITIONED_COST = 0.4
 
 
 def score_criteria(
@@ -24,9 +36,10 @@ def score_criteria(
     count = max(len(case.items), 1)
     ungraspable = tuple(index for index in range(len(case.items)) if index not in graspable)
     share = _to_points(len(graspable) / count)
+    sound = _to_points(1 - _BAD_GEOMETRY_COST * len(bad) / count)
     return PerCriterion(
         category_diversity=CriterionScore(score=_score_diversity(names)),
-        geometric_plausibility=CriterionScore(score=_to_points(1 - 1.5 * len(bad) / count), bad_geometry_ids=bad),
+        geometric_plausibility=CriterionScore(score=sound, bad_geometry_ids=bad),
         graspability=CriterionScore(score=share, graspable_ids=graspable, ungraspable_ids=ungraspable),
         layout_clarity=CriterionScore(score=_to_points(_measure_clarity(case, partitioned))),
     )
@@ -34,7 +47,7 @@ def score_criteria(
 
 def compute_final_score(criteria: PerCriterion, n_objects: int, usable: bool) -> int:
     """Compute the weighted mean: below five objects at most two more than objects; at most 4 if unusable."""
-    few = n_objects + 2 if n_objects < FEW_OBJECTS else 10
+    few = n_objects + _FEW_BONUS if n_objects < FEW_OBJECTS else 10
     return min(max(int(weigh_criteria(criteria) + 0.5), 1), few, 10 if usable else UNUSABLE_CAP)
 
 
@@ -51,7 +64,8 @@ def has_bad_geometry(item: JudgedObject) -> bool:
 def _score_diversity(names: tuple[str, ...]) -> int:
     """Score the numbers of objects and categories; below five objects no more points than objects."""
     categories = {name if is_generic(name) else find_head_noun(name) for name in names}
-    points = _to_points(0.6 * min(len(names) / _MANY_OBJECTS, 1.0) + 0.4 * min(len(categories) / _MANY_CATEGORIES, 1.0))
+    objects, kinds = min(len(names) / _MANY_OBJECTS, 1.0), min(len(categories) / _MANY_CATEGORIES, 1.0)
+    points = _to_points(_OBJECTS_WEIGHT * objects + _CATEGORIES_WEIGHT * kinds)
     return min(points, max(len(names), 1)) if len(names) < FEW_OBJECTS else points
 
 
@@ -61,7 +75,9 @@ def _measure_clarity(case: JudgeInput, partitioned: bool) -> float:
     strayed = sum(item.displacement_m > _STRAYED_M for item in case.items) / count
     sunk = sum(float(item.body.low[2]) < _OFF_TABLE_M for item in case.items) / count
     clipping = min(case.penetration_before_m / _DEEP_M, 1.0)
-    return 1.0 - 0.3 * clipping - 1.0 * strayed - 0.6 * sunk - 0.4 * partitioned
+    return (
+        1.0 - _DEEP_COST * clipping - _STRAYED_COST * strayed - _OFF_TABLE_COST * sunk - _PARTITIONED_COST * partitioned
+    )
 
 
 def _to_points(share: float) -> int:

@@ -10,10 +10,11 @@ from tableverse_factory.geometry.math.planes import Points2, compute_convex_outl
 from tableverse_factory.stages.perceive.base.table_view import TableView
 from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import surrounds
 
-SAMPLES = 1500
-MIN_OVER = 0.7
-BELOW_RIM_M = 0.02
-WALL_M = 0.01
+SAMPLES = 1500  # pixels that stand for a larger region, or up to twice as many
+MIN_OVER = 0.7  # least share of the content, and of its foot, that is over the holder's footprint
+INSET_M = 0.01  # from the edge of that footprint, within which a content lies
+BELOW_RIM_M = 0.02  # least height of the holder's rim over the lowest part of its content
+FOOT_M = 0.01  # height of a content's foot over its lowest part; what surrounds the content as walls is higher
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +60,8 @@ def _lies_in(inner: _RegionShape, holder: _RegionShape) -> bool:
     """
     if inner.low > holder.rim - BELOW_RIM_M or inner.rim < holder.low:
         return False
-    over = is_inside_outline(holder.footprint, inner.xy, -WALL_M)
-    if min(float(over.mean()), float(over[inner.heights <= inner.low + WALL_M].mean())) < MIN_OVER:
+    over = is_inside_outline(holder.footprint, inner.xy, -INSET_M)
+    if min(float(over.mean()), float(over[inner.heights <= inner.low + FOOT_M].mean())) < MIN_OVER:
         return False
-    walls = holder.xy[holder.heights > inner.low + WALL_M]
+    walls = holder.xy[holder.heights > inner.low + FOOT_M]
     return len(walls) > 0 and surrounds(walls, inner.xy.mean(axis=0))

@@ -15,38 +15,45 @@ from tableverse_factory.stages.perceive.base.table_view import TableView, expand
 from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, shift_image
 from tableverse_factory.stages.perceive.depth_segmenter.vessel_floors import (
     NEAR_PX,
-    RIM_PX,
+    TOUCHING_PX,
     find_floors,
     is_wall_of_floor,
     surrounds,
 )
 
-SAMPLES = 400
-TANGENT_PLANES = 60
-ON_PLANE_M = 0.006
-SAME_DIRECTION_COS = 0.94
-CONTINUED = 0.55
-PART_CONTINUED = 0.9
-WHOLE_CONTINUED = 0.25
-MAX_GAP_M = 0.15
-CHORD_ENDS = 10
-MIN_CONSISTENT = 0.85
-MIN_HIDDEN = 0.3
-NEARER_M = 0.012
-MIN_STEP = 0.2  # length of a step between two regions, in square roots of the smaller one's pixels
+SAMPLES = 400  # pixels that stand for a larger region, or up to twice as many
+TANGENT_PLANES = 60  # of these, the points whose tangent planes are compared, about
 
-ACROSS_PX = 4
-IN_FOOTPRINT = 0.85
-RIM_SLACK_M = 0.005
-RIM_DEPTH_M = 0.03
-BACK_RIM_M = 0.015
-PARTLY_IN_FOOTPRINT = 0.6
-MIN_RIM_PX = 8
-HOLLOW_BULGE = -0.15
-FLAT_BULGE = 0.2
-SCRAP_SHARE = 0.25
-NEAR_SLACK_M = 0.005
-MAX_IN_FRONT = 0.3
+# Parts of one object that an occluder separates: a point continues a region if it lies so near to one of its tangent
+# planes and faces the same way, at most 20 degrees off. Of either region at least a share of `CONTINUED` does, or
+# nearly all of one and some of the other
+ON_PLANE_M, SAME_DIRECTION_COS = 0.006, 0.94
+CONTINUED, PART_CONTINUED, WHOLE_CONTINUED = 0.55, 0.9, 0.25
+MAX_GAP_M = 0.15  # least distance of their points from one another up to which two regions may be one object
+CHORD_ENDS = 10  # points of each region from which chords lead to those of the other, about
+# Least shares of the chords that show nothing behind them, up to a tenth of their pixels, and that are hidden, at
+# three pixels or more
+MIN_CONSISTENT, MIN_HIDDEN = 0.85, 0.3
+MAX_BEHIND, MIN_HIDDEN_PX = 0.1, 3
+NEARER_M = 0.012  # least difference in depth by which one surface is in front of another
+ACROSS_PX = 4  # depths are compared at this distance across the border of two regions
+# Length of a step between two regions from which they are two objects, in square roots of the smaller one's pixels
+MIN_STEP_LENGTH = 0.2
+
+# The inside of a vessel is told by three signs: where it lies, what is seen over what, and its own shape
+FOOTPRINT_SLACK_M = 0.002  # what is so far outside a wall's footprint still lies over it
+# Least share of the inside over it; the latter where it is also seen over the wall
+IN_FOOTPRINT, PARTLY_IN_FOOTPRINT = 0.85, 0.6
+# Most that its rim may be above the wall's: by where it lies; where it is also seen over the wall; and in a hollow, of
+# which it may also be so far below
+RIM_SLACK_M, BACK_RIM_M, HOLLOW_RIM_M = 0.005, 0.015, 0.03
+MIN_RIM_PX = 8  # length of the border along which it is seen behind the wall's rim
+MAX_IN_FRONT = 0.3  # most share of the steps at their border at which it is the nearer one: rims are noisy
+NEAR_SLACK_M = 0.005  # by how much the wall may begin farther from the camera, along the table
+# Bulge of a region, see `measure_bulge`: 0 for a plane, the mean chord over the radius for a sphere
+HOLLOW_BULGE, FLAT_BULGE = -0.15, 0.2  # most of a hollow, and of any inside or wall of a vessel: contents bulge more
+MIN_CHORD_M = 0.005  # shorter chords tell nothing of it
+SCRAP_SHARE = 0.25  # of a floor's pixels: a smaller region may be its wall however it bulges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +121,7 @@ def _find_other_part(
     for a in sorted(range(len(regions)), key=lambda k: -regions[k].size):
         if regions[a].size <= regions[b].size:
             return None
-        if max(nearer[a + 1, b + 1], nearer[b + 1, a + 1]) >= MIN_STEP * regions[b].size ** 0.5:
+        if max(nearer[a + 1, b + 1], nearer[b + 1, a + 1]) >= MIN_STEP_LENGTH * regions[b].size ** 0.5:
             continue
         if is_continuation(regions[a], regions[b]) and is_hidden_between(regions[a], regions[b], surface):
             return a
@@ -147,7 +154,7 @@ def _add_floors(ids: IdImage, regions: list[MergedRegion], pairs: list[tuple[int
             continue
         part = expand_window(floor, NEAR_PX)
         floor_there, ids_there, color = floor[part], ids[part], view.observation.color[part]
-        around = np.unique(ids_there[ndimage.binary_dilation(floor_there, iterations=RIM_PX)])
+        around = np.unique(ids_there[ndimage.binary_dilation(floor_there, iterations=TOUCHING_PX)])
         walls = [
             int(a)
             for a in around[around > 0]
@@ -186,7 +193,7 @@ def is_hollow_of(
     """
     if own_shape > FLAT_BULGE or holder.near > inner.near + NEAR_SLACK_M:
         return False
-    over = float(is_inside_outline(holder.footprint, inner.xy, 0.002).mean())
+    over = float(is_inside_outline(holder.footprint, inner.xy, FOOTPRINT_SLACK_M).mean())
     rise = inner.rim - holder.rim
     never_in_front = inner_nearer <= MAX_IN_FRONT * (inner_nearer + holder_nearer)
     seen_over_rim = never_in_front and holder_nearer >= MIN_RIM_PX
@@ -194,7 +201,7 @@ def is_hollow_of(
         return True
     if rise <= BACK_RIM_M and over >= PARTLY_IN_FOOTPRINT and seen_over_rim:
         return True
-    return abs(rise) < RIM_DEPTH_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW_BULGE
+    return abs(rise) < HOLLOW_RIM_M and (seen_over_rim or over >= IN_FOOTPRINT) and own_shape < HOLLOW_BULGE
 
 
 def measure_bulge(region: MergedRegion) -> float:
@@ -204,7 +211,7 @@ def measure_bulge(region: MergedRegion) -> float:
     across, turn = points[:, None] - points[None], normals[:, None] - normals[None]
     length = np.linalg.norm(across, axis=-1)
     spread = np.einsum("ijk,ijk->ij", across, turn) / np.maximum(length, 1e-9)
-    return float(spread[length > 0.005].mean()) if (length > 0.005).any() else 0.0
+    return float(spread[length > MIN_CHORD_M].mean()) if (length > MIN_CHORD_M).any() else 0.0
 
 
 def is_continuation(a: MergedRegion, b: MergedRegion) -> bool:
@@ -247,4 +254,4 @@ def _trace_chord(a: MergedRegion, i: int, b: MergedRegion, j: int, surface: Surf
     seen = surface.points[rows, columns, 2]
     behind = seen > expected + NEARER_M
     hidden = (seen == 0) | (seen < expected - NEARER_M)
-    return float(behind.mean()) < 0.1, int(hidden.sum()) >= 3
+    return float(behind.mean()) < MAX_BEHIND, int(hidden.sum()) >= MIN_HIDDEN_PX

@@ -15,12 +15,13 @@ from schemas.geometry import IdImage, Mask
 from tableverse_factory.stages.perceive.base.object_filter import renumber_regions
 from tableverse_factory.stages.perceive.depth_segmenter.surface import DIRECTIONS, Surface, measure_border, shift_image
 
-SEED_SPACING_M = 0.013
-COMPACTNESS = 0.02
-MERGED_BELOW = 1.0
-MAX_JUMP_M = 0.02
-SHORT_BORDER = 2.0
-MAX_GAP_PX = 4
+SEED_SPACING_M = 0.013  # distance of the seeds of patches at the depth of the objects
+MIN_SPACING_PX, MAX_SPACING_PX = 6, 16  # bounds of it in the picture
+COMPACTNESS = 0.02  # of the patches, see `skimage.segmentation.watershed`: 0 lets them follow borders alone
+MERGED_BELOW = 1.0  # strength of a border up to which patches are merged; 1 is certain, see `Surface.borders`
+SHORT_BORDER = 2.0  # length below which a border counts as stronger, in square roots of the smaller region's pixels
+MAX_GAP_PX = 4  # patches so far apart touch if nothing was read between them
+MAX_JUMP_M = 0.02  # border pixels join no region over a larger jump in depth
 
 
 class Link(NamedTuple):
@@ -37,7 +38,7 @@ Links = dict[int, dict[int, Link]]  # of each patch with its neighbours
 
 def oversegment(borders: Float64[np.ndarray, "h w"], mask: Mask, pitch_m: float) -> IdImage:
     """Split the mask into small patches that respect borders by a compact watershed from a grid of seeds."""
-    spacing = int(np.clip(round(SEED_SPACING_M / pitch_m), 6, 16))
+    spacing = int(np.clip(round(SEED_SPACING_M / pitch_m), MIN_SPACING_PX, MAX_SPACING_PX))
     seeds = np.zeros(mask.shape, dtype=np.int32)
     grid = seeds[spacing // 2 :: spacing, spacing // 2 :: spacing]
     grid[...] = np.arange(1, grid.size + 1).reshape(grid.shape)

@@ -14,27 +14,31 @@ from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.planes import Points2
 from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise, expand_window
 
-UPWARDS_PX = 2
-MAX_CONTOUR = 250
-MIN_CONTOUR = 16
-TRIES = 160
-TOLERANCE_M = 0.004
-NOISES = 2.5
-MIN_RADIUS_M, MAX_RADIUS_M = 0.025, 0.17
-MIN_RIM_M = 0.012
-SECTORS = 36
-MIN_SECTORS = 9
-MIN_OWN = 0.35
-HOLLOW_M = 0.008
-MIN_HOLLOW_SHARE = 0.08
-MIN_HOLLOW_PX = 60
-THROUGH_M = 0.012
-MAX_THROUGH = 0.04
-MAX_LEVEL = 0.5
-MAX_MISSING = 0.15
-BESIDE_PX = 2
-BESIDE_M = 0.025
-REFINEMENTS = 3
+UPWARDS_PX = 2  # a pixel is of an upper contour if its region has ended so many rows above
+# Pixels of an upper contour: with fewer no circle is looked for; of more, from so many to twice as many are used
+MIN_CONTOUR_PX, CONTOUR_SAMPLES = 16, 250
+TRIES = 160  # circles through three of them
+MIN_TRIANGLE_M2 = 1e-5  # four times the area of three points: smaller ones are in line
+# Most distance of a rim's points from its circle, along the table and in height: the larger of [m] and deviations of
+# the sensor's noise
+TOLERANCE_M, NOISES = 0.004, 2.5
+REFINEMENTS = 3  # least-squares fits of the circle, each to the points near the last one
+MIN_RADIUS_M, MAX_RADIUS_M = 0.025, 0.17  # of a rim
+MIN_RIM_M = 0.012  # least height of a rim over the table
+MIN_OWN = 0.35  # least share of a region's upper contour that is on the circle found from it
+RIM_SECTORS, MIN_RIM_SECTORS = 36, 9  # directions around a rim, and in how many of them it must be visible
+MIN_CAMERA_RISE = 0.25  # least height of the camera over a rim, in radii of the rim
+OPENING = 0.92  # radius of the opening, in radii of the rim
+
+# What is seen through the opening: a hollow, no lid, and nothing beyond the walls
+HOLLOW_M = 0.008  # below the rim from which it is in the hollow; what is nearer to the rim's height is level with it
+MIN_HOLLOW_SHARE, MIN_HOLLOW_PX = 0.08, 60  # least share of the opening's pixels in the hollow, and least number
+MAX_LEVEL = 0.5  # most share of the opening's pixels that is level with the rim: more are a lid
+THROUGH_M = 0.012  # distance beyond the wall from which something was seen through it
+MAX_THROUGH = 0.04  # most share of the opening's pixels that show what is beyond the wall
+MAX_MISSING = 0.15  # most share of the circle where only what is behind it is seen, so that no wall is there
+BESIDE_PX = 2  # around a point of the circle where its wall is looked for; the margin of a rim's window
+BESIDE_M = 0.025  # outside the circle: so far reaches a rim's window, and so far away a handle may begin
 
 Circle = tuple[float, float, float, float]  # x, y, radius and height [m]
 
@@ -47,7 +51,7 @@ class Rim(Frozen):
     radius: float
     height: float
     floor: float  # 5th percentile of the heights inside [m]
-    sectors: int  # number of the `SECTORS` directions in which it is visible
+    sectors: int  # number of the `RIM_SECTORS` directions in which it is visible
     within: Mask  # pixels seen through its disc, below its height
     window: tuple[slice, slice]  # with all of `within`, all nearer than `BESIDE_M` to its disc, and `BESIDE_PX` around
 
@@ -60,7 +64,7 @@ def find_rims(ids: IdImage, view: TableView) -> list[Rim]:
     """Find the rims along the upper contours of the regions, the most complete first, without duplicates."""
     contour = _find_upper_contour(ids, view.valid)
     rows, columns = np.nonzero(contour)
-    if len(rows) < MIN_CONTOUR:
+    if len(rows) < MIN_CONTOUR_PX:
         return []
     points = view.points_camera[rows, columns]
     owner, xy, heights = ids[rows, columns], view.xy(points), view.heights[rows, columns]
@@ -69,8 +73,8 @@ def find_rims(ids: IdImage, view: TableView) -> list[Rim]:
     found = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         own = np.flatnonzero(owner == k)
-        own = own[:: max(1, len(own) // MAX_CONTOUR)]
-        circle = _find_circle(xy[own], heights[own], tolerance, rng) if len(own) >= MIN_CONTOUR else None
+        own = own[:: max(1, len(own) // CONTOUR_SAMPLES)]
+        circle = _find_circle(xy[own], heights[own], tolerance, rng) if len(own) >= MIN_CONTOUR_PX else None
         for _ in range(REFINEMENTS):
             circle = None if circle is None else _refine_circle(circle, xy, heights, tolerance)
         if circle is None or float(_is_on_circle(circle, xy[own], heights[own], tolerance).mean()) < MIN_OWN:
@@ -99,7 +103,7 @@ def _find_circle(
     level = np.ptp(heights[picks], axis=1) < 2 * tolerance
     ab, ac = b - a, c - a
     twice = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    usable = level & (np.abs(twice) > 1e-5)
+    usable = level & (np.abs(twice) > MIN_TRIANGLE_M2)
     if not usable.any():
         return None
     ab, ac, twice = ab[usable], ac[usable], twice[usable]
@@ -126,7 +130,7 @@ def _is_on_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"
 def _refine_circle(circle: Circle, xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
     """Fit a circle by least squares (Kåsa 1976) to all contour points near it; None where they form none."""
     near = _is_on_circle(circle, xy, heights, 1.5 * tolerance)
-    if int(near.sum()) < MIN_CONTOUR:
+    if int(near.sum()) < MIN_CONTOUR_PX:
         return None
     part = xy[near]
     middle = part.mean(axis=0)
@@ -143,12 +147,12 @@ def _validate_rim(circle: Circle, shown_xy: Points2, xy: Float64[np.ndarray, "h 
     """Accept a rim if enough of it is visible, with a hollow inside, no lid, and nothing visible beyond its walls."""
     x, y, radius, height = circle
     turns = np.arctan2(shown_xy[:, 1] - y, shown_xy[:, 0] - x) / (2 * np.pi)
-    sectors = len(np.unique(np.floor(turns * SECTORS)))
+    sectors = len(np.unique(np.floor(turns * RIM_SECTORS)))
     camera_height = float(view.plane.heights(np.zeros((1, 3)))[0])
-    if sectors < MIN_SECTORS or camera_height <= height + radius / 4:
+    if sectors < MIN_RIM_SECTORS or camera_height <= height + MIN_CAMERA_RISE * radius:
         return None
     along = (camera_height - height) / np.maximum(camera_height - view.heights, 1e-6)
-    seen = view.valid & (_compute_length(xy[..., 0] * along - x, xy[..., 1] * along - y) < 0.92 * radius)
+    seen = view.valid & (_compute_length(xy[..., 0] * along - x, xy[..., 1] * along - y) < OPENING * radius)
     below, off = seen & (view.heights < height - HOLLOW_M), _compute_length(xy[..., 0] - x, xy[..., 1] - y)
     hollow, through = below & (off < radius), below & (off > radius + THROUGH_M)
     least = max(MIN_HOLLOW_PX, MIN_HOLLOW_SHARE * int(seen.sum()))
@@ -172,7 +176,7 @@ def _compute_length(
 def _measure_missing(circle: Circle, view: TableView) -> float:
     """Measure the share of the circle where the picture shows what lies behind it, so that no wall is there."""
     x, y, radius, height = circle
-    turns = np.linspace(0.0, 2 * np.pi, 2 * SECTORS, endpoint=False)
+    turns = np.linspace(0.0, 2 * np.pi, 2 * RIM_SECTORS, endpoint=False)
     level = np.full(len(turns), height + view.plane.offset)
     points = np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns), level]) @ view.axes
     columns, rows = np.round(project(points, view.observation.camera)).astype(np.int64).T

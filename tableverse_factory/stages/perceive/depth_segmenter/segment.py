@@ -32,12 +32,11 @@ from tableverse_factory.stages.perceive.depth_segmenter.vessels import (
     merge_vessel_walls,
 )
 
-WORKING_PIXELS = 350_000
-MARGIN_PX = 12
-MIN_CORE_M2 = 0.0003
-MIN_PIXELS = 120
-MOSTLY_INSIDE = 0.6
-MAX_HOLE_PX = 60
+WORKING_PIXELS = 350_000  # of a picture: larger ones are thinned to it
+MARGIN_PX = 12  # around what rises, of the part of the picture that is looked at
+MIN_CORE_M2, MIN_PIXELS = 0.0003, 120  # least area and pixels of a region
+MOSTLY_INSIDE = 0.6  # share of a region from which it is in a box
+MAX_HOLE_PX = 60  # larger holes are no lost readings
 
 
 def detect_from_depth(view: TableView, _config: Config, _services: Services) -> DetectionResult:

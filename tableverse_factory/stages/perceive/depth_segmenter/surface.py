@@ -15,14 +15,25 @@ from schemas.geometry import Camera, DepthImage, Frozen
 from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.stages.perceive.base.table_view import compute_depth_noise
 
-NORMAL_RADIUS_M = 0.007
+NORMAL_RADIUS_M = 0.007  # of the disc to which a normal is fitted, at the depth of the objects
+MIN_RADIUS_PX, MAX_RADIUS_PX = 2, 8  # bounds of it in the picture
+# Difference in depth up to which a reading is of the same surface, in [m] and in deviations of the noise: to fit a
+# normal the larger of the first two, and half the disc's radius more; to average the last
+SAME_SURFACE_M, SAME_SURFACE_NOISES, SMOOTHED_NOISES = 0.008, 3, 4
+MIN_READINGS = 5  # that support a normal
+MIN_SPREAD = 0.05  # least determinant of their covariance [px⁴], at a spacing of 1 px: readings in a line have less
+# Border of strength 1: how much normals lean towards each other (1.41 at a right-angled crease), and a step in
+# deviations of the noise, but never a smaller one than `MIN_STEP_M`
 CONCAVITY_OF_BORDER = 0.7
-STEP_OF_BORDER = 4.0
-MIN_STEP_M = 0.006
-STRONGEST = 2.0
+STEP_OF_BORDER, MIN_STEP_M = 4.0, 0.006
+STRONGEST = 2.0  # a border that is stronger counts as so strong
+BLUR_PX = 0.7  # standard deviation by which borders are blurred
+# Distance of two points from which a step is between them and no crease is measured, in units of the radius at which
+# normals are compared. The radius is in pixels, which count as wide as with this focal length, whatever the camera's
+MAX_ACROSS, FOCAL_PX = 6, 500
 
 Pixels = tuple[np.ndarray, np.ndarray]  # rows and columns
-DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns to half of the eight neighbours: pairs count once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,16 +48,16 @@ class Surface(Frozen):
 def compute_surface(depth: DepthImage, camera: Camera, typical_depth_m: float) -> Surface:
     """Compute the surface of a depth image, its scale set for objects at `typical_depth_m` from the camera."""
     pitch = typical_depth_m / camera.fx
-    radius = int(np.clip(round(NORMAL_RADIUS_M / pitch), 2, 8))
+    radius = int(np.clip(round(NORMAL_RADIUS_M / pitch), MIN_RADIUS_PX, MAX_RADIUS_PX))
     noise = compute_depth_noise(depth)
     smooth = _smooth_depth(np.asarray(depth, dtype=np.float64), noise)
     points = backproject(smooth, camera)
-    reach = np.maximum(0.008, 3 * noise) + 0.5 * radius * pitch
+    reach = np.maximum(SAME_SURFACE_M, SAME_SURFACE_NOISES * noise) + 0.5 * radius * pitch
     normals = fit_normals(smooth, camera, radius, reach)
     bend = np.maximum(*(_measure_concavity(points, normals, r) for r in (max(1, round(0.6 * radius)), radius)))
     step = _measure_steps(points, normals) / np.maximum(MIN_STEP_M, STEP_OF_BORDER * noise)
     borders = np.minimum(np.maximum(bend / CONCAVITY_OF_BORDER, step), STRONGEST)
-    return Surface(points, normals, ndimage.gaussian_filter(borders, 0.7))
+    return Surface(points, normals, ndimage.gaussian_filter(borders, BLUR_PX))
 
 
 def measure_border(surface: Surface, first: Pixels, second: Pixels) -> Float64[np.ndarray, " n"]:
@@ -79,7 +90,7 @@ def _smooth_depth(depth: Float64[np.ndarray, "h w"], noise: Float64[np.ndarray, 
         total, count = np.zeros_like(depth), np.zeros_like(depth)
         for rows, columns in product((-1, 0, 1), repeat=2):
             other = shift_image(depth, rows, columns)
-            near = (other > 0) & (np.abs(other - depth) < 4 * noise)
+            near = (other > 0) & (np.abs(other - depth) < SMOOTHED_NOISES * noise)
             total += np.where(near, other, 0.0)
             count += near
         depth = np.where(depth > 0, total / np.maximum(count, 1), 0.0)
@@ -92,7 +103,7 @@ def fit_normals(
     """Fit normals by regression over a disc of pixels: a plane's inverse depth is linear in the pixel coordinates.
 
     Readings further in depth than `reach` [m] belong to another surface; `radius` is in pixels. Returns unit vectors
-    towards the camera, zero where fewer than five readings support one.
+    towards the camera, zero where fewer than `MIN_READINGS` support one.
     """
     valid = depth > 0
     near_depth, limit = depth.astype(np.float32), reach.astype(np.float32)
@@ -117,7 +128,7 @@ def fit_normals(
     u, v, d = u / n, v / n, d / n
     uu, uv, vv, ud, vd = uu / n - u * u, uv / n - u * v, vv / n - v * v, ud / n - u * d, vd / n - v * d
     determinant = uu * vv - uv * uv
-    usable = valid & (count >= 5) & (determinant > 0.05 * step**4)
+    usable = valid & (count >= MIN_READINGS) & (determinant > MIN_SPREAD * step**4)
     determinant = np.where(usable, determinant, 1.0)
     a, b = (ud * vv - vd * uv) / determinant, (vd * uu - ud * uv) / determinant
     pixel_v, pixel_u = np.indices(depth.shape, dtype=np.float64)
@@ -143,7 +154,7 @@ def _measure_concavity(
         turn = shift_image(normals, -rows, -columns) - shift_image(normals, rows, columns)
         length = np.linalg.norm(across, axis=-1)
         lean = np.einsum("ijk,ijk->ij", turn, across) / np.maximum(length, 1e-9)
-        near = length < 6 * radius * points[..., 2] / 500
+        near = length < MAX_ACROSS * radius * points[..., 2] / FOCAL_PX
         fits = known & near & shift_image(known, rows, columns) & shift_image(known, -rows, -columns)
         most = np.maximum(most, np.where(fits, lean, 0.0))
     return most

@@ -9,21 +9,19 @@ from schemas.geometry import IdImage, Mask, Picture
 from tableverse_factory.geometry.math.planes import Points2, compute_convex_outline, is_inside_outline
 from tableverse_factory.stages.perceive.base.table_view import TableView
 
-LAB_BINS = (6.0, 4.0, 4.0)
-RARE_ON_TABLE = 0.03
-AWAY_PX = 6
-MIN_TABLE_PIXELS = 2000
-MIN_FLOOR_PIXELS = 150
-MIN_ENCLOSED = 0.5
+LAB_BINS = (6.0, 4.0, 4.0)  # of the histogram of the table's colours, in CIELAB
+RARE_ON_TABLE = 0.03  # share of the table's own pixels whose colours are so rare on it that they may be a floor's
+AWAY_PX = 6  # from what rises, of the pixels that tell the table's colours
+MIN_TABLE_PIXELS = 2000  # of these
+MIN_FLOOR_PIXELS = 150  # also of a part that rises around floors
+MIN_ENCLOSED = 0.5  # least share of a floor's surroundings that rises or has no reading
 
-CHROMA_BIN = 6.0
-NEAR_PX = 10
-SAME_COLOR = 0.3
-SAME_LIGHTNESS = 40.0
-MIN_TOUCH_PX = 8
-RIM_PX = 4
-SECTORS = 12
-MIN_SECTORS = 8
+TOUCHING_PX, NEAR_PX = 4, 10  # from a floor: what touches it, and where colours are compared with its own
+MIN_TOUCH_PX = 8  # least number of a wall's pixels that touch its floor
+CHROMA_BIN = 6.0  # of the histograms of a wall's and a floor's colours, in a and b of CIELAB
+SAME_COLOR = 0.3  # least overlap of those histograms; 1 where they are equal
+SAME_LIGHTNESS = 40.0  # most difference of their median lightness in CIELAB
+SIDES, MIN_SIDES = 12, 8  # directions around what walls surround, and in how many of them walls are
 
 
 def find_floors(view: TableView) -> IdImage:
@@ -42,9 +40,9 @@ def find_floors(view: TableView) -> IdImage:
     for k, part in enumerate(ndimage.find_objects(patches, count), start=1):
         if part is None:
             continue
-        window = tuple(slice(max(s.start - RIM_PX, 0), s.stop + RIM_PX) for s in part)
+        window = tuple(slice(max(s.start - TOUCHING_PX, 0), s.stop + TOUCHING_PX) for s in part)
         mask = patches[window] == k
-        rim = ndimage.binary_dilation(mask, iterations=RIM_PX) & ~mask
+        rim = ndimage.binary_dilation(mask, iterations=TOUCHING_PX) & ~mask
         if int(mask.sum()) >= MIN_FLOOR_PIXELS and float(bounded[window][rim].mean()) >= MIN_ENCLOSED:
             result[window][mask] = int(result.max()) + 1
     return result
@@ -77,7 +75,7 @@ def _find_unlike_table(lab: Float64[np.ndarray, "h w 3"], table: Mask) -> Mask:
 def is_wall_of_floor(floor: Mask, region: Mask, color: Picture) -> bool:
     """Whether the region touches the floor and has its colour there: the wall of the same vessel."""
     near = region & ndimage.binary_dilation(floor, iterations=NEAR_PX)
-    touching = region & ndimage.binary_dilation(floor, iterations=RIM_PX)
+    touching = region & ndimage.binary_dilation(floor, iterations=TOUCHING_PX)
     if int(touching.sum()) < MIN_TOUCH_PX:
         return False
     a, b = rgb2lab(color[floor][None])[0], rgb2lab(color[near][None])[0]
@@ -89,8 +87,8 @@ def is_wall_of_floor(floor: Mask, region: Mask, color: Picture) -> bool:
 def surrounds(walls_xy: Points2, center_xy: Float64[np.ndarray, "2"]) -> bool:
     """Whether the walls stand in most directions around the centre; a shadow has its object on one side."""
     around = walls_xy - center_xy
-    sectors = np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * SECTORS).astype(np.int64) % SECTORS
-    return len(np.unique(sectors)) >= MIN_SECTORS
+    sectors = np.floor(np.arctan2(around[:, 1], around[:, 0]) / (2 * np.pi) * SIDES).astype(np.int64) % SIDES
+    return len(np.unique(sectors)) >= MIN_SIDES
 
 
 def _build_chroma_histogram(lab: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "44 44"]:

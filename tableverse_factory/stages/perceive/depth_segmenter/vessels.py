@@ -12,25 +12,30 @@ from tableverse_factory.stages.perceive.depth_segmenter.containment import find_
 from tableverse_factory.stages.perceive.depth_segmenter.rims import BESIDE_M, Rim
 from tableverse_factory.stages.perceive.depth_segmenter.surface import Surface
 
-WALL_M = 0.006
-STEP_M = 0.004
-LEVEL = 0.7
-OUTERMOST = 97.0
-OWN_SHARE = 0.75
-MIN_WALL_PX = 12
+WALL_M = 0.006  # how far from its circle, its height, its lining or its floor a vessel's own pixel may be
+LINING_STEP_M = 0.004  # height of the steps in which the inside of a wall is measured
+OUTERMOST_PERCENT = 97.0  # percentile of a step's distances from the axis that is the wall
+LEVEL_COS = 0.7  # between the normals of a floor and the table: up to 46 degrees
+OWN_SHARE = 0.75  # least share of a region that is a vessel's from which it is one of its walls
+MIN_WALL_PX = 12  # least pixels of a wall at the rim, of a step of its inside, and of a long object
+# Least depth of a vessel that holds something, the larger of [m] and rim radii; the former if it has a handle
 MIN_DEPTH_M, MIN_DEPTH = 0.02, 0.3
-REACHES_IN_M = 0.025
-RISES_M = 0.015
-TOP_PERCENT = 97.0
-FEET_M = 0.012
-INNER_M = 0.002
-FEET_PERCENT = 15.0
-FEET_INSIDE = 0.5
-MOSTLY_OVER = 0.75
-POINTS_IN_M = 0.06
-LONG = 3.0
-UPRIGHT = 0.4
-HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3
+
+# What stands in a vessel: its foot is over the opening and inside it, or most of it is over the opening, or its axis
+# points into it
+FEET_M, FEET_PERCENT = 0.012, 15.0  # the foot: height over the lowest part, or percentile of heights if that is more
+INNER_M = 0.002  # within the rim's circle
+FEET_INSIDE, MOSTLY_OVER = 0.5, 0.75  # least shares of the foot and of the whole
+# Most height over the rim of its lowest visible part; the latter if it points in
+REACHES_IN_M, POINTS_IN_M = 0.025, 0.06
+TOP_PERCENT, RISES_M = 97.0, 0.015  # percentile of heights that is a top; its least height over the rim if it rises
+
+# Long objects, by the axis of their points
+LONG = 3.0  # least ratio of the spread along the axis to that across it
+BREADTHS = 4.0  # deviations across the axis that are the breadth
+UPRIGHT_COS = 0.4  # between the axis and the vertical: what leans out has more, and a handle less
+HANDLE_JOINT_M = 0.025  # most difference in height of a handle's beginning and the rim
+HANDLE_BREADTH, HANDLE_MISS = 0.6, 0.3  # most breadth, and distance at which its axis passes the rim's, in rim radii
 
 Distances = Float64[np.ndarray, "h w"]  # of the pixels of a rim's window [m]
 
@@ -44,7 +49,7 @@ def merge_vessel_walls(ids: IdImage, found: list[Rim], surface: Surface, view: T
     if not found:
         return ids
     result, xy = ids.copy(), view.xy(view.points_camera)
-    level = surface.normals @ view.plane.normal > LEVEL
+    level = surface.normals @ view.plane.normal > LEVEL_COS
     for rim in found:
         near, off = rim.window, rim.distance(xy[rim.window])
         own = _find_own_pixels(rim, off, level[near], view)
@@ -71,13 +76,13 @@ def _find_own_pixels(rim: Rim, off: Distances, level: Mask, view: TableView) -> 
 
 def _find_lining(rim: Rim, off: Distances, level: Mask, heights: Distances) -> Mask:
     """Find the visible inside of the vessel: its floor, and at each height what is as far out as its wall there."""
-    within, steps = rim.within[rim.window], int(rim.height / STEP_M) + 1
-    step = np.clip(heights / STEP_M, 0, steps).astype(np.int64)
+    within, steps = rim.within[rim.window], int(rim.height / LINING_STEP_M) + 1
+    step = np.clip(heights / LINING_STEP_M, 0, steps).astype(np.int64)
     wall = np.zeros(steps + 1)
     for k in range(steps + 1):
         distances = off[within & (step == k)]
         if len(distances) >= MIN_WALL_PX:
-            wall[k] = min(float(np.percentile(distances, OUTERMOST)), rim.radius)
+            wall[k] = min(float(np.percentile(distances, OUTERMOST_PERCENT)), rim.radius)
     wall = np.maximum.accumulate(wall)
     floor = level & (heights < rim.floor + WALL_M)
     return within & (floor | (off > wall[step] - WALL_M))
@@ -186,7 +191,7 @@ def _stands_in(seen: tuple[np.ndarray, ...], rim: Rim, xy: np.ndarray, view: Tab
 def _points_in(xy: Points2, heights: Float64[np.ndarray, " n"], rim: Rim) -> bool:
     """Whether a long object leans out of the rim: its axis, extended downwards, passes through the opening."""
     line = _fit_long_axis(xy, heights)
-    if line is None or abs(line[1][2]) < UPRIGHT:
+    if line is None or abs(line[1][2]) < UPRIGHT_COS:
         return False
     middle, axis, _ = line
     foot = middle + axis * (rim.height - middle[2]) / axis[2]
@@ -198,7 +203,7 @@ def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
     seen = mask & view.valid
     off, heights = rim.distance(xy[seen]), view.heights[seen]
     line = _fit_long_axis(xy[seen], heights)
-    if line is None or abs(line[1][2]) > UPRIGHT or float(np.percentile(heights, 5)) < rim.height / 2:
+    if line is None or abs(line[1][2]) > UPRIGHT_COS or float(np.percentile(heights, 5)) < rim.height / 2:
         return False
     middle, axis, breadth = line
     (x, y), (along_x, along_y) = middle[:2] - rim.center, axis[:2]
@@ -209,7 +214,7 @@ def _is_handle(mask: Mask, rim: Rim, xy: np.ndarray, view: TableView) -> bool:
         -WALL_M < begins - rim.radius < BESIDE_M
         and breadth < HANDLE_BREADTH * rim.radius
         and misses < HANDLE_MISS * rim.radius
-        and abs(joint - rim.height) < REACHES_IN_M
+        and abs(joint - rim.height) < HANDLE_JOINT_M
     )
 
 
@@ -221,4 +226,4 @@ def _fit_long_axis(xy: Points2, heights: Float64[np.ndarray, " n"]) -> tuple[Vec
     spread, axes = np.linalg.eigh(np.cov(points.T))
     if spread[2] <= LONG**2 * spread[1]:
         return None
-    return points.mean(axis=0), axes[:, 2], 4.0 * float(np.sqrt(max(spread[1], 0.0)))
+    return points.mean(axis=0), axes[:, 2], BREADTHS * float(np.sqrt(max(spread[1], 0.0)))

@@ -15,16 +15,17 @@ from scipy.spatial import cKDTree
 
 from schemas.geometry import Frozen, Vector3
 
-MIN_THICKNESS_M = 0.002
+MIN_THICKNESS_M = 0.002  # of a bar or a sheet [m]
 BAR_HALF_WIDTH_M = 0.0125  # greatest half width of a bar [m]; wider parts are sheets or solids
 BAR_SHAPE = 3.2  # most thickness of a bar in half widths: a thicker part stands, and is no bar
 SHEET_SHARE, SHEET_M = 0.3, 0.008  # most thickness of a sheet's edge, in half widths and [m]: round bodies have more
 SETTLED_M = 0.004  # height above the support up to which an edge rests on it [m]
 FACING_COS = 0.1  # least cosine between an edge's outward direction and the camera: others hide their end
-EDGES = 12
-MEDIAN_CELLS = 5
-STEEP = 0.35
-SMOOTHING_CELLS = 1.5
+EDGES = 12  # nearest border columns, whose medians decide for a column
+MEDIAN_CELLS = 5  # side of the square over which the underside is smoothed by medians
+MIN_UPRIGHT_COS = 0.35  # between the vertical and the normal of the top: steeper slopes, from 70 degrees, count as this
+SMOOTHING_CELLS = 1.5  # standard deviation by which tops and outlines are smoothed before their slope is measured
+MARGIN_CELLS = 4  # around the footprint, for that smoothing
 LEVELS = 12  # of the radius of discs
 
 Map = Float64[np.ndarray, "nx ny"]
@@ -102,8 +103,8 @@ def compute_half_width(inside: Map) -> Map:
 
 
 def _find_edges(footprint: Footprint, width: Map, upright: Map, support: float) -> _Edges:
-    depth = ndimage.gaussian_filter(np.pad(footprint.closed.astype(float), 4), 1.5)
-    slope = np.stack(np.gradient(depth), axis=-1)[4:-4, 4:-4]
+    depth = ndimage.gaussian_filter(np.pad(footprint.closed.astype(float), MARGIN_CELLS), SMOOTHING_CELLS)
+    slope = np.stack(np.gradient(depth), axis=-1)[MARGIN_CELLS:-MARGIN_CELLS, MARGIN_CELLS:-MARGIN_CELLS]
     length = np.maximum(np.linalg.norm(slope, axis=-1), 1e-9)
     level = float(np.linalg.norm(footprint.to_eye[:2]))
     facing = -(slope @ footprint.to_eye[:2]) / (length * max(level, 1e-9))
@@ -147,4 +148,4 @@ def _compute_uprightness(footprint: Footprint) -> Map:
     smooth = ndimage.gaussian_filter(top, SMOOTHING_CELLS) / np.maximum(weight, 1e-6)
     smooth = np.where(footprint.closed, smooth, footprint.top)
     along, across = np.gradient(smooth)
-    return np.asarray(np.clip(1.0 / np.hypot(1.0, np.hypot(along, across) / footprint.cell), STEEP, 1.0))
+    return np.asarray(np.clip(1.0 / np.hypot(1.0, np.hypot(along, across) / footprint.cell), MIN_UPRIGHT_COS, 1.0))
