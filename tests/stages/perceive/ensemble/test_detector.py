@@ -19,6 +19,7 @@ from tableverse_factory.stages.perceive.ensemble.detector import (
     compare_answers,
     contain_as,
     detect_with_ensemble,
+    find_bent_table,
     group_objects,
     prefer_fused,
     prefer_net,
@@ -26,7 +27,7 @@ from tableverse_factory.stages.perceive.ensemble.detector import (
 from tableverse_factory.stages.perceive.ensemble.fused import find_openings
 from tableverse_factory.stages.perceive.perceive import choose_detector
 from tableverse_factory.stages.perceive.table import find_table
-from tests.helpers.tabletop_views import look
+from tests.helpers.tabletop_views import Box, camera_above, look
 
 SHAPE = (80, 120)
 ONE = np.zeros(SHAPE, dtype=np.int32)
@@ -255,3 +256,25 @@ def test_the_table_is_seen_through_a_handle_and_not_through_a_plate(behind_m: fl
     found = find_openings(standing, depth)
     assert found[away < 13].all() == found.any() == is_opening
     assert not found[away > 15].any()
+
+
+@pytest.mark.parametrize(
+    ("height", "probability", "is_table"),
+    [
+        pytest.param(0.012, 1.0, True, id="table that the sensor bends"),
+        pytest.param(0.012, 0.8, False, id="a book in the colour of the table"),
+        pytest.param(0.08, 1.0, False, id="a block of the table's wood"),
+    ],
+)
+def test_what_rises_a_little_and_looks_like_table_is_table(height, probability, is_table):
+    seen, ids = look([Box(-0.15, 0.0, (0.1, 0.1, 0.1)), Box(0.15, 0.0, (0.1, 0.1, height))], camera_above(0.6, 0.7))
+    view = find_table(seen, np.random.default_rng(0))
+    things = np.maximum(ids - 1, 0).astype(np.int32)
+    table_probability = np.where(things == 1, 0.0, np.where(things == 2, probability, 1.0)).astype(np.float32)
+    assert (find_bent_table(things, view, table_probability) == ((things == 2) & is_table)).all()
+
+
+def test_without_objects_no_table_is_taken_for_one():
+    seen, ids = look([Box(0.0, 0.0, (0.1, 0.1, 0.1))], camera_above(0.6, 0.7))
+    view = find_table(seen, np.random.default_rng(0))
+    assert not find_bent_table(np.zeros_like(ids), view, np.ones(ids.shape, np.float32)).any()
