@@ -225,7 +225,7 @@ def _match_things(truth: IdImage, ids: IdImage, view: TwinView) -> IdImage:
 
 def _compare_things(capture: Capture, view: TwinView, things: IdImage, shown: IdImage) -> Iterator[TwinThing]:
     """Compare each thing with the object that is shown with its id."""
-    ious = compare_silhouettes(things, shown).ious
+    ious = compare_silhouettes(things, shown)
     for value in np.unique(things[things > 0]).tolist():
         both = (things == value) & (shown == value)
         if not both.any():

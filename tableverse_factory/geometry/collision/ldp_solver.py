@@ -53,7 +53,7 @@ def solve_least_motion(rows: Rows, bounds: Bounds) -> Values | None:
     return -residual[:count] / residual[count]
 
 
-def solve_least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: float) -> Values:
+def _solve_least_violation(rows: Rows, bounds: Bounds, owners: Owners, softness: float) -> Values:
     """A short x where the constraints contradict one another: those of one owner give way together, at a price.
 
     Minimises `|x|² + |s / softness|²` under `rows @ x + s[owners] >= bounds`; s is 0 where the owner is -1.
@@ -78,8 +78,8 @@ def solve_balanced_motion(
 ) -> Values:
     """Minimise `|x|² + |wishes @ x - wished|²` under `rows @ x >= bounds`.
 
-    Contradicting constraints give way as in `solve_least_violation`. Constraints become active once they are violated:
-    most never are. More work than the effort allows is a `SolverError`.
+    Contradicting constraints of one owner give way together, at a price; those of owner -1 never do. Constraints become
+    active once they are violated: most never are. More work than the effort allows is a `SolverError`.
     """
     lower = np.linalg.cholesky(np.eye(rows.shape[1]) + wishes.T @ wishes)
     free = np.linalg.solve(lower.T, np.linalg.solve(lower, wishes.T @ wished))
@@ -102,7 +102,7 @@ def _solve_shortest(rows: Rows, bounds: Bounds, owners: Owners, softness: float,
     if found is not None:
         return found
     _spend(effort, len(rows), rows.shape[1] + len(np.unique(owners)))
-    return solve_least_violation(rows, bounds, owners, softness)
+    return _solve_least_violation(rows, bounds, owners, softness)
 
 
 def _spend(effort: SolverEffort, constraints: int, unknowns: int) -> None:

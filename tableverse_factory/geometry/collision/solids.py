@@ -51,16 +51,6 @@ def place_pieces(pieces: ConvexPieces, pose: Pose, scale: float) -> Solids:
     return Solids(vertices, [hull.faces for hull in pieces.hulls])
 
 
-def find_overlapping_boxes(
-    a: Solids, b: Solids, margin: float = 0.0, offset: Vector3 | None = None
-) -> list[tuple[int, int]]:
-    """Find pairs (piece of `a`, piece of `b`) whose boxes come within `margin` [m], with `a` moved by `offset` [m]."""
-    shift = np.zeros(3) if offset is None else offset
-    low, high = a.low + shift, a.high + shift
-    apart = (low[:, None] > b.high[None] + margin) | (b.low[None] > high[:, None] + margin)
-    return [(int(i), int(j)) for i, j in np.argwhere(~apart.any(axis=2))]
-
-
 def find_near_pieces(
     a: Solids, b: Solids, reach_m: float, offset: Vector3 | None = None, signed: bool = True
 ) -> Iterator[tuple[float, coal.DistanceResult]]:
@@ -69,12 +59,13 @@ def find_near_pieces(
     Yields the gap [m] and coal's result, whose object is reused for the next pair. Gaps of pieces that overlap are
     negative if `signed`, else 0, for less work.
     """
+    shift = np.zeros(3) if offset is None else offset
+    low, high = a.low + shift, a.high + shift
+    near = ~((low[:, None] > b.high[None] + reach_m) | (b.low[None] > high[:, None] + reach_m)).any(axis=2)
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = signed
-    moved, still = coal.Transform3s(), coal.Transform3s()
-    if offset is not None:
-        moved.setTranslation(offset)
-    for i, j in find_overlapping_boxes(a, b, reach_m, offset):
+    moved, still = coal.Transform3s(np.eye(3), shift), coal.Transform3s()
+    for i, j in np.argwhere(near).tolist():
         result.clear()
         gap = float(coal.distance(a.shape(i), moved, b.shape(j), still, request, result))
         if gap <= reach_m:

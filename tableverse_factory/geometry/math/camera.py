@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Camera, DepthImage, Frozen, Points, Pose
+from tableverse_factory.geometry.math.transforms import rotation_matrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +37,16 @@ def backproject(depth: DepthImage, camera: Camera) -> Float64[np.ndarray, "h w 3
     z = np.asarray(depth, dtype=np.float64)
     v, u = np.indices(z.shape, dtype=np.float64)
     return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+
+
+def compute_pixel_rays(
+    camera: Camera, camera_to_scene: Pose, offset: tuple[float, float] = (0.0, 0.0)
+) -> Float64[np.ndarray, "h w 3"]:
+    """Compute directions through the pixels, `offset` from their centres [px], of length 1 along the optical axis."""
+    x = (np.arange(camera.width) + offset[0] - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + offset[1] - camera.cy) / camera.fy
+    right, down, forward = rotation_matrix(camera_to_scene.quaternion_wxyz).T
+    return x[None, :, None] * right + (y[:, None, None] * down + forward)
 
 
 def project(points_camera: Points, camera: Camera) -> Float64[np.ndarray, "n 2"]:

@@ -134,12 +134,12 @@ def _draw_hypotheses(
     return normals, np.einsum("ij,ij->i", normals, a)
 
 
-def compute_convex_outline(points_xy: Points2) -> Points2:
-    """Compute the convex hull, counter-clockwise; a small box around points that lie on a line. Shape (m, 2)."""
+def compute_convex_outline(points_xy: Points2, margin: float = 1e-3) -> Points2:
+    """Compute the convex hull, counter-clockwise; of points on a line the box, wider by `margin` [m]. Shape (m, 2)."""
     try:
         return np.asarray(points_xy[ConvexHull(points_xy).vertices], dtype=np.float64)
     except (QhullError, ValueError):
-        low, high = points_xy.min(axis=0) - 1e-3, points_xy.max(axis=0) + 1e-3
+        low, high = points_xy.min(axis=0) - margin, points_xy.max(axis=0) + margin
         return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 

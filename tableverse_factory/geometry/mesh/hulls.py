@@ -115,12 +115,12 @@ def _expand_hull(hull: TriangleMesh, points: Points) -> TriangleMesh:
 def make_hull_mesh(points: Points) -> TriangleMesh:
     """Make the convex hull as triangles, counter-clockwise seen from outside; flat points are a `GeometryError`."""
     try:
-        return TriangleMesh(*orient_faces_outward(ConvexHull(points)))
+        return TriangleMesh(*_orient_faces_outward(ConvexHull(points)))
     except QhullError as error:
         raise GeometryError(f"{len(points)} points span no volume") from error
 
 
-def orient_faces_outward(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
+def _orient_faces_outward(hull: ConvexHull) -> tuple[np.ndarray, np.ndarray]:
     """Convert a scipy hull to its used vertices, in their order, and counter-clockwise triangles."""
     used = np.zeros(len(hull.points), dtype=bool)
     used[hull.simplices] = True

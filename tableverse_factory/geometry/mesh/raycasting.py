@@ -4,8 +4,7 @@ import numpy as np
 
 from schemas.geometry import Camera, Pose, TriangleMesh
 from tableverse_factory.core.open3d_import import o3d
-from tableverse_factory.geometry.math.camera import backproject
-from tableverse_factory.geometry.math.transforms import rotation_matrix
+from tableverse_factory.geometry.math.camera import compute_pixel_rays
 
 RaycastingScene = o3d.t.geometry.RaycastingScene
 
@@ -34,5 +33,4 @@ def pack_rays(origins: np.ndarray, directions: np.ndarray) -> o3d.core.Tensor:
 
 def pack_pixel_rays(camera: Camera, camera_to_scene: Pose) -> o3d.core.Tensor:
     """Rays of all pixels, shape (h, w, 6); where one meets a surface, `t_hit` is the depth along the optical axis."""
-    unit = backproject(np.ones((camera.height, camera.width)), camera)
-    return pack_rays(camera_to_scene.position, unit @ rotation_matrix(camera_to_scene.quaternion_wxyz).T)
+    return pack_rays(camera_to_scene.position, compute_pixel_rays(camera, camera_to_scene))

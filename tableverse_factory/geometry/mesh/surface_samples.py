@@ -9,6 +9,7 @@ from schemas.geometry import Points, TriangleMesh
 
 _R2_FIRST = 0.7548776662466927  # the plastic number's inverse and its square: a sequence that fills the unit square
 _R2_SECOND = 0.5698402909980532
+_NEAREST = 8  # samples whose triangles a point is measured to
 _BATCH = 256  # points measured at once
 _ROUNDING_M = 1e-12  # a sample lies on its triangle up to this
 
@@ -43,14 +44,12 @@ def _compute_doubled_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " m"]:
     return np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
 
 
-def measure_distance_to_surface(
-    points: Points, mesh: TriangleMesh, samples: int, neighbours: int = 8
-) -> Float64[np.ndarray, " n"]:
+def measure_distance_to_surface(points: Points, mesh: TriangleMesh, samples: int) -> Float64[np.ndarray, " n"]:
     """Measure the distance of each point to the triangles of the samples nearest to it [m]."""
-    return _SampledSurface(mesh, samples).measure_distance(points, neighbours)
+    return _SampledSurface(mesh, samples).measure_distance(points)
 
 
-def find_largest_distance_to_surface(points: Points, mesh: TriangleMesh, samples: int, neighbours: int = 8) -> float:
+def find_largest_distance_to_surface(points: Points, mesh: TriangleMesh, samples: int) -> float:
     """Find the largest of `measure_distance_to_surface` [m].
 
     The distance to the nearest sample bounds each, so that only points with large bounds are measured.
@@ -62,7 +61,7 @@ def find_largest_distance_to_surface(points: Points, mesh: TriangleMesh, samples
         batch = order[start : start + _BATCH]
         if bounds[batch[0]] < largest - _ROUNDING_M:
             break
-        largest = max(largest, float(surface.measure_distance(points[batch], neighbours).max()))
+        largest = max(largest, float(surface.measure_distance(points[batch]).max()))
     return largest
 
 
@@ -73,8 +72,8 @@ class _SampledSurface:
         points, self._triangle = sample_surface(mesh, samples)
         self._mesh, self.tree = mesh, cKDTree(points)
 
-    def measure_distance(self, points: Points, neighbours: int) -> Float64[np.ndarray, " n"]:
-        _, near = self.tree.query(points, k=min(neighbours, self.tree.n))
+    def measure_distance(self, points: Points) -> Float64[np.ndarray, " n"]:
+        _, near = self.tree.query(points, k=min(_NEAREST, self.tree.n))
         candidates = self._triangle[near.reshape(len(points), -1)]
         repeated = np.repeat(points, candidates.shape[1], axis=0)
         closest = closest_point(self._mesh.vertices[self._mesh.faces[candidates.ravel()]], repeated)

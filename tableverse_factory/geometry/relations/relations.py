@@ -8,13 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 
 from schemas.curation import Relation
 from schemas.geometry import Frozen, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.aabb import aabb
+from tableverse_factory.geometry.math.planes import Points2, compute_convex_outline
 from tableverse_factory.geometry.mesh.height_maps import (
     CELL_M,
     Cavity,
@@ -27,8 +26,6 @@ from tableverse_factory.geometry.mesh.height_maps import (
     rotate_quarter_turn,
 )
 from tableverse_factory.geometry.mesh.raycasting import RaycastingScene, make_raycasting_scene
-
-Points2 = Float64[np.ndarray, "n 2"]
 
 # Axis and sign of each side.
 SIDES = {Relation.LEFT: (0, -1), Relation.RIGHT: (0, 1), Relation.IN_FRONT: (1, -1), Relation.BEHIND: (1, 1)}
@@ -100,13 +97,9 @@ def _make_features(low: Vector3, high: Vector3, outline: Points2, heights: Heigh
 def compute_outline(points: Points2) -> Points2:
     """Compute the convex outline, counter-clockwise; the box where the points lie on a line.
 
-    Of a finely curved outline only the extreme points in 64 directions are kept: within a tenth of a millimetre.
+    Only the extreme points in 64 directions are kept: those of a fine curve, within a tenth of a millimetre.
     """
-    try:
-        hull = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):
-        (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
-        return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    hull = compute_convex_outline(points, margin=0.0)
     return hull[np.unique(np.argmax(_OUTLINE_DIRECTIONS @ hull.T, axis=1))]
 
 

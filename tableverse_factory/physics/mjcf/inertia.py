@@ -3,12 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from schemas.geometry import Faces, Frozen, Matrix3, TriangleMesh, Vector3
 from tableverse_factory.core.memoize import memoize_by_content
 from tableverse_factory.geometry.math.aabb import aabb
-from tableverse_factory.geometry.mesh.hulls import orient_faces_outward, unite_hulls
+from tableverse_factory.geometry.mesh.hulls import make_hull_mesh, unite_hulls
 from tableverse_factory.geometry.mesh.mass_integrals import integrate_volume
 from tableverse_factory.geometry.mesh.repair import solid_to_mesh
 from tableverse_factory.geometry.mesh.shells import is_one_shell, unite_shells
@@ -67,7 +66,10 @@ def compute_volume_moments(mesh: TriangleMesh, hulls: tuple[TriangleMesh, ...]) 
             return found
     union = solid_to_mesh(unite_hulls(hulls))
     found = _integrate_closed(union, "pieces") if len(union.faces) else None
-    return found or _integrate_hull(np.concatenate([hull.vertices for hull in hulls]))
+    if found is not None:
+        return found
+    hull = make_hull_mesh(np.concatenate([hull.vertices for hull in hulls]))
+    return VolumeMoments(*integrate_volume(hull), "hull")
 
 
 def is_closed(mesh: TriangleMesh) -> bool:
@@ -101,8 +103,3 @@ def _compute_inertia(moments: Matrix3, mass_kg: float) -> Matrix3:
     inertia: Matrix3 = np.trace(moments) * np.eye(3) - moments
     lacking = mass_kg * MIN_GYRATION_M**2 - float(np.linalg.eigvalsh(inertia)[0])
     return inertia + max(lacking, 0.0) * np.eye(3)
-
-
-def _integrate_hull(points: np.ndarray) -> VolumeMoments:
-    hull = TriangleMesh(*orient_faces_outward(ConvexHull(points)))
-    return VolumeMoments(*integrate_volume(hull), "hull")

@@ -35,7 +35,7 @@ def make_scenery(names: Sequence[str], meshes: Sequence[TriangleMesh], slab: Sla
     return Scenery(tuple(names), (*meshes, board), (*(None for _ in meshes), slab.color))
 
 
-def load_scenery(model: mujoco.MjModel, table: str = "table", visual_group: int = 2) -> Scenery:
+def load_scenery(model: mujoco.MjModel, visual_group: int = 2) -> Scenery:
     """Load the visual meshes and the table's box of a model in its initial state."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -45,7 +45,7 @@ def load_scenery(model: mujoco.MjModel, table: str = "table", visual_group: int 
     for geom in range(model.ngeom):
         body = model.body(int(model.geom_bodyid[geom])).name
         kind = int(model.geom_type[geom])
-        if kind == mujoco.mjtGeom.mjGEOM_BOX and body == table:
+        if kind == mujoco.mjtGeom.mjGEOM_BOX and body == "table":
             boards.append(_place_geom(make_geom_box(model, geom), model, data, geom))
         elif kind == mujoco.mjtGeom.mjGEOM_MESH and int(model.geom_group[geom]) == visual_group:
             names.append(body)

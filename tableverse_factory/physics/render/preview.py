@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from schemas.geometry import Camera, IdImage, Picture, Pose, Texture, TriangleMesh
+from schemas.geometry import Camera, IdImage, Picture, Pose, TriangleMesh
 from tableverse_factory.core.open3d_import import o3d
-from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_pixel_rays
+from tableverse_factory.geometry.mesh.texels import get_nearest_texels
 
 Rgb = tuple[int, int, int]
 
@@ -34,8 +34,8 @@ class PreviewRenderer:
 
     def draw(self, camera: Camera, camera_to_world: Pose) -> tuple[Picture, IdImage]:
         """Draw the picture, and the index of the part seen in each pixel: -1 for none."""
-        rays = _make_camera_rays(camera, camera_to_world)
-        answer = self._caster.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+        packed = pack_pixel_rays(camera, camera_to_world)
+        answer, rays = self._caster.cast_rays(packed, nthreads=1), packed.numpy()
         geometry = answer["geometry_ids"].numpy()
         ids = self._part_of[np.minimum(geometry, len(self._part_of) - 1)]
         normals = answer["primitive_normals"].numpy()
@@ -65,38 +65,19 @@ class PreviewRenderer:
         """Colour of each pixel's surface, sRGB in 0–255."""
         plain = np.array([color or _GREY for color in self._colors] + [_BACKGROUND], dtype=np.float32)
         colors: Float32[np.ndarray, "h w 3"] = plain[ids]
-        triangles, uv = answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
+        triangles, weights_uv = answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
         for index, mesh in enumerate(self._parts):
             if mesh.texture is None and mesh.vertex_colors is None:
                 continue
             here = np.nonzero(ids == index)
             if not len(here[0]):
                 continue
-            faces, inside = triangles[here], uv[here]
+            faces, inside = triangles[here], weights_uv[here]
             weights = np.stack([1.0 - inside.sum(axis=1), inside[:, 0], inside[:, 1]], axis=1)
             if mesh.texture is not None:
-                colors[here] = _sample_texture(mesh.texture, faces, weights)
+                uv = np.einsum("nk,nkd->nd", weights, mesh.texture.corner_uv[faces])
+                colors[here] = get_nearest_texels(mesh.texture, uv)
             elif mesh.vertex_colors is not None:
                 corners = mesh.vertex_colors[mesh.faces[faces]].astype(np.float32)
                 colors[here] = np.einsum("nk,nkd->nd", weights, corners)
         return colors
-
-
-def _sample_texture(texture: Texture, faces: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Sample the nearest texel of points on faces. Shape (n, 3)."""
-    height, width = texture.picture.shape[:2]
-    uv = np.einsum("nk,nkd->nd", weights, texture.corner_uv[faces])
-    columns = np.clip((uv[:, 0] * width).astype(np.int64), 0, width - 1)
-    rows = np.clip(((1.0 - uv[:, 1]) * height).astype(np.int64), 0, height - 1)
-    return texture.picture[rows, columns]
-
-
-def _make_camera_rays(camera: Camera, camera_to_world: Pose) -> Float32[np.ndarray, "h w 6"]:
-    """Origin and direction per pixel, of length 1 along the optical axis."""
-    right, down, forward = rotation_matrix(camera_to_world.quaternion_wxyz).T.astype(np.float32)
-    x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
-    y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
-    rays = np.empty((camera.height, camera.width, 6), dtype=np.float32)
-    rays[..., :3] = camera_to_world.position
-    rays[..., 3:] = x[None, :, None] * right + (y[:, None, None] * down + forward)
-    return rays

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.geometry import Camera, Frozen, Points, Pose, TriangleMesh
-from tableverse_factory.geometry.math.transforms import rotation_matrix
-from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_rays
+from tableverse_factory.geometry.math.camera import compute_pixel_rays
+from tableverse_factory.geometry.mesh.raycasting import make_raycasting_scene, pack_pixel_rays, pack_rays
 
 SURFACE_OFFSET_M = 1e-4  # start of rays that leave a surface: less than any wall, more than float32's error at a metre
 
@@ -42,7 +42,7 @@ class Raycaster:
 
     def cast(self, camera: Camera, camera_to_world: Pose, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
         """Cast one ray per pixel, `offset` from its centre [px]."""
-        directions = compute_camera_rays(camera, camera_to_world, offset)
+        directions = compute_pixel_rays(camera, camera_to_world, offset).reshape(-1, 3)
         answer = self._caster.cast_rays(pack_rays(camera_to_world.position, directions), nthreads=1)
         depth = answer["t_hit"].numpy()
         pixels = np.flatnonzero(np.isfinite(depth))
@@ -67,19 +67,10 @@ class Raycaster:
 
     def covered(self, camera: Camera, camera_to_world: Pose) -> tuple[np.ndarray, np.ndarray]:
         """List every pair of a pixel and a mesh on its ray, hidden or not, sorted: pixels, parts."""
-        directions = compute_camera_rays(camera, camera_to_world, (0.0, 0.0))
-        hits = self._caster.list_intersections(pack_rays(camera_to_world.position, directions), nthreads=1)
+        hits = self._caster.list_intersections(pack_pixel_rays(camera, camera_to_world), nthreads=1)
         if not len(self._part_of):
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         count = int(self._part_of[-1]) + 1
         parts = self._part_of[hits["geometry_ids"].numpy()]
         pairs = np.unique(hits["ray_ids"].numpy().astype(np.int64) * count + parts)
         return pairs // count, pairs % count
-
-
-def compute_camera_rays(camera: Camera, camera_to_world: Pose, offset: tuple[float, float]) -> Points:
-    """Compute world directions through the pixels, of length 1 along the optical axis. Shape (h * w, 3)."""
-    x = (np.arange(camera.width) + offset[0] - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + offset[1] - camera.cy) / camera.fy
-    right, down, forward = rotation_matrix(camera_to_world.quaternion_wxyz).T
-    return (x[None, :, None] * right + (y[:, None, None] * down + forward)).reshape(-1, 3)

@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64
 
 from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, Texture, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.transforms import quaternion_from_matrix
+from tableverse_factory.geometry.mesh.texels import fold_uv
 from tableverse_factory.physics.render.normals import compute_corner_normals
 from tableverse_factory.physics.render.raycast import Hits, Raycaster
 
@@ -207,8 +208,7 @@ class Surfaces:
 def _sample_texture(texture: Texture, triangles: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Sample linear colours of points on faces, bilinearly; the texture repeats. Shape (n, 3)."""
     height, width = texture.picture.shape[:2]
-    uv = np.einsum("nk,nkd->nd", weights, texture.corner_uv[triangles])
-    uv = np.where((uv < 0.0) | (uv > 1.0), uv - np.floor(uv), uv)
+    uv = fold_uv(np.einsum("nk,nkd->nd", weights, texture.corner_uv[triangles]))
     x = np.clip(uv[:, 0] * width - 0.5, 0.0, width - 1.0)
     y = np.clip((1.0 - uv[:, 1]) * height - 0.5, 0.0, height - 1.0)
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)

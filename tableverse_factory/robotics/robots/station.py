@@ -11,8 +11,9 @@ from schemas.geometry import Points, Pose
 from schemas.trajectories import JointVector, Numbers
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
+from tableverse_factory.geometry.math.planes import Points2
 from tableverse_factory.geometry.math.transforms import normalize_quaternion
-from tableverse_factory.geometry.relations.relations import Points2, compute_outline
+from tableverse_factory.geometry.relations.relations import compute_outline
 from tableverse_factory.physics.mjcf.file_check import check_references
 from tableverse_factory.physics.mjcf.geom_meshes import make_geom_mesh
 from tableverse_factory.physics.simulate.at_rest import find_free_bodies, make_quiet_data

@@ -9,6 +9,7 @@ from jaxtyping import UInt16
 from schemas.geometry import Camera, Frozen, IdImage, Picture, Points, Pose, TriangleMesh
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.geometry.math.camera import backproject
 from tableverse_factory.geometry.math.transforms import invert_pose, transform_points
 from tableverse_factory.geometry.mesh.meshes import place_mesh
 from tableverse_factory.physics.render.raycast import Raycaster
@@ -136,11 +137,10 @@ def _transform_texture(item: PlacedModel) -> Pattern:
 
 def _compute_facing(rendering: Rendering, camera: Camera, camera_to_table: Pose) -> np.ndarray:
     """Compute the cosine between normal and line of sight at each pixel. Shape (h, w)."""
-    v, u = np.indices(rendering.depth.shape, dtype=np.float64)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    rays = backproject(np.ones_like(rendering.depth), camera)
     rotation = Pose(np.zeros(3), invert_pose(camera_to_table).quaternion_wxyz)
     normals = transform_points(rotation, rendering.normals.reshape(-1, 3).astype(np.float64))
-    facing: np.ndarray = np.abs(np.einsum("ij,ij->i", rays.reshape(-1, 3), normals)).reshape(v.shape)
+    facing: np.ndarray = np.abs(np.einsum("ij,ij->i", rays.reshape(-1, 3), normals)).reshape(rendering.depth.shape)
     facing /= np.linalg.norm(rays, axis=-1)
     return facing
 

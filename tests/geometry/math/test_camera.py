@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.geometry import Camera
-from tableverse_factory.geometry.math.camera import backproject, compute_field_of_view_deg, project
+from schemas.geometry import Camera, Pose
+from tableverse_factory.geometry.math.camera import backproject, compute_field_of_view_deg, compute_pixel_rays, project
+from tableverse_factory.geometry.math.transforms import transform_points
 
 cameras = st.builds(
     Camera,
@@ -57,3 +58,13 @@ def test_the_field_of_view_is_the_angle_between_the_outer_borders() -> None:
     assert compute_field_of_view_deg(Camera(320.0, 300.0, 319.5, 239.5, 640, 480)) == pytest.approx(90.0)
     assert compute_field_of_view_deg(Camera(300.0, 320.0, 239.5, 319.5, 480, 640)) == pytest.approx(90.0)
     assert compute_field_of_view_deg(Camera(640.0, 640.0, -0.5, 239.5, 640, 480)) == pytest.approx(45.0)
+
+
+def test_a_pixel_s_ray_goes_through_its_points() -> None:
+    camera = Camera(100.0, 200.0, 10.0, 5.0, 32, 24)
+    camera_to_table = Pose(np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.5, -0.5, 0.5]))
+    points = transform_points(camera_to_table, backproject(np.full((24, 32), 2.0), camera).reshape(-1, 3))
+    rays = compute_pixel_rays(camera, camera_to_table)
+    np.testing.assert_allclose(camera_to_table.position + 2.0 * rays.reshape(-1, 3), points, atol=1e-12)
+    beside = compute_pixel_rays(camera, camera_to_table, (1.0, -1.0))
+    np.testing.assert_allclose(beside[1:, :-1], rays[:-1, 1:], atol=1e-12)

@@ -109,6 +109,7 @@ def test_the_rectangle_of_a_rectangle_is_itself(yaw, half_x, half_y, x, y):
 def test_points_on_a_line_still_have_an_outline_and_a_rectangle():
     points = np.stack([np.linspace(0, 1, 5), np.zeros(5)], axis=1)
     assert is_inside_outline(compute_convex_outline(points), points).all()
+    np.testing.assert_array_equal(compute_convex_outline(points, 0.0).max(axis=0), [1.0, 0.0])
     assert fit_min_rectangle(compute_convex_outline(points[:1])).half_size.max() < 0.01
 
 

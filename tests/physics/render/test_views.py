@@ -147,6 +147,20 @@ def test_a_sketch_wears_textures_vertex_colours_and_plain_ones():
     assert [int(picture[ids == k].mean(axis=0).argmax()) for k in range(3)] == [0, 1, 2]
 
 
+def test_a_texture_repeats_in_a_sketch_as_in_the_renderer():
+    corners = np.array([[-0.2, -0.1, 0.01], [0.2, -0.1, 0.01], [0.2, 0.1, 0.01], [-0.2, 0.1, 0.01]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    red_then_blue = np.array([[[250, 10, 10]] * 8 + [[10, 10, 250]] * 8] * 16, dtype=np.uint8)
+    cloth = TriangleMesh(corners, faces, None, Texture(red_then_blue, 5.0 * corners[faces][..., :2]))  # u from -1 to 1
+    scenery = make_scenery(["cloth"], [cloth], SLAB)
+    eye = make_top_camera(scenery, 120, 60)
+    sketch, ids = PreviewRenderer(scenery.parts, scenery.colors).draw(eye.camera, eye.camera_to_table)
+    columns = np.flatnonzero(ids[30] == 0)
+    quarters = columns[(np.array([0.125, 0.375, 0.625, 0.875]) * len(columns)).astype(int)]
+    for picture in (sketch, render_pictures(scenery, [eye])[0].color):
+        assert picture[30, quarters].argmax(axis=1).tolist() == [0, 2, 0, 2]
+
+
 @pytest.mark.heavy
 def test_tags_of_a_crowd_do_not_cover_one_another():
     grid = [ball(0.09 * i, 0.09 * j) for i in range(4) for j in range(4)]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from schemas.geometry import Frozen, IdImage, Mask
+from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.planes import Points2
 from tableverse_factory.stages.perceive.base.table_view import TableView, compute_depth_noise, expand_window
@@ -69,12 +70,12 @@ def find_rims(ids: IdImage, view: TableView) -> list[Rim]:
     points = view.points_camera[rows, columns]
     owner, xy, heights = ids[rows, columns], view.xy(points), view.heights[rows, columns]
     tolerance = max(TOLERANCE_M, NOISES * float(compute_depth_noise(np.median(points[:, 2]))))
-    table_xy, rng = view.xy(view.points_camera), np.random.default_rng(0)
+    table_xy = view.xy(view.points_camera)
     found = []
     for k in range(1, int(ids.max(initial=0)) + 1):
         own = np.flatnonzero(owner == k)
         own = own[:: max(1, len(own) // CONTOUR_SAMPLES)]
-        circle = _find_circle(xy[own], heights[own], tolerance, rng) if len(own) >= MIN_CONTOUR_PX else None
+        circle = _find_circle(xy[own], heights[own], tolerance) if len(own) >= MIN_CONTOUR_PX else None
         for _ in range(REFINEMENTS):
             circle = None if circle is None else _refine_circle(circle, xy, heights, tolerance)
         if circle is None or float(_is_on_circle(circle, xy[own], heights[own], tolerance).mean()) < MIN_OWN:
@@ -94,11 +95,12 @@ def _find_upper_contour(ids: IdImage, valid: Mask) -> Mask:
     return contour
 
 
-def _find_circle(
-    xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float, rng: np.random.Generator
-) -> Circle | None:
-    """Find the level circle through three points with which most others agree (RANSAC)."""
-    picks = rng.integers(0, len(xy), (TRIES, 3))
+def _find_circle(xy: Points2, heights: Float64[np.ndarray, " n"], tolerance: float) -> Circle | None:
+    """Find the level circle through three points with which most others agree (RANSAC).
+
+    The draws depend on the number of points alone, not on other regions.
+    """
+    picks = make_rng(0, "", "rims").integers(0, len(xy), (TRIES, 3))
     a, b, c = xy[picks[:, 0]], xy[picks[:, 1]], xy[picks[:, 2]]
     level = np.ptp(heights[picks], axis=1) < 2 * tolerance
     ab, ac = b - a, c - a

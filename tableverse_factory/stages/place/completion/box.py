@@ -1,18 +1,17 @@
 """Fit of a box that stands upright on the object's support, and of the rounding of its upright edges."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from manifold3d import CrossSection, JoinType, Manifold
-from scipy.optimize import minimize
 
 from schemas.geometry import Frozen, Matrix3, Pose, TriangleMesh, Vector3
 from tableverse_factory.geometry.math.planes import fit_min_rectangle
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.geometry.mesh.voxel_solids import from_manifold
 from tableverse_factory.geometry.registration.symmetry import rotation_about_axis
+from tableverse_factory.stages.place.completion.nelder_mead import minimize_cost
 from tableverse_factory.stages.place.completion.ray_misfit import (
     RaySample,
     compute_misfit,
@@ -66,7 +65,8 @@ def round_edges(view: ObjectView, rays: RaySample, box: SolidBox) -> SolidBox | 
         return misfit + _penalize_uncarried(view, position, rotation, half)
 
     steps = np.array([*2.0 * STEPS, ROUND_STEP])  # with shorter ones, twice as many calls end 0.1 mm above, in the mean
-    found = minimize_cost(cost, start, ((steps, ROUND_CALLS), (-steps, ROUND_CALLS)))
+    found = minimize_cost(cost, start, steps, ROUND_CALLS)
+    found = minimize_cost(cost, found, -steps, ROUND_CALLS)  # other steps leave minima in which it stuck
     position, rotation, half, radius = decode(found)
     if radius < LEAST_ROUND * half[:2].min():
         return None
@@ -83,23 +83,6 @@ def build_box_mesh(box: SolidBox) -> TriangleMesh:
         section = section.offset(box.radius, JoinType.Round, circular_segments=SEGMENTS)
     solid = Manifold.extrude(section, float(size[2])).translate((0.0, 0.0, -float(box.half_size[2])))
     return from_manifold(solid.refine_to_length(float(size.max()) / EDGES_ON_LONGEST_SIDE))
-
-
-def minimize_cost(
-    cost: Callable[[Float64[np.ndarray, " n"]], float],
-    start: Float64[np.ndarray, " n"],
-    searches: tuple[tuple[Float64[np.ndarray, " n"], int], ...],
-) -> Float64[np.ndarray, " n"]:
-    """Minimise the cost of a box [m] by Nelder and Mead, from a simplex of one step along each number.
-
-    Each of the searches, steps and most calls, begins where the one before it ended: other steps leave minima in which
-    it stuck.
-    """
-    for steps, calls in searches:
-        options = {"initial_simplex": np.vstack([start, start + np.diag(steps)]), "maxfev": calls}
-        options |= {"xatol": 2e-4, "fatol": 1e-6}
-        start = np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
-    return start
 
 
 def _propose_yaws(view: ObjectView) -> list[float]:
@@ -126,7 +109,7 @@ def _fit_upright(view: ObjectView, rays: RaySample, yaw: float) -> SolidBox:
         misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
         return misfit + prior + _penalize_uncarried(view, position, rotation, half)
 
-    found = minimize_cost(cost, start, ((STEPS, CALLS),))
+    found = minimize_cost(cost, start, STEPS, CALLS)
     position, rotation, half = _decode_box(found, view.support_z)
     misfit = compute_misfit(rays, intersect_box(rays, position, rotation, half))
     return SolidBox(Pose(position, quaternion_about_z(float(found[5]))), half, misfit)

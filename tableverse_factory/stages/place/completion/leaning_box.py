@@ -11,7 +11,8 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_from_matrix,
     rotation_matrix,
 )
-from tableverse_factory.stages.place.completion.box import MAX_SIDE_M, MIN_SIDE_M, SolidBox, minimize_cost
+from tableverse_factory.stages.place.completion.box import MAX_SIDE_M, MIN_SIDE_M, SolidBox
+from tableverse_factory.stages.place.completion.nelder_mead import minimize_cost
 from tableverse_factory.stages.place.completion.ray_misfit import RaySample, compute_misfit, intersect_box
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
@@ -23,7 +24,7 @@ SINK_WEIGHT = 0.2  # weight of corners below the support, against the misfit of 
 MAX_SINK_M = 0.05  # from which a corner counts no more [m]
 FLOAT_WEIGHT = 0.05  # weight of the height of the lowest corner above the support, which has to be touched
 STEPS = np.array([0.005] * 3 + [0.08] * 3 + [0.05] * 3)  # of the search: middle [m], logarithms of sides, turn [rad]
-SEARCHES = ((STEPS, 300), (0.4 * STEPS, 200))  # with their calls; the second looks nearer
+CALLS, NEAR_SHARE, NEAR_CALLS = 300, 0.4, 200  # of the search, and of a second one with this share of its steps
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
@@ -51,7 +52,8 @@ def fit_leaning_box(view: ObjectView, rays: RaySample) -> SolidBox:
             + FLOAT_WEIGHT * max(float(heights.min()) - view.support_z, 0.0)
         )
 
-    found = minimize_cost(cost, start, SEARCHES)
+    found = minimize_cost(cost, start, STEPS, CALLS)
+    found = minimize_cost(cost, found, NEAR_SHARE * STEPS, NEAR_CALLS)
     turned = normalize_quaternion(multiply_quaternions(base, _decode_turn(found)))
     return SolidBox(Pose(found[:3], turned), _decode_half_size(found), cost(found))
 

@@ -6,7 +6,6 @@ All normals of a surface of revolution meet its axis. With Plücker coordinates 
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import minimize
 
 from schemas.geometry import Matrix3, Points, Pose, Vector3
 from tableverse_factory.geometry.math.transforms import (
@@ -15,6 +14,7 @@ from tableverse_factory.geometry.math.transforms import (
     rotation_matrix,
     transform_points,
 )
+from tableverse_factory.stages.place.completion.nelder_mead import minimize_cost
 from tableverse_factory.stages.place.view.object_view import ObjectView
 
 FIT_POINTS = 1500
@@ -97,10 +97,8 @@ def _refine_axis(points: Points, normals: Points, axis: Pose) -> tuple[Pose, flo
         gap = np.sort(np.minimum(np.abs(distance - means[group]), WORST_SPREAD_M))
         return float(gap[: int(KEPT_SHARE * len(gap))].mean())
 
-    simplex = np.array([[0.0, 0.0], [0.006, 0.0], [0.0, 0.006]])
-    options = {"initial_simplex": simplex, "maxfev": 80, "xatol": 1e-4, "fatol": 1e-7}
-    found = minimize(spread, np.zeros(2), method="Nelder-Mead", options=options)
-    return _shift_axis(axis, found.x), float(found.fun)
+    center = minimize_cost(spread, np.zeros(2), np.full(2, 0.006), 80, xatol=1e-4, fatol=1e-7)
+    return _shift_axis(axis, center), spread(center)
 
 
 def _shift_axis(axis: Pose, center: Float64[np.ndarray, "2"]) -> Pose:

@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import minimize
 
 from schemas.geometry import Pose
 from tableverse_factory.core.errors import GeometryError
@@ -20,6 +19,7 @@ from tableverse_factory.geometry.math.transforms import (
     quaternion_about_z,
     quaternion_from_matrix,
 )
+from tableverse_factory.stages.place.completion.nelder_mead import minimize_cost
 from tableverse_factory.stages.place.completion.ray_misfit import MISS_M, RaySample, compute_misfit
 from tableverse_factory.stages.place.completion.turned_profile import Radii, TurnedProfile, intersect_turned
 from tableverse_factory.stages.place.view.object_view import ObjectView
@@ -31,6 +31,7 @@ MIN_HOLLOW = 0.25  # least depth of a cavity, as a share of the height
 BEND_M = 3e-4  # cost of bends of the profile by its widest radius [m]: it decides what was not seen
 CARRY_WEIGHT = 0.1  # weight of how far outside of the body stands what it carries
 CALLS, REFINING_CALLS = 70, 320  # of the search for the size of a template, and for all radii
+FATOL_M = 2e-6  # differences of cost at which a search ends [m]
 HOPELESS_M = 1e-3  # cost over the best template's from which a template is not refined [m]
 MOST_REFINED_M = 1.5e-3  # gain to expect by all radii [m]: of 112 selected shapes under 1.3 mm of 95 %, at most 2.6
 # Radii at the knots as shares of the widest, of which one is the start: a can, a ball, a cone; a beaker, a cup, a bowl
@@ -201,7 +202,7 @@ def _fit_size(
     ]
     start = min(starts, key=cost)
     steps = np.array([0.2 * radius, 0.2 * radius, -0.2, -0.15, 0.25])[: len(start)]
-    found = _minimize(cost, start, steps, CALLS)
+    found = minimize_cost(cost, start, steps, CALLS, fatol=FATOL_M)
     return cost(found), unfold(found)
 
 
@@ -209,15 +210,13 @@ def _refine(view: ObjectView, rays: RaySample, start: Numbers, kind: Kind) -> Tu
     """Fit all numbers of a shape."""
     size = float(np.exp(start[3 : 3 + KNOTS]).max())
     steps = np.array([0.06 * size, 0.06 * size, 0.06, *([0.08] * KNOTS), 0.1])[: len(start)]
-    found = _minimize(lambda x: _measure_cost(view, rays, x, kind)[0], start, steps, REFINING_CALLS)
+
+    def measure(x: Numbers) -> float:
+        return _measure_cost(view, rays, x, kind)[0]
+
+    found = minimize_cost(measure, start, steps, REFINING_CALLS, fatol=FATOL_M, adaptive=True)
     cost, profile = _measure_cost(view, rays, found, kind)
     return TurnedShape(profile, cost)
-
-
-def _minimize(cost: Callable[[Numbers], float], start: Numbers, steps: Numbers, calls: int) -> Numbers:
-    simplex = np.vstack([start, start + np.diag(steps)])
-    options = {"initial_simplex": simplex, "maxfev": calls, "xatol": 2e-4, "fatol": 2e-6, "adaptive": len(start) > 5}
-    return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
 
 
 def _measure_cost(view: ObjectView, rays: RaySample, x: Numbers, kind: Kind) -> tuple[float, TurnedProfile]:

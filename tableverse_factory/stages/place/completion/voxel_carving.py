@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy import ndimage
 from scipy.interpolate import LinearNDInterpolator
-from scipy.optimize import minimize
 from scipy.spatial import QhullError
 
 from schemas.geometry import Frozen, Pose, TriangleMesh, Vector3
@@ -32,6 +31,7 @@ from tableverse_factory.geometry.mesh.voxel_solids import (
     simplify_solid,
     to_manifold,
 )
+from tableverse_factory.stages.place.completion.nelder_mead import minimize_cost
 from tableverse_factory.stages.place.completion.underside import Footprint, estimate_underside
 from tableverse_factory.stages.place.view.object_view import ObjectView, measure_free_space
 
@@ -162,9 +162,7 @@ def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
     away /= max(float(np.linalg.norm(away)), 1e-9)
     reach = 0.25 * float(np.ptp(points[:, :2], axis=0).max())
     best = min((frame.center + k * reach * away for k in (-0.5, 0.0, 0.5, 1.0)), key=cost)
-    simplex = best + np.array([[0.0, 0.0], [0.008, 0.0], [0.0, 0.008]])
-    options = {"initial_simplex": simplex, "maxfev": 60, "xatol": 2e-4, "fatol": 1e-6}
-    return np.asarray(minimize(cost, best, method="Nelder-Mead", options=options).x)
+    return minimize_cost(cost, best, np.full(2, 0.008), 60)
 
 
 def _is_torn(field: Field) -> bool:

@@ -15,6 +15,7 @@ from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP
 from tableverse_factory.geometry.mesh.meshes import box_center, read_mesh
 from tableverse_factory.geometry.mesh.repair import make_closed_solid
+from tableverse_factory.geometry.mesh.texels import get_nearest_texels
 from tableverse_factory.geometry.mesh.voxel_solids import find_largest_part, from_manifold, simplify_solid
 from tableverse_factory.models.services import Services
 from tableverse_factory.stages.place.interfaces import Completion
@@ -84,12 +85,8 @@ def _convert_answer(answer: MeshAnswer, name: str) -> Completion | GeometryError
 def _sample_vertex_colors(mesh: TriangleMesh) -> Colors | None:
     if mesh.texture is None:
         return mesh.vertex_colors
-    height, width = mesh.texture.picture.shape[:2]
-    u, v = mesh.texture.corner_uv.reshape(-1, 2).T
-    columns = np.clip((u * width).astype(np.int64), 0, width - 1)
-    rows = np.clip(((1.0 - v) * height).astype(np.int64), 0, height - 1)
     colors = np.zeros((len(mesh.vertices), 3), dtype=np.uint8)
-    colors[mesh.faces.reshape(-1)] = mesh.texture.picture[rows, columns]
+    colors[mesh.faces.reshape(-1)] = get_nearest_texels(mesh.texture, mesh.texture.corner_uv.reshape(-1, 2))
     return colors
 
 

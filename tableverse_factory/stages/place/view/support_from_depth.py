@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 from scipy.spatial import ConvexHull, QhullError
 
 from schemas.geometry import Frozen, Points, Pose
 from schemas.objects import PerceivedObject
+from tableverse_factory.geometry.math.planes import Points2
 from tableverse_factory.geometry.math.transforms import transform_points
 
 ABOVE_M = 0.03  # most height of an object's lowest visible points above its support [m]: its foot can be hidden
@@ -24,8 +24,6 @@ LONG_RATIO = 2.5  # least length over breadth of contents that lean on the rim a
 STEEP_RATIO = 1.9  # the same of steep ones, which are more hidden
 STEEP = 0.9  # least sine of the elevation of a steep object's longest axis
 CORE = 0.5  # share of a supported object's footprint, about its middle, that has to be supported
-
-Points2 = Float64[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,6 +39,13 @@ def test_a_rim_is_found_where_it_is(noise_m):
     assert not (elsewhere & (rim.within | (off < rim.radius + BESIDE_M))).any(), "only the window is looked at"
 
 
+def test_a_rim_does_not_depend_on_the_numbers_of_other_regions():
+    _, view, truth = seen([Bowl(0.05, 0.02, 0.09), PARTING], 0.004)
+    found = [find_rims(np.array(numbers, dtype=np.int32)[truth], view)[0] for numbers in ((0, 0, 1, 2), (0, 0, 2, 1))]
+    assert found[0].center.tolist() == found[1].center.tolist()
+    assert (found[0].radius, found[0].height) == (found[1].radius, found[1].height)
+
+
 def test_solid_things_have_no_rim():
     things = [
         Box(0.0, 0.0, (0.12, 0.12, 0.1)),
