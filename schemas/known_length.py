@@ -10,6 +10,9 @@ from schemas.error_text import describe_validation_error
 
 MAX_CHARS = 1000
 MIN_DISTANCE_PX = 4.0
+# Longer and shorter side (ISO 216, ANSI Y14.1, ISO 7810 ID-1)
+SHEET_SIZES_M = {"a4": (0.297, 0.210), "us_letter": (0.2794, 0.2159), "bank_card": (0.0856, 0.05398)}
+PIXEL_STD = 0.001  # standard deviation of a marked pixel, in longer sides of the picture
 
 _Coordinate = Annotated[float, Field(ge=-0.5, le=100_000.0, allow_inf_nan=False)]
 Pixel: TypeAlias = tuple[_Coordinate, _Coordinate]
@@ -56,8 +59,8 @@ class KnownSheet(_Known):
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Longer and shorter side [m] (ISO 216, ANSI Y14.1, ISO 7810 ID-1)."""
-        return {"a4": (0.297, 0.210), "us_letter": (0.2794, 0.2159), "bank_card": (0.0856, 0.05398)}[self.kind]
+        """Longer and shorter side [m]."""
+        return SHEET_SIZES_M[self.kind]
 
 
 class KnownHeight(_Known):
@@ -89,6 +92,11 @@ KnownLength: TypeAlias = Annotated[
 KNOWN_LENGTHS = (KnownDistance, KnownSheet, KnownHeight, KnownCameraHeight)
 
 _ADAPTER: TypeAdapter[KnownLength] = TypeAdapter(KnownLength)
+
+
+def get_pixel_std(sides: tuple[int, ...]) -> float:
+    """Get the standard deviation of a pixel that a person marks in a picture of two sides [px]."""
+    return max(0.5, PIXEL_STD * max(sides))
 
 
 def parse_known_length(text: str) -> KnownLength:

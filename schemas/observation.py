@@ -9,8 +9,9 @@ from schemas.known_length import KnownLength
 
 ScaleSource: TypeAlias = Literal["sensor", "estimated", "measured", "given"]
 """What metres come from: a depth sensor, a depth model, a known length, or the file of a layout."""
-IntrinsicsSource: TypeAlias = Literal["capture", "exif", "model", "assumed"]
-"""What the camera comes from: its file, the picture's EXIF, the depth model, or the configuration and defaults."""
+IntrinsicsSource: TypeAlias = Literal["capture", "exif", "sheet", "model", "assumed"]
+"""What the camera comes from: its file, the picture's EXIF, the corners of a known sheet, the depth model, or the
+configuration and defaults."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

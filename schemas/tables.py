@@ -35,7 +35,7 @@ SCENES = pa.schema(
         ("scale_source", pa.string()),  # sensor | estimated | measured | given
         ("scale_sigma", pa.float64()),  # relative standard deviation; null for layouts, and where nothing tells it
         ("scale_deviation", pa.float64()),  # of a known length from the estimate, in standard deviations; or null
-        ("intrinsics_source", pa.string()),  # capture | exif | model | assumed; null for layouts, as is the next
+        ("intrinsics_source", pa.string()),  # capture | exif | sheet | model | assumed; null for layouts, as the next
         ("field_of_view_deg", pa.float64()),  # of the camera, over the longer side
         ("perception", pa.string()),
         ("judge", pa.string()),

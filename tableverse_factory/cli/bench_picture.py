@@ -31,15 +31,19 @@ def bench_picture(
     shapes: Annotated[
         bool, typer.Option("--shapes", help="Compare the proportions of the shapes with those of the sensor's too.")
     ] = False,
+    sheet: Annotated[
+        bool, typer.Option("--sheet", help="Measure by a sheet of A4 on the table instead of a distance.")
+    ] = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare depth, table, scale and objects found in the colour of captures with their depth and masks.
 
-    One scale is taken out of the depth error; measured, it is that of one distance which the sensor tells. Masks are
-    compared where there is a seg.png or masks.png, shapes by their height over their width. Of the folder --other the
-    pictures are listed that are not dropped.
+    One scale is taken out of the depth error; measured, it is that of one distance which the sensor tells, or with
+    --sheet of a sheet of A4, which tells the focal length too. Masks are compared where there is a seg.png or
+    masks.png, shapes by their height over their width. Of the folder --other the pictures are listed that are not
+    dropped.
 
     Example: `tableverse bench picture captures`
     """
@@ -50,7 +54,7 @@ def bench_picture(
 
     settings = load_config(config, overrides or [])
     with count_progress("pictures") as done:
-        scores = list(bench_pictures(folder, settings, focal, done.update, with_shapes=shapes))
+        scores = list(bench_pictures(folder, settings, focal, done.update, with_shapes=shapes, with_sheet=sheet))
     if all(score.unread for score in scores):
         raise InputError(f"none of {len(scores)} captures could be read; the first: {scores[0].reason}")
     total = summarize_pictures(scores)

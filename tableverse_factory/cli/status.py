@@ -160,7 +160,7 @@ def _print_state(state: "BuildState", out: "StoragePath") -> None:
         console.print(table)
     writer = describe_writer(out / WORK / LOCK)
     if writer is not None:
-        print(f"a build is running: {writer}")
+        print(f"being written by {writer}")
     if not state.remaining:
         return
     again = read_rerun_stage(out) == "trajectories"

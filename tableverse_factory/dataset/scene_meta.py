@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from schemas.geometry import Camera, Pose
+from schemas.identity import UNNAMED
 from schemas.scene import Certificate
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.text import sanitize_line
@@ -69,7 +70,7 @@ def read_object_names(meta: Mapping[str, Any]) -> dict[str, str]:
 def read_object_phrases(meta: Mapping[str, Any]) -> dict[str, str]:
     """Read a phrase of every object by id: its first distinguishing phrase, else its name after *the*; printable."""
     verdicts = _read_verdicts(meta)
-    phrases = {key: f"the {name or 'object'}" for key, name in read_object_names(meta).items()}
+    phrases = {key: f"the {name or UNNAMED}" for key, name in read_object_names(meta).items()}
     for key in phrases:
         given = verdicts.get(key, {}).get("distinguishing_phrases")
         if isinstance(given, list) and given:

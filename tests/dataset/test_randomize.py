@@ -202,6 +202,8 @@ def test_somebody_elses_xml_is_refused_in_words(xml, words):
         ('<camera name="observation" pos="0 0"/>', "pos='0 0' of <camera>: 3 finite numbers"),
         ('<camera name="observation" quat="1 0 0"/>', "quat='1 0 0' of <camera>: 4 finite numbers"),
         ('<camera name="observation" quat="0 0 0 0"/>', "no rotation"),
+        ('<camera name="observation" quat="1e-12 0 0 0"/>', "no rotation"),
+        ('<camera name="observation" quat="1e200 0 0 0"/>', "no rotation"),
         ('<camera name="observation" fovy="1 2"/>', "fovy='1 2'"),
         ('<light diffuse="1 1"/>', "diffuse='1 1' of <light>"),
         ('<light pos="0 1"/>', "pos='0 1' of <light>"),

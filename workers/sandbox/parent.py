@@ -161,6 +161,8 @@ class _Child:
 
     def is_alive(self) -> bool:
         """Whether the process can take work; one whose threads are still ending exists but is dead."""
+        if self._process.returncode is not None:
+            return False
         try:
             return self._usage.status() != psutil.STATUS_ZOMBIE  # `poll` would reap it, see `_end`
         except psutil.NoSuchProcess:

@@ -33,8 +33,11 @@ class Journal(ABC):
 
     def __init__(self, path: StoragePath) -> None:
         """Open or create the journal."""
-        with translate_write_errors(path):
+        try:
             self._end = read_journal(path).end
+        except OSError as error:
+            why = f"cannot read {path}: {error.strerror or error}: mend the disk or the permissions"
+            raise BuildError(f"{why}, then run the same command to go on") from error
 
     def record(self, result: SceneResult) -> None:
         """Append a result; it survives a kill at once on the disk, after about a second in a store."""

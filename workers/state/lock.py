@@ -65,7 +65,7 @@ class FileLock:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError:  # also if its last holder removed the folder in this moment
-            if folder.is_symlink() or folder.is_file():
+            if folder.is_symlink() or folder.is_file() or not folder.parent.is_dir():
                 raise
         with ExitStack() as undo:
             try:

@@ -44,7 +44,8 @@ def read_labels(meta: Mapping[str, Any]) -> dict[str, str]:
     """Read labels of the objects by id from a `meta.json`: the detector's, the judge's name without one, or the id."""
     names = read_object_names(meta)
     labels = {str(entry["object_id"]): clean_label(str(entry.get("label") or "")) for entry in meta.get("objects", ())}
-    return {key: clean_label(names[key] or key) if label == UNNAMED else label for key, label in labels.items()}
+    called = {key: key if name in ("", UNNAMED) else clean_label(name) for key, name in names.items()}
+    return {key: called[key] if label == UNNAMED else label for key, label in labels.items()}
 
 
 FORMATS: dict[str, Callable[[Scene, ModelContents, Mapping[str, str]], dict[str, bytes]]] = {

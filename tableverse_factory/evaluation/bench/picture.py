@@ -1,5 +1,6 @@
 """Scores of bare pictures: the colour of captures through `observe` and `perceive`, against their depth and masks."""
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from jaxtyping import Float64
 from schemas.config import Config, ObserveConfig, PerceiveConfig
 from schemas.geometry import DepthImage
 from schemas.identity import check_id
-from schemas.known_length import KnownDistance
+from schemas.known_length import KnownDistance, KnownLength, KnownSheet, encode_known_length
 from schemas.manifest import ImageRow, SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.observation import Observation
@@ -19,6 +20,7 @@ from schemas.outcome import Done, Outcome
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
 from tableverse_factory.evaluation.bench.captures import list_captures
+from tableverse_factory.evaluation.bench.marked_sheet import mark_sheet
 from tableverse_factory.evaluation.bench.perception import (
     MaskScore,
     compare_masks,
@@ -84,19 +86,21 @@ def bench_pictures(
     on_picture: Callable[[int, int], object] = lambda _done, _total: None,
     *,
     with_shapes: bool = False,
+    with_sheet: bool = False,
 ) -> Iterator[PictureScore]:
     """Score the colour of every capture in `folder`, or of `folder` itself, by name; what cannot be read says so.
 
     What lies on the table, and where the table is, tells the sensor through the detector `geometric`; objects are those
     of `seg.png` or `masks.png` where there is one. `with_focal` gives the net the capture's focal length. `with_shapes`
-    compares the proportions of the shapes too.
+    compares the proportions of the shapes too. `with_sheet` measures by a sheet of A4, marked on the table where one
+    would lie free, instead of a distance.
     """
     captures = list_captures(folder, [CAMERA_NAME])
     if not captures:
         raise InputError(f"{str(folder)!r} holds no capture: a folder with color.png, depth.png and camera.json")
     for done, capture in enumerate(captures, 1):
         try:
-            yield score_picture(capture, config, with_focal, with_shapes=with_shapes)
+            yield score_picture(capture, config, with_focal, with_shapes=with_shapes, with_sheet=with_sheet)
         except InputError as error:
             nothing = float("nan")
             figures = (nothing,) * 5
@@ -115,7 +119,7 @@ def bench_other_pictures(folder: Path, config: Config) -> Iterator[tuple[str, st
 
 
 def score_picture(
-    capture: Path, config: Config, with_focal: bool = False, *, with_shapes: bool = False
+    capture: Path, config: Config, with_focal: bool = False, *, with_shapes: bool = False, with_sheet: bool = False
 ) -> PictureScore:
     """Run `observe` and `perceive` on the colour of a capture and compare with its depth and masks.
 
@@ -144,7 +148,10 @@ def score_picture(
     wanted = (ids > 0) | (truth.instance_ids == -1)
     depth = resize_nearest(found.observation.depth, sensor.depth.shape)
     error, log_scale = compare_depth(depth, sensor.depth, wanted)
-    measured = compare_measured_depth(found.observation, sensor, wanted)
+    if with_sheet:
+        measured = _compare_with_sheet(color, config, mark_sheet(truth, config.run.seed), sensor, wanted)
+    else:
+        measured = compare_measured_depth(found.observation, sensor, wanted)
     plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))
     sigma = found.observation.scale_sigma
     found_ids = resize_nearest(found.instance_ids, truth.instance_ids.shape)
@@ -184,6 +191,18 @@ def compare_measured_depth(found: Observation, sensor: Observation, wanted: np.n
     except InputError:  # an end lies where depth is torn: a person would mark another
         return float("nan")
     return float(np.mean(np.abs(true / own * depth[both].astype(np.float64) / sensor.depth[both] - 1.0)))
+
+
+def _compare_with_sheet(
+    path: Path, config: Config, known: KnownSheet | None, sensor: Observation, wanted: np.ndarray
+) -> float:
+    """Compare depth where it is `wanted`, in the metres that a sheet gives it; NaN without a sheet or a scene."""
+    outcome = None if known is None else _perceive_picture(path, config, known)
+    if not isinstance(outcome, Done):
+        return float("nan")
+    depth = resize_nearest(outcome.value.observation.depth, sensor.depth.shape)
+    both = wanted & (depth > 0) & (sensor.depth > 0)
+    return float(np.mean(np.abs(depth[both].astype(np.float64) / sensor.depth[both] - 1.0))) if both.any() else math.nan
 
 
 def _measure_between(ends: np.ndarray, seen: Observation) -> float:
@@ -243,13 +262,14 @@ def _perceive_truth(capture: Path, config: Config) -> tuple[Observation, Perceiv
     return seen.value, outcome.value if isinstance(outcome, Done) else None
 
 
-def _observe(kind: SceneKind, path: Path, config: Config) -> Outcome[Observation]:
-    row = ImageRow(scene_id=check_id("picture"), kind=kind, uri=str(path))
+def _observe(kind: SceneKind, path: Path, config: Config, known: KnownLength | None = None) -> Outcome[Observation]:
+    scene_id = check_id("picture")
+    row = ImageRow(scene_id=scene_id, kind=kind, uri=str(path), known_length=encode_known_length(known))
     return observe(row, config, _seed(config), Services(Path()))
 
 
-def _perceive_picture(path: Path, config: Config) -> Outcome[PerceivedObjects]:
-    seen = _observe(SceneKind.IMAGE, path, config)
+def _perceive_picture(path: Path, config: Config, known: KnownLength | None = None) -> Outcome[PerceivedObjects]:
+    seen = _observe(SceneKind.IMAGE, path, config, known)
     return perceive(seen.value, config, _seed(config), Services(Path())) if isinstance(seen, Done) else seen
 
 

@@ -1,5 +1,6 @@
 """Merge the meshes of a file with their colours: textures, plain materials, or vertex colours."""
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.core.storage.untrusted import IMAGE_FORMATS
 
 MAX_SIDE = 2048  # larger pictures are reduced
-MAX_SHEET = 4096  # side of the atlas that holds the pictures of several materials
+MAX_SHEET = 4096  # side of the atlas that holds the pictures of several materials, but for rows of plain colours
 MOST_PICTURES = 4  # pixels of all pictures of a mesh, as a multiple of the most that one may have
 DEFAULT_COLOR = (178, 178, 184)  # sRGB of uncoloured parts beside coloured ones
 
@@ -68,14 +69,25 @@ def merge_parts(parts: Sequence[MaterialPart], max_pixels: int) -> TriangleMesh:
 
 def _read_paints(meshes: Sequence[trimesh.Trimesh], max_pixels: int) -> list[_Paint | None]:
     """Read the materials; their pictures are reduced to fit into the atlas together."""
-    images = {id(image): image for mesh in meshes if (image := _get_picture(mesh)) is not None}
-    pixels = [math.prod(image.size) for image in images.values()]
+    images = {id(mesh): image for mesh in meshes if (image := _get_picture(mesh)) is not None}
+    digests = {key: _hash_picture(image) for key, image in images.items()}
+    distinct = dict(zip(digests.values(), images.values(), strict=True))
+    pixels = [math.prod(image.size) for image in distinct.values()]
     for some, count, most in (("a texture", max(pixels, default=0), 1), ("all textures", sum(pixels), MOST_PICTURES)):
         if count > most * max_pixels:
             raise GeometryError(f"{some} of {count} pixels; at most {most * max_pixels} are decoded")
-    side = min(MAX_SIDE, MAX_SHEET // max(1, math.ceil(math.sqrt(len(images)))))
-    pictures = {key: _shrink(image.convert("RGB"), side) for key, image in images.items()}
-    return [_read_paint(mesh, pictures) for mesh in meshes]
+    tinted = {
+        (digests[id(m)], repr(getattr(m.visual.material, "baseColorFactor", None))) for m in meshes if id(m) in images
+    }
+    side = min(MAX_SIDE, max(1, MAX_SHEET // max(1, math.ceil(math.sqrt(len(tinted))))))
+    pictures = {digest: _shrink(image.convert("RGB"), side) for digest, image in distinct.items()}
+    return [_read_paint(mesh, pictures.get(digests.get(id(mesh), ""))) for mesh in meshes]
+
+
+def _hash_picture(image: Image.Image) -> str:
+    """Hash a picture by its file, or by its pixels once it is decoded; materials may open one file several times."""
+    stream = getattr(image, "fp", None)
+    return content_hash(stream.getvalue() if isinstance(stream, io.BytesIO) else image.tobytes())
 
 
 def _get_picture(mesh: trimesh.Trimesh) -> Image.Image | None:
@@ -87,11 +99,11 @@ def _get_picture(mesh: trimesh.Trimesh) -> Image.Image | None:
     return image if is_picture and has_uv else None
 
 
-def _read_paint(mesh: trimesh.Trimesh, pictures: Mapping[int, Picture]) -> _Paint | None:
+def _read_paint(mesh: trimesh.Trimesh, picture: Picture | None) -> _Paint | None:
     """Read a material, if there is one; an OBJ's plain colour does not tint its picture."""
     if mesh.visual.kind != "texture":
         return None
-    material, picture = mesh.visual.material, pictures.get(id(_get_picture(mesh)))
+    material = mesh.visual.material
     linear, plain = getattr(material, "baseColorFactor", None), getattr(material, "kwargs", {}).get("kd")
     if picture is not None:
         return _Paint(_apply_tint(picture, linear), np.nan_to_num(np.asarray(mesh.visual.uv, dtype=np.float64)))
@@ -156,23 +168,25 @@ def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | Non
             pixel = 0.5 + np.stack([across, down], axis=-1)
             uv = np.array([0.0, 1.0]) + pixel / sheet_size * np.array([1.0, -1.0])
         corners.append(uv)
-    if max(sheet.shape[:2]) > MAX_SHEET:
-        sheet = _shrink(Image.fromarray(sheet), MAX_SHEET)
     return Texture(sheet, np.concatenate(corners))
 
 
 def _arrange_pictures(pictures: Mapping[str, Picture]) -> tuple[dict[str, tuple[int, int]], np.ndarray]:
-    """Arrange pictures in rows, the highest first; returns the left upper pixel of each, and width and height."""
+    """Arrange pictures in rows, the highest first; returns the left upper pixel of each, and width and height.
+
+    Of n pictures that are no plain colours there are as many rows as columns at most.
+    """
     sizes = {key: picture.shape[:2] for key, picture in pictures.items()}
-    area = sum(height * width for height, width in sizes.values())
-    across = max(math.isqrt(area), *(width for _, width in sizes.values()))
-    places, left, top, bottom = {}, 0, 0, 0
+    columns = math.ceil(math.sqrt(sum(size != (1, 1) for size in sizes.values())))
+    across = max(1, columns) * max(width for _, width in sizes.values())
+    places, left, top, right, bottom = {}, 0, 0, 0, 0
     for key, (height, width) in sorted(sizes.items(), key=lambda each: (-each[1][0], -each[1][1])):
         if left + width > across:
             left, top = 0, bottom
         places[key] = left, top
-        left, bottom = left + width, max(bottom, top + height)
-    return places, np.array([across, bottom])
+        left += width
+        right, bottom = max(right, left), max(bottom, top + height)
+    return places, np.array([right, bottom])
 
 
 def _wrap_corner_uv(part: MaterialPart, paint: _Paint | None) -> Float64[np.ndarray, "m 3 2"]:

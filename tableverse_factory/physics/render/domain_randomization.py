@@ -113,8 +113,8 @@ def _move_camera(root: ET.Element, rng: np.random.Generator) -> None:
     eye.set("pos", _text(_read_numbers(eye, "pos", 3, [0.0] * 3) + shift))
     if not any(name in eye.attrib for name in _OTHER_ORIENTATIONS):
         before = _read_numbers(eye, "quat", 4, [1.0, 0.0, 0.0, 0.0])
-        if not before.any():
-            raise InputError(f"scene.xml: quat {eye.get('quat')!r} of a camera is no rotation", "bad_mjcf")
+        if not 1e-6 < np.abs(before).max() < 1e6:
+            raise InputError(f"scene.xml: quat={eye.get('quat', '')[:60]!r} of a camera is no rotation", "bad_mjcf")
         small = normalize_quaternion(np.array([1.0, *(turn / 2)]))
         eye.set("quat", _text(multiply_quaternions(normalize_quaternion(before), small)))
     for key, count, factor in (("fovy", 1, zoom), ("focalpixel", 2, 1 / zoom)):

@@ -111,6 +111,7 @@ SCALE_NAMES = {  # of `schemas.observation.ScaleSource`
 CAMERA_NAMES = {  # of `schemas.observation.IntrinsicsSource`
     "capture": "from its file",
     "exif": "from EXIF",
+    "sheet": "by the sheet of known size",
     "model": "by the depth model",
     "assumed": "assumed",
 }

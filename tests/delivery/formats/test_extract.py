@@ -363,10 +363,12 @@ def test_what_no_detector_named_is_called_by_the_judge_or_as_its_id():
         {"object_id": "obj_000", "label": "object"},
         {"object_id": "obj_001"},
         {"object_id": "obj_002", "label": "mug"},
+        {"object_id": "obj_003", "label": "object"},
     ]
     judged = {"objects": [{"object_id": f"obj_00{k}", "relabel_name": "white bowl"} for k in (0, 2)]}
     assert read_labels({"objects": objects, "assessment": judged}) == {
         "obj_000": "white bowl",
         "obj_001": "obj_001",
         "obj_002": "mug",
+        "obj_003": "obj_003",
     }

@@ -11,7 +11,10 @@ import skimage
 from PIL import Image
 
 from schemas.config import Config
+from schemas.geometry import TABLE_ID
+from schemas.outcome import Done
 from tableverse_factory.core.seeding import make_rng
+from tableverse_factory.evaluation.bench.marked_sheet import mark_sheet
 from tableverse_factory.evaluation.bench.picture import (
     PictureScore,
     compare_depth,
@@ -20,11 +23,13 @@ from tableverse_factory.evaluation.bench.picture import (
     summarize_pictures,
 )
 from tableverse_factory.evaluation.bench.picture_shapes import ProportionError, ShapeScore, compare_proportions
+from tableverse_factory.geometry.math.transforms import rotation_matrix
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.manifest import make_manifest
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.perceive import perceive
+from tests.helpers.tabletop_views import GEOMETRIC, Box, look
 
 DATA = Path(skimage.__file__).parent / "data"
 
@@ -175,3 +180,27 @@ def test_a_capture_that_cannot_be_read_costs_its_own_row(tmp_path, run) -> None:
     code, _, errors = run("bench", "picture", good.parent)
     assert code != 0
     assert "none of 2 captures could be read" in errors
+
+
+def test_a_sheet_is_marked_where_nothing_stands_and_as_large_as_it_is(tmp_path: Path) -> None:
+    thing = Box(0.0, 0.0, (0.08, 0.08, 0.1))
+    seen, _ = look([thing])
+    truth = perceive(seen, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
+    assert isinstance(truth, Done), truth
+    known = mark_sheet(truth.value, seed=0)
+    assert known is not None
+    camera, pose = seen.camera, truth.value.camera_to_table
+    offsets = (np.array(known.pixels) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    directions = np.append(offsets, np.ones((4, 1)), axis=1) @ rotation_matrix(pose.quaternion_wxyz).T
+    corners = pose.position - directions * (pose.position[2] / directions[:, 2:])
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+    assert np.sort(sides) == pytest.approx([0.21, 0.21, 0.297, 0.297], abs=0.01)
+    columns, rows = np.array(known.pixels).mean(axis=0).round().astype(int)
+    assert truth.value.instance_ids[rows, columns] == TABLE_ID
+
+
+def test_a_small_table_has_no_room_for_a_sheet(tmp_path: Path) -> None:
+    seen, _ = look([Box(0.0, 0.0, (0.08, 0.08, 0.1))], table_half=(0.14, 0.1))
+    truth = perceive(seen, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
+    assert isinstance(truth, Done), truth
+    assert mark_sheet(truth.value, seed=0) is None

@@ -1,5 +1,6 @@
 """Meshes: every format gives the same triangles, volumes are analytic, and hostile files give one clear error."""
 
+import io
 import json
 import struct
 
@@ -201,31 +202,54 @@ def test_scanned_meshes_are_whole(shared_dir):
         assert 0.005 < (high - low).max() < 0.6, path.name  # metres: hand-sized things
 
 
-def paint_many(count: int, side: int) -> bytes:
-    """A GLB of `count` squares, each with a picture of its own."""
+def paint_many(count: int, side: int, plain: int = 0) -> bytes:
+    """A GLB of `count` squares, each with a picture of its own, and of `plain` ones of a colour."""
     scene = trimesh.Scene()
-    for k in range(count):
-        color = (10 * k, 255 - 10 * k, 40)
+    for k in range(count + plain):
         square = trimesh.Trimesh([[k, 0, 0], [k + 0.9, 0, 0], [k, 0.9, 0]], [[0, 1, 2]], process=False)
-        image = Image.new("RGB", (side, side), color)
-        square.visual = trimesh.visual.TextureVisuals(
-            np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
-            trimesh.visual.material.PBRMaterial(baseColorTexture=image),
-        )
+        color = (9 * k, 255 - 9 * k, 40)
+        if k < count:
+            material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (side, side), color))
+        else:
+            material = trimesh.visual.material.PBRMaterial(baseColorFactor=(*color, 255))
+        square.visual = trimesh.visual.TextureVisuals(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), material)
         scene.add_geometry(square, geom_name=f"square_{k}")
     return scene.export(file_type="glb")
 
 
-def test_many_pictures_fit_into_one_sheet_and_stay_sharp():
-    mesh = read_mesh(paint_many(20, 512), "many.glb")
+@pytest.mark.parametrize("plain", [0, 2])
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 13, 20])
+def test_many_pictures_fit_into_one_sheet_and_stay_sharp(count, plain):
+    mesh = read_mesh(paint_many(count, 512, plain), "many.glb")
     assert mesh.texture is not None
     height, width = mesh.texture.picture.shape[:2]
-    assert max(height, width) <= 4096
-    assert height * width >= 20 * 512 * 512  # none was reduced
+    assert max(height, width - plain) <= 512 * int(np.ceil(np.sqrt(count))) + min(plain, 1)
+    assert height * width >= count * 512 * 512  # none was reduced
     middles = mesh.texture.corner_uv.mean(axis=1)
     columns, rows = np.int64(middles[:, 0] * width), np.int64((1.0 - middles[:, 1]) * height)
     own = np.int64(mesh.vertices[mesh.faces][:, :, 0].min(axis=1) + 1e-6)
-    assert np.abs(mesh.texture.picture[rows, columns, 0].astype(int) - 10 * own).max() <= 1
+    painted = own < count
+    shown = mesh.texture.picture[rows, columns, 0].astype(int)
+    assert np.abs(shown - 9 * own)[painted].max() <= 1
+
+
+def test_pictures_larger_than_the_sheet_together_are_reduced_alike():
+    mesh = read_mesh(paint_many(5, 1600, plain=1), "many.glb")
+    assert mesh.texture is not None
+    assert 4000 <= max(mesh.texture.picture.shape[:2]) <= 4097
+
+
+def test_materials_of_one_file_have_its_picture_once(tmp_path):
+    """An OBJ's materials open it anew each."""
+    picture = io.BytesIO()
+    Image.new("RGB", (1024, 1024), (200, 30, 40)).save(picture, "PNG")
+    lines = ["mtllib many.mtl", *(f"v {x} {y} 0" for x, y in ((0, 0), (1, 0), (0, 1))), "vt 0 0", "vt 1 0", "vt 0 1"]
+    lines += [f"usemtl m{k}\nf 1/1 2/2 3/3" for k in range(12)]
+    library = "\n".join(f"newmtl m{k}\nmap_Kd one.png" for k in range(12))
+    beside = {"many.mtl": library.encode(), "one.png": picture.getvalue()}
+    mesh = read_mesh("\n".join(lines).encode(), "many.obj", beside, max_pixels=1024 * 1024)
+    assert mesh.texture is not None
+    assert mesh.texture.picture.shape == (1024, 1024, 3)
 
 
 def test_pictures_of_too_many_pixels_together_are_refused():

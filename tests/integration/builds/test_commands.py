@@ -42,7 +42,7 @@ def test_status_names_the_build_that_runs_and_gives_no_advice_for_a_second_one(r
     with create_writer_lock(out / ".work" / "lock"):
         code, text, _ = run("status", out)
     assert code == 0
-    assert f"a build is running: process {os.getpid()} on {platform.node()}" in text.splitlines()
+    assert f"being written by process {os.getpid()} on {platform.node()}" in text.splitlines()
     assert "wait for it" not in text
 
 

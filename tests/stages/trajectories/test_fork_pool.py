@@ -19,6 +19,7 @@ from tableverse_factory.core.errors import (
     StoreError,
 )
 from tableverse_factory.stages.trajectories.fork_pool import ItemFailure, map_in_fork
+from tests.helpers.builds import wait_until
 
 pytestmark = pytest.mark.heavy
 
@@ -123,12 +124,19 @@ def test_no_item_is_begun_for_a_parent_that_was_killed_while_it_forked(tmp_path)
 import os, time
 from pathlib import Path
 from tableverse_factory.stages.trajectories.fork_pool import map_in_fork
-os.register_at_fork(after_in_child=lambda: time.sleep(1.0))
+def wait_for_its_death():
+    Path({str(tmp_path / "forked")!r}).write_text(str(os.getpid()))
+    while os.getppid() == parent:
+        time.sleep(0.01)
+parent = os.getpid()
+os.register_at_fork(after_in_child=wait_for_its_death)
 map_in_fork(lambda item: Path({str(tmp_path / "begun")!r}).touch() or b"", 1, 30.0, {MEMORY_MB})
 """
+    forked = tmp_path / "forked"
     with subprocess.Popen([sys.executable, "-c", script]) as parent:
-        while not (children := psutil.Process(parent.pid).children()):
-            time.sleep(0.01)
+        wait_until(lambda: parent.poll() is not None or (forked.exists() and forked.read_text()))
+        assert parent.poll() is None
+        child = psutil.Process(int(forked.read_text()))
         parent.kill()
-    assert psutil.wait_procs(children, timeout=20)[1] == []
+    assert psutil.wait_procs([child], timeout=20)[1] == []
     assert not (tmp_path / "begun").exists()

@@ -136,7 +136,7 @@ def test_a_damaged_journal_is_said_and_costs_what_stood_there_alone(tmp_path):
 
 def test_a_journal_that_cannot_be_read_is_a_clear_error(tmp_path):
     (tmp_path / "j").mkdir()
-    with pytest.raises(BuildError, match=r"cannot write .*j: Is a directory"):
+    with pytest.raises(BuildError, match=r"cannot read .*j: Is a directory: mend the disk"):
         FileJournal(tmp_path / "j")
 
 

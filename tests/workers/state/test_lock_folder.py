@@ -6,12 +6,14 @@ import platform
 import re
 import subprocess
 import sys
-import threading
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tableverse_factory.core.errors import BuildError
+from workers.state import lock
 from workers.state.lock import FileLock, describe_writer
 from workers.state.lock_owner import LockOwner, encode_owner
 
@@ -33,17 +35,16 @@ def test_a_lock_ends_although_another_command_writes_into_its_folder(tmp_path, m
         pass
 
 
-def test_a_look_at_the_lock_refuses_no_build(tmp_path):
+def test_a_look_at_the_lock_refuses_no_build(tmp_path, monkeypatch):
     path = tmp_path / "out" / ".work" / "lock"
     path.parent.mkdir(parents=True)
     path.write_bytes(encode_owner(LockOwner(4711, "gone")))
     looking = os.open(path, os.O_RDWR)
-    fcntl.flock(looking, fcntl.LOCK_SH)  # as `describe_writer` does, but for longer
-    end = threading.Timer(0.05, os.close, [looking])
-    end.start()
+    fcntl.flock(looking, fcntl.LOCK_SH)  # as `describe_writer` does, until the build waits for it
+    waiting = SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: os.close(looking))
+    monkeypatch.setattr(lock, "time", waiting)
     with FileLock(path):
         assert describe_writer(path) == f"process {os.getpid()} on {platform.node()}"
-    end.join()
 
 
 def test_a_second_build_is_refused_and_told_what_to_do(tmp_path):
@@ -59,7 +60,9 @@ def test_a_lock_that_cannot_be_written_is_not_held(tmp_path):
     script = f"""
 import resource, signal
 from pathlib import Path
+from types import SimpleNamespace
 from tableverse_factory.core.errors import BuildError
+from workers.state import lock
 from workers.state.lock import FileLock
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -83,7 +86,9 @@ def test_commands_that_end_and_begin_at_once_are_refused_by_name_alone(tmp_path)
     script = f"""
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from tableverse_factory.core.errors import BuildError
+from workers.state import lock
 from workers.state.lock import FileLock
 until = time.monotonic() + 2.0
 while time.monotonic() < until:
@@ -98,8 +103,11 @@ while time.monotonic() < until:
     assert [command.communicate()[1] for command in commands] == [""] * 4
 
 
+@pytest.mark.parametrize("place", ["disk", "disk/out", "disk/out/.work"])
 @pytest.mark.parametrize("way", [Path.touch, lambda path: path.symlink_to("gone")])
-def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path, way):
-    way(tmp_path / ".work")
-    with pytest.raises(BuildError, match=r"cannot write .*File exists"):
-        FileLock(tmp_path / ".work" / "lock").__enter__()
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path, way, place):
+    """As on a disk that is not mounted."""
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    way(tmp_path / place)
+    with pytest.raises(BuildError, match=r"cannot write .*(File exists|Not a directory)"):
+        FileLock(tmp_path / "disk/out/.work/lock").__enter__()

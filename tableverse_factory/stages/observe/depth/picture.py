@@ -15,7 +15,6 @@ from tableverse_factory.stages.observe.depth.estimate import DepthEstimate, buil
 from tableverse_factory.stages.observe.depth.rgb_image import RgbImage, read_rgb_image
 
 SIGMA_FACTOR = 1.15  # 68 % of 28 photographs lie within so many deviations of the net, which knows renders alone
-FOCAL_SIGMA = 0.2  # of the logarithm of a focal length that no file tells, with which the scale grows
 # Only narrower ones: a picture without its EXIF was often cropped, and a crop never widens the field of view. The net's
 # logit for a table is highest near the true field: on 28 photographs its focal length is off by 16 % in the root mean
 # square, and that of 58 degrees by 24 %.
@@ -24,7 +23,7 @@ UNSURE_PROBABILITY = 0.5  # from which a picture gets these looks, which cost as
 
 
 def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
-    """Estimate depth; the focal length comes from EXIF, `observe.focal_px` or the usual field of view.
+    """Estimate depth; the focal length is as `RgbImage` tells it.
 
     Where it is a guess, and the net is unsure of the table, narrower fields of view are tried, and the one with which
     it is surest is taken: a wrong field distorts what it sees.
@@ -32,17 +31,16 @@ def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
     Raises:
         AnswerInvalidError: reasons `no_table`, `table_out_of_bounds`.
     """
-    bounds, photo = config.observe, read_rgb_image(item.uri, config.observe)
-    is_guess = photo.exif_px is None and bounds.focal_px is None
-    tried = [_predict(photo, photo.get_focal_px(bounds.focal_px), bounds)]
-    if is_guess and UNSURE_PROBABILITY <= tried[0][1].table_probability < bounds.min_table_probability:
+    bounds, photo = config.observe, read_rgb_image(item.uri, config.observe, item.known_length)
+    tried = [_predict(photo, photo.focal_px, bounds)]
+    if photo.is_guessed and UNSURE_PROBABILITY <= tried[0][1].table_probability < bounds.min_table_probability:
         tried += [_predict(photo, photo.get_field_px(field), bounds) for field in NARROWER_FIELDS_DEG]
     camera, found = max(tried, key=lambda each: each[1].table_probability)
     source = photo.intrinsics_source if camera is tried[0][0] else "model"
     check_table(found, bounds)
     capture = build_capture(photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=source), bounds)
-    spread = FOCAL_SIGMA if is_guess else 0.0
-    return replace(capture, camera=camera, scale_sigma=math.hypot(SIGMA_FACTOR * found.scale_sigma, spread))
+    sigma = math.hypot(SIGMA_FACTOR * found.scale_sigma, photo.focal_sigma)  # the scale grows with the focal length
+    return replace(capture, camera=camera, scale_sigma=sigma)
 
 
 def _predict(photo: RgbImage, focal_px: float, bounds: ObserveConfig) -> tuple[Camera, PicturePrediction]:

@@ -116,8 +116,9 @@ def _find_feet_below_image(view: TableView) -> Mask:
 def _is_carried(mask: Mask, ids: IdImage, view: TableView) -> bool:
     """Whether the region is near the table or has a visible or hidden support, and does not stand below, on a floor.
 
-    Below its lower contour are the table, a surface that it touches, or something nearer that may hide its support.
-    What rises there beyond the table, in no region of `ids`, is a wall or furniture: a rail on it is no object.
+    Below its lower contour, at the next reading, are the table, a surface that it touches, or something nearer that may
+    hide its support; where nothing more is read down to the border of the picture, its support may be there. What rises
+    there beyond the table, in no region of `ids`, is a wall or furniture: a rail on it is no object.
     """
     low, middle = np.percentile(view.heights[mask], (2, 50))
     if middle < -max(HANGING_M, BENDS * view.observation.bend * float(np.median(view.depth[mask]))):

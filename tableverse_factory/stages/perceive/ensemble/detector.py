@@ -62,7 +62,8 @@ def detect_with_ensemble(view: TableView, config: Config, services: Services) ->
     unread, fused = view.observation.depth <= 0, detect_fused(view, seen)
     by_depth = _choose_answers(detect_from_depth(view, config, services), fused, boundary, unread, prefer_fused)
     bent = find_bent_table(_get_ids(by_depth), view, upsample_map(seen.label[TABLE], view.valid.shape))
-    answer = _choose_answers(by_depth, detect_predicted(view, seen), boundary, unread, prefer_net, bent)
+    by_depth = replace(by_depth, ids=np.where(bent, 0, _get_ids(by_depth)))
+    answer = _choose_answers(by_depth, detect_predicted(view, seen), boundary, unread, prefer_net)
     answer = contain_as(by_depth, answer)  # depth shows hollows better than the net alone
     return replace(answer, shown=fused.shown & ~bent, table_top=find_label(seen, TABLE, view.valid.shape))
 
@@ -73,12 +74,8 @@ def _choose_answers(
     boundary: Probabilities,
     unread: Mask,
     prefers_second: Callable[[Comparison], bool],
-    left_out: Mask | None = None,
 ) -> DetectionResult:
-    """Take the second answer for each group of objects of which it is preferred, else the first.
-
-    Objects of the first that lie in `left_out` for the most part are none.
-    """
+    """Take the second answer for each group of objects of which it is preferred, else the first."""
     answers = first, second
     ids, contained = [_get_ids(answer) for answer in answers], [_list_contained(answer) for answer in answers]
     numbers = group_objects(ids[0], ids[1], contained[0], contained[1])
@@ -88,8 +85,6 @@ def _choose_answers(
         window = expand_window((groups[0] == group) | (groups[1] == group), 2 * REACH_PX)
         own = [np.where(each[window] == group, part[window], 0) for each, part in zip(groups, ids, strict=True)]
         takes_second[group] = prefers_second(compare_answers(own, boundary[window], unread[window]))
-    if left_out is not None:
-        ids[0] = np.where(left_out, 0, ids[0])
     return _merge_answers(answers, ids, groups, takes_second)
 
 
@@ -160,15 +155,16 @@ def prefer_net(compared: Comparison) -> bool:
 
 
 def find_bent_table(ids: IdImage, view: TableView, table_probability: Probabilities) -> Mask:
-    """Find the objects that are table: bent depth raises it a little, and the net sees nothing else; shapes (h, w)."""
-    labels = np.arange(1, int(ids.max(initial=0)) + 1)
-    probable = ndimage.mean(table_probability, ids, labels) if len(labels) else []
-    bent = [
-        k
-        for k, mean in zip(labels, probable, strict=True)
-        if mean > SURELY_TABLE and np.median(view.heights[(ids == k) & view.valid]) < MAX_BENT_M
-    ]
-    return np.isin(ids, bent)
+    """Find the objects that are table: bent depth raises it a little, and the net sees nothing else; shapes (h, w).
+
+    What has no reading, depth has not raised.
+    """
+    read = np.where(view.valid, ids, 0)
+    labels = np.unique(read[read > 0])
+    if not len(labels):
+        return np.zeros(ids.shape, dtype=bool)
+    probable, height = ndimage.mean(table_probability, read, labels), ndimage.median(view.heights, read, labels)
+    return np.isin(ids, labels[(probable > SURELY_TABLE) & (height < MAX_BENT_M)])
 
 
 def _score_borders(border: Mask, boundary: Probabilities, inside: Mask) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from schemas.geometry import IdImage, Mask
-from schemas.known_length import KnownCameraHeight, KnownDistance, KnownHeight, KnownSheet
+from schemas.known_length import KnownCameraHeight, KnownDistance, KnownHeight, KnownSheet, get_pixel_std
 from schemas.observation import Observation
 from schemas.outcome import Dropped
 from tableverse_factory.core.errors import InputError
@@ -19,7 +19,6 @@ from tableverse_factory.stages.perceive.scale.surface import (
     LENGTH_STD_M,
     UNMEASURED,
     MeasuredLength,
-    get_pixel_std,
     measure_distance,
     measure_sheet,
 )
@@ -148,7 +147,7 @@ def measure_object_height(view: TableView, known: KnownHeight, mask: Mask) -> Me
     apart = float(np.hypot(np.ptp(rows), np.ptp(columns))) / side
     away = float(np.median(view.depth[mask]))
     along = abs(float(view.plane.normal[2])) * away * math.sqrt(2.0) * apart * item.bend
-    across = math.sqrt(2.0) * get_pixel_std(item) * away / item.camera.fy
+    across = math.sqrt(2.0) * get_pixel_std(item.depth.shape) * away / item.camera.fy
     return MeasuredLength(height, math.hypot(item.bend, along / height, across / height, LENGTH_STD_M / known.length_m))
 
 

@@ -8,12 +8,11 @@ from jaxtyping import Bool, Float64
 from scipy.optimize import least_squares
 
 from schemas.geometry import Camera, Frozen, Points, Vector3
-from schemas.known_length import KnownDistance, KnownSheet, Pixel
+from schemas.known_length import KnownDistance, KnownSheet, Pixel, get_pixel_std
 from schemas.observation import Observation
 from tableverse_factory.core.errors import InputError
 
 UNMEASURED = "known_length_unmeasured"
-PIXEL_STD = 0.001  # standard deviation of a marked pixel, in longer sides of the picture
 LENGTH_STD_M = 0.001  # of a length that was measured by hand
 REACH, NEAR = 0.005, 0.002  # radii around a marked pixel, in longer sides: of the fitted surface, of what is meant
 ONE_SURFACE = 0.04  # depths that differ by more than this share lie on two surfaces
@@ -56,11 +55,6 @@ def compute_rays(pixels: Pixels, camera: Camera) -> Points:
     return np.stack([x, y, np.ones(len(pixels))], axis=1)
 
 
-def get_pixel_std(observation: Observation) -> float:
-    """Get the standard deviation of a marked pixel [px]."""
-    return max(0.5, PIXEL_STD * max(observation.depth.shape))
-
-
 def measure_distance(observation: Observation, known: KnownDistance) -> MeasuredLength:
     """Measure the distance between the surfaces at two pixels."""
     camera, bend = observation.camera, observation.bend
@@ -81,7 +75,7 @@ def measure_distance(observation: Observation, known: KnownDistance) -> Measured
         raise InputError(f"known_length: the two pixels show points {length:.2g} m apart: mark others", UNMEASURED)
     along = float((first - second) @ (first + second)) / 2.0 / length**2  # of the line of sight, over the length
     apart = min(1.0, float(np.linalg.norm(pixels[0] - pixels[1])) / max(observation.depth.shape))
-    from_pixels = _propagate(lambda at: float(np.log(measure(at))), pixels) * get_pixel_std(observation)
+    from_pixels = _propagate(lambda at: float(np.log(measure(at))), pixels) * get_pixel_std(observation.depth.shape)
     parts = (from_pixels, bend, along * bend * np.sqrt(2.0) * apart, LENGTH_STD_M / known.length_m)
     return MeasuredLength(length, float(np.linalg.norm(parts)))
 
@@ -114,7 +108,7 @@ def measure_sheet(observation: Observation, known: KnownSheet) -> MeasuredLength
             f"known_length: the corners make no {known.kind}: {differs}; mark its four corners", UNMEASURED
         )
     log_ratio = compare(plane)
-    from_pixels = _propagate(lambda at: compare(fit(at)[0]), corners) * get_pixel_std(observation)
+    from_pixels = _propagate(lambda at: compare(fit(at)[0]), corners) * get_pixel_std(observation.depth.shape)
     return MeasuredLength(known.size_m[0] * float(np.exp(log_ratio)), float(np.hypot(from_pixels, observation.bend)))
 
 

@@ -100,7 +100,7 @@ def carve_half_turn(view: ObjectView) -> CarvedSurface:
     rectangle = fit_min_rectangle(np.concatenate([view.points[:, :2], turned]))
     pose, half = place_frame(view, rectangle, center)
     cell = float(np.clip((2 * half).max() / CELLS_ON_LONGEST_SIDE, *CELL_RANGE_M))
-    cell = max(cell, float(np.cbrt((2 * half).prod() / MAX_CELLS)))
+    cell = _coarsen(cell, 2 * half)
     grid = make_grid(-half - cell, half + cell, cell)
     local = grid.points()
     turned_pose = Pose(pose.position, multiply_quaternions(pose.quaternion_wxyz, quaternion_about_z(np.pi)))
@@ -147,6 +147,16 @@ def close_floor(field: Field, footprint: Footprint, support: float, z: Heights) 
     return np.where(wider[:, :, None], np.maximum(field, floor), field)
 
 
+def _coarsen(cell: float, size: Vector3, cells_up: float = 0.0) -> float:
+    """Enlarge a cell [m] until a grid of this size has at most `MAX_CELLS`, one more on each side included.
+
+    Along z there are `cells_up` at least.
+    """
+    while np.prod([*(size[:2] / cell + 3), max(size[2] / cell, cells_up) + 3]) > MAX_CELLS:
+        cell *= 1.1
+    return cell
+
+
 def _find_turn_center(view: ObjectView) -> Float64[np.ndarray, "2"]:
     """Find the vertical axis: turned points must not lie in free space, but near it."""
     step = max(1, len(view.points) // TURN_POINTS)
@@ -177,7 +187,7 @@ def build_flat_grid(view: ObjectView, half: Vector3) -> tuple[VoxelGrid, float]:
     pixel = float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) / view.camera.fx
     cell = min(float(np.cbrt(size.prod() / COLUMN_CELLS)), float(size.max()) / CELLS_ON_LONGEST_SIDE)
     cell = float(np.clip(cell, max(CELL_RANGE_M[0], PIXELS_A_CELL * pixel), CELL_RANGE_M[1]))
-    cell = max(cell, float(np.sqrt(size[:2].prod() * CELLS_UP / MAX_CELLS)), float(np.cbrt(size.prod() / MAX_CELLS)))
+    cell = _coarsen(cell, size, CELLS_UP)
     stretch = cell / float(np.clip(size[2] / CELLS_UP, MIN_STEP_M, cell))
     scale = np.array([1.0, 1.0, stretch])
     return make_grid(-half * scale - cell, half * scale + cell, cell), stretch

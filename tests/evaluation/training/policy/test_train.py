@@ -1,12 +1,14 @@
 """Training of the policy on states: the same weights again, also in parts; other files are refused."""
 
 import hashlib
+import itertools
 import re
 import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -64,8 +66,8 @@ def test_stopped_after_any_step_and_resumed_gives_the_weights_of_one_go(packed: 
 def test_weights_that_are_hardly_trained_are_said_to_be_with_the_time_of_all_steps(
     packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = iter(range(0, 10_000, 30))
-    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(now)))  # every look at the clock takes 30 s
+    now = itertools.count(0.0, 30.0)
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: next(now)))  # every look takes 30 s
     lines = train(tmp_path / "few", packed, replace(SETTINGS, steps=3_000), minutes=0.0)
     (warning,) = [line for line in lines if "warning" in line]
     pace, hours = re.search(r"1 of 3000 steps, so the .* at (\S+) s/step all steps take (\S+) h", warning).groups()

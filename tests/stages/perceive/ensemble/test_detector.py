@@ -13,8 +13,10 @@ from tableverse_factory.models.services import Services
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 from tableverse_factory.stages.observe.observe import observe
 from tableverse_factory.stages.perceive.base.interfaces import Candidate, DetectionResult
+from tableverse_factory.stages.perceive.depth_segmenter.segment import to_detections
 from tableverse_factory.stages.perceive.ensemble.detector import (
     Comparison,
+    _choose_answers,
     _merge_answers,
     compare_answers,
     contain_as,
@@ -278,3 +280,15 @@ def test_without_objects_no_table_is_taken_for_one():
     seen, ids = look([Box(0.0, 0.0, (0.1, 0.1, 0.1))], camera_above(0.6, 0.7))
     view = find_table(seen, np.random.default_rng(0))
     assert not find_bent_table(np.zeros_like(ids), view, np.ones(ids.shape, np.float32)).any()
+
+
+def test_an_object_on_bent_table_that_the_net_alone_sees_is_kept():
+    bent, thing = np.zeros(SHAPE, np.int32), np.zeros(SHAPE, np.int32)
+    bent[5:75, 5:115] = thing[30:50, 50:70] = 1
+    boundary = np.full(SHAPE, 0.02, dtype=np.float32)
+    boundary[29:51, 49:71] = 0.95
+    boundary[32:48, 52:68] = 0.02
+    by_depth, seen = (to_detections(ids, {}) for ids in (bent, thing))
+    without = replace(by_depth, ids=np.zeros_like(bent))
+    assert (_choose_answers(without, seen, boundary, READ, prefer_net).ids == thing).all()
+    assert not (_choose_answers(by_depth, seen, boundary, READ, prefer_net).ids == thing).all()
