@@ -21,6 +21,7 @@ TROUBLESHOOTING = "docs/troubleshooting.md"
 
 _REMEDIES = {
     errno.ENOSPC: "make room, then run the same command again",
+    errno.EFBIG: "the limit on the size of a file is too low: ulimit -f unlimited",
     errno.EDQUOT: "make room, then run the same command again",
     errno.EACCES: "look whose it is with ls -l, or give another path",
     errno.EROFS: "give a path that can be written",

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 
 from schemas.config import ObserveConfig
@@ -19,7 +20,6 @@ from tableverse_factory.core.storage.files import StoragePath, parse_path, write
 from tableverse_factory.core.storage.parquet import encode_rows
 from tableverse_factory.core.storage.untrusted import exists, open_image, parse_json, read_bytes
 from tableverse_factory.core.text import sanitize_line
-from tableverse_factory.geometry.mesh.meshes import read_mesh
 from tableverse_factory.sources.capture import read_capture
 from tableverse_factory.sources.content_hash import hash_entry
 from tableverse_factory.sources.discovery import ManifestEntry, discover_entries, name_source_files
@@ -27,6 +27,7 @@ from tableverse_factory.sources.focal import read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
 from tableverse_factory.sources.known_length import REASON, check_pixels, read_known_length
 from tableverse_factory.sources.layout_file import read_layout_file, resolve_mesh_uri
+from tableverse_factory.sources.mesh_file import read_mesh_with_colors
 from tableverse_factory.sources.urls.fetch_lists import NO_LISTS, NO_ORIGIN, FetchedLists, Origin
 from tableverse_factory.sources.urls.image_filter import FilterCriteria, ImageStats, filter_rows, measure_image
 from tableverse_factory.sources.urls.lists import COLUMN_ALIASES, MAX_LICENCE_CHARS, MAX_SOURCE_CHARS
@@ -138,7 +139,7 @@ class _EntryChecker:
         self.known_length = known_length
         self.ignored: Counter[str] = Counter()
         self.digests: dict[str, str] = {}
-        self.refused: dict[str, str] = {}
+        self.refused: dict[str, InputError | None] = {}
 
     def make_row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
         digest, source, licence = "", origin.source, origin.licence
@@ -187,13 +188,21 @@ class _EntryChecker:
         for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
             uri = resolve_mesh_uri(entry.uri, mesh)
             if uri not in self.refused:
-                try:
-                    read_mesh(read_bytes(uri, self.bounds.max_file_bytes, "missing_mesh"), uri)
-                    self.refused[uri] = ""
-                except GeometryError as error:
-                    self.refused[uri] = str(error)
-            if self.refused[uri]:
-                raise InputError(self.refused[uri], "bad_mesh")
+                self.refused[uri] = self._try_mesh(entry.uri, mesh)
+            if (error := self.refused[uri]) is not None:
+                raise error
+        return None
+
+    def _try_mesh(self, layout: str, mesh: str) -> InputError | None:
+        """Read a mesh of a layout with its pictures; returns the error that refuses it, None if it can be read."""
+        locate = partial(resolve_mesh_uri, layout)
+        try:
+            data = read_bytes(locate(mesh), self.bounds.max_file_bytes, "missing_mesh")
+            read_mesh_with_colors(mesh, data, locate, self.bounds)
+        except InputError as error:
+            return error
+        except GeometryError as error:
+            return InputError(str(error), "bad_mesh")
         return None
 
 
@@ -266,6 +275,8 @@ def _reject_duplicates(rows: Iterable[ImageRow]) -> tuple[ImageRow, ...]:
             first = first_of.setdefault((row.kind, row.content_sha256), row)
             if first is not row:
                 detail = f"same content as {first.scene_id} at {sanitize_line(first.uri, 500)}"
+                if row.licence != first.licence:
+                    detail += f", which has the licence {first.licence or 'none'}, and this one {row.licence or 'none'}"
                 row = row.model_copy(update={"rejected": "duplicate_of", "rejected_detail": detail})
         unique.append(row)
     return tuple(unique)

@@ -164,6 +164,14 @@ def test_a_second_entry_of_the_same_content_is_a_duplicate(tmp_path):
     assert rows[1].scene_id == f"{rows[0].scene_id}-2"
 
 
+def test_a_duplicate_with_another_licence_says_so(tmp_path):
+    for name, licence in (("a", "CC0-1.0"), ("b", "CC-BY-ND-4.0")):
+        write_capture(tmp_path / name, 1)
+        (tmp_path / name / "source.json").write_text(json.dumps({"licence": licence}))
+    detail = rows_of(tmp_path)[1].rejected_detail
+    assert detail.endswith("which has the licence CC0-1.0, and this one CC-BY-ND-4.0")
+
+
 def test_a_path_given_twice_is_one_row(tmp_path):
     write_capture(tmp_path / "a", 1)
     assert len(rows_of(tmp_path, tmp_path / "a", f"{tmp_path}/./a/")) == 1
@@ -257,6 +265,15 @@ HOSTILE_LAYOUTS = {
 def test_a_hostile_layout_is_a_row_with_its_reason(tmp_path, reason):
     write_layout(tmp_path / "bad.json", **HOSTILE_LAYOUTS[reason])
     assert reasons(tmp_path)["bad.json"] == reason.strip()
+
+
+def test_a_damaged_picture_of_a_mesh_is_found_before_the_build(tmp_path):
+    lines = ["mtllib a.mtl", "v 0 0 0", "v 1 0 0", "v 0 1 0", "vt 0 0", "usemtl m", "f 1/1 2/1 3/1"]
+    write_layout(tmp_path / "bad.json", content="\n".join(lines).encode())
+    folder = next(tmp_path.rglob("*.obj")).parent
+    (folder / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+    (folder / "a.png").write_bytes(b"no picture")
+    assert reasons(tmp_path)["bad.json"] == "bad_texture"
 
 
 def test_a_label_that_looks_like_markup_is_only_text(tmp_path):

@@ -67,9 +67,11 @@ def connect(address: str | None) -> None:
             log_to_driver=False,
             **({} if address else local),
         )
-    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
-        where = f"the Ray cluster at {redact_uri(address)}" if address else "Ray on this machine"
-        raise BuildError(f"{where} cannot be reached: {describe_loss(error)}") from error
+    except Exception as error:  # Ray raises a plain one where a node does not start in time
+        where, remedy = f"the Ray cluster at {redact_uri(address or '')} cannot be reached", ""
+        if not address:
+            where, remedy = "Ray does not start on this machine", "; is its disk full? --executor local does without"
+        raise BuildError(f"{where}: {describe_loss(error)}{remedy}") from error
 
 
 def _check_reachable(address: str) -> None:

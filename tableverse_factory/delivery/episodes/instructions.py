@@ -19,8 +19,8 @@ PARAPHRASES = (
 
 
 def read_instruction(row: Mapping[str, Any]) -> str:
-    """Read the task's instruction: foreign text, cut and without control characters."""
-    return sanitize_line(str(row.get("instruction") or ""), _MAX_INSTRUCTION)
+    """Read the task's instruction: foreign text, cut and without control characters; empty for none."""
+    return sanitize_line(str(row.get("instruction") or ""), _MAX_INSTRUCTION).strip()
 
 
 def write_instruction(x: str, relation: Relation, y: str) -> str:

@@ -6,6 +6,7 @@ the relation holds on the true meshes. Only the six phases of the fingers are no
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 import mujoco
@@ -35,6 +36,7 @@ from tableverse_factory.robotics.robots.base import find_bases
 from tableverse_factory.robotics.robots.registry import load_arm
 from tableverse_factory.robotics.robots.station import Station
 
+TASK_KEYS = ("x_id", "y_id", "relation", "instruction")  # of a task of one's own
 _UNMOVED_M = 1e-4  # displacement below which a relation is not recomputed
 
 
@@ -206,9 +208,24 @@ def _compute_box(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
     return (low + high) / 2, (high - low) / 2
 
 
+def _check_task(scene: Scene, task: Mapping[str, Any]) -> None:
+    """Refuse a task of one's own with a misspelt key, an unknown object, or an instruction that is no text."""
+    for key in sorted(str(key) for key in task.keys() - TASK_KEYS):
+        if close := get_close_matches(key, TASK_KEYS, n=1, cutoff=0.8):
+            raise InputError(f"task: {sanitize_line(key, 60)!r} is no key: did you mean {close[0]}?", "bad_task")
+    known = [str(item["object_id"]) for item in scene.meta.get("objects", ())]
+    for key in ("x_id", "y_id"):
+        if known and task.get(key) not in known:
+            given, there = sanitize_line(repr(task.get(key)), 60), sanitize_line(", ".join(known[:10]), 200)
+            raise InputError(f"task: {key} {given} is no object of {scene.scene_id}; there are {there}", "bad_task")
+    if not isinstance(words := task.get("instruction"), str | None):
+        raise InputError(f"task: instruction {sanitize_line(repr(words), 60)}: give text, or leave it out", "bad_task")
+
+
 def _find_task(scene: Scene, task: object) -> Mapping[str, Any]:
     """Find a task of `meta.json` by id, or return the given one."""
     if isinstance(task, Mapping):
+        _check_task(scene, task)
         return task
     if not isinstance(task, str):
         raise InputError(f"task {sanitize_line(repr(task), 80)}: give an id, or x_id, y_id and relation", "bad_task")

@@ -4,7 +4,12 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from schemas.identity import check_id, content_hash
+from schemas.manifest import ImageRow, SceneKind
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.core.text import sanitize_line
 
 
 def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
@@ -12,6 +17,14 @@ def list_captures(folder: Path, *needed: Iterable[str]) -> list[Path]:
     if _has_files(folder, needed):
         return [folder.absolute()]  # `.` has no name
     return sorted(path for path in folder.iterdir() if _has_files(path, needed))
+
+
+def make_row(kind: SceneKind, path: Path, scene_id: str, known_length: str = "") -> ImageRow:
+    """Make the row of a capture or a picture; an `InputError` names a path that is not UTF-8."""
+    try:
+        return ImageRow(scene_id=scene_id, kind=kind, uri=str(path), known_length=known_length)
+    except ValidationError:
+        raise InputError(f"{sanitize_line(path.name, 80)}: the name is not UTF-8: rename it") from None
 
 
 def list_captures_lacking(folder: Path, needed: Iterable[str], missing: Iterable[str]) -> list[Path]:

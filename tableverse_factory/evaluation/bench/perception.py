@@ -12,12 +12,12 @@ from scipy.optimize import linear_sum_assignment
 
 from schemas.config import Config, ObserveConfig
 from schemas.geometry import Camera, DepthImage, Frozen, IdImage
-from schemas.manifest import ImageRow, SceneKind
+from schemas.manifest import SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.bench.captures import find_file, list_captures, make_scene_id
+from tableverse_factory.evaluation.bench.captures import find_file, list_captures, make_row, make_scene_id
 from tableverse_factory.models.services import Services
 from tableverse_factory.sources.capture import COLOR_NAMES, MASKS_NAME, read_id_image
 from tableverse_factory.sources.discovery import GROUND_TRUTH_NAME
@@ -116,7 +116,7 @@ def score_capture(capture: Path, config: Config) -> MaskScore:
     scene_id = make_scene_id(capture)
     services = Services(Path())
     seen = observe(
-        ImageRow(scene_id=scene_id, kind=SceneKind.CAPTURE, uri=str(capture)),
+        make_row(SceneKind.CAPTURE, capture, scene_id),
         config,
         make_rng(config.run.seed, scene_id, "observe"),
         services,

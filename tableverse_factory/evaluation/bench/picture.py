@@ -11,15 +11,14 @@ from jaxtyping import Float64
 
 from schemas.config import Config, ObserveConfig, PerceiveConfig
 from schemas.geometry import DepthImage
-from schemas.identity import check_id
 from schemas.known_length import KnownDistance, KnownLength, KnownSheet, encode_known_length
-from schemas.manifest import ImageRow, SceneKind
+from schemas.manifest import SceneKind
 from schemas.objects import PerceivedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done, Outcome
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.bench.captures import list_captures
+from tableverse_factory.evaluation.bench.captures import list_captures, make_row
 from tableverse_factory.evaluation.bench.marked_sheet import mark_sheet
 from tableverse_factory.evaluation.bench.perception import (
     MaskScore,
@@ -235,7 +234,7 @@ def summarize_pictures(scores: Sequence[PictureScore]) -> PictureSummary:
         _find_median(score.plane_deg for score in known),
         _find_median(abs(float(np.expm1(-score.log_scale))) for score in known),
         _average(score.is_within_sigma for score in known),
-        _find_median(score.cpu_s for score in scores),
+        _find_median(score.cpu_s for score in scores if not score.unread),
         merge_scores(masks) if masks else None,
         _find_median(
             float(np.expm1(abs(thing.log_ratio)))
@@ -263,8 +262,7 @@ def _perceive_truth(capture: Path, config: Config) -> tuple[Observation, Perceiv
 
 
 def _observe(kind: SceneKind, path: Path, config: Config, known: KnownLength | None = None) -> Outcome[Observation]:
-    scene_id = check_id("picture")
-    row = ImageRow(scene_id=scene_id, kind=kind, uri=str(path), known_length=encode_known_length(known))
+    row = make_row(kind, path, "picture", encode_known_length(known))
     return observe(row, config, _seed(config), Services(Path()))
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from schemas.config import Config
 from schemas.geometry import Pose, TriangleMesh
-from schemas.manifest import ImageRow, SceneKind
+from schemas.manifest import SceneKind
 from schemas.objects import FitUncertainty, PerceivedObjects, PlacedObject, PlacedObjects
 from schemas.observation import Observation
 from schemas.outcome import Done
 from tableverse_factory.core.errors import InputError
 from tableverse_factory.core.seeding import make_rng
-from tableverse_factory.evaluation.bench.captures import list_captures, make_scene_id
+from tableverse_factory.evaluation.bench.captures import list_captures, make_row, make_scene_id
 from tableverse_factory.evaluation.methods.heading import compute_heading_error, find_symmetric_turns
 from tableverse_factory.evaluation.methods.sources import read_pose
 from tableverse_factory.geometry.math.aabb import aabb
@@ -125,7 +125,7 @@ def place_capture(
 ) -> tuple[PerceivedObjects, PlacedObjects] | None:
     """Return the perceived and the placed objects of a capture; None if a stage dropped it."""
     services, scene_id = Services(Path()), make_scene_id(capture)
-    item = ImageRow(scene_id=scene_id, kind=SceneKind.CAPTURE, uri=str(capture))
+    item = make_row(SceneKind.CAPTURE, capture, scene_id)
     observed = observe(item, config, make_rng(config.run.seed, scene_id, "observe"), services)
     if not isinstance(observed, Done):
         return None

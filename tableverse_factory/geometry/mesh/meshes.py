@@ -14,6 +14,7 @@ from schemas.geometry import Pose, TriangleMesh, Vector3
 from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb, aabb_size
 from tableverse_factory.geometry.math.transforms import Y_UP_TO_Z_UP, transform_points
+from tableverse_factory.geometry.mesh.glb_pictures import check_glb_pictures
 from tableverse_factory.geometry.mesh.mesh_colors import MaterialPart, merge_parts
 from tableverse_factory.geometry.mesh.plain_obj import read_plain_obj
 
@@ -43,6 +44,8 @@ def read_mesh(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own bound decides
+            if suffix == ".glb":
+                check_glb_pictures(data)
             scene = trimesh.load_scene(
                 io.BytesIO(data),
                 file_type=suffix[1:],

@@ -56,6 +56,25 @@ def test_a_task_of_ones_own_is_worded_as_those_of_the_factory(scene):
     assert info["instruction"] == "Pick up the tea box and place it to the left of the bowl"
     assert len(info["paraphrases"]) == 3
     assert TableEnv(scene, {**own, "instruction": "Tidy up"}).sim.instruction == "Tidy up"
+    assert TableEnv(scene, {**own, "instruction": "  "}).sim.instruction == info["instruction"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"instrution": "Tidy up"}, "'instrution' is no key: did you mean instruction"),
+        ({"x_id": "obj_999"}, "x_id 'obj_999' is no object of s-0; there are obj_000, obj_001"),
+        ({"y_id": "table"}, "y_id 'table' is no object"),
+        ({"y_id": None}, "y_id None is no object"),
+        ({"x_id": 0}, "x_id 0 is no object"),
+        ({"instruction": 5}, "instruction 5: give text"),
+        ({"relation": None}, "no relation 'None'; one of"),
+    ],
+)
+def test_a_task_that_is_none_is_said_by_what_is_wrong(scene, change, said):
+    with pytest.raises(InputError, match=said) as caught:
+        TableEnv(scene, {"x_id": "obj_002", "y_id": "obj_001", "relation": "to the left of", **change})
+    assert caught.value.reason == "bad_task"
 
 
 def test_a_recorded_success_is_one_and_a_recorded_failure_is_none(scene):
@@ -355,8 +374,6 @@ def test_tasks_of_ones_own_and_tasks_that_are_none(scene):
         TableEnv(scene, "task_009")
     with pytest.raises(InputError, match="no relation 'over'"):
         TableEnv(scene, {"x_id": "obj_000", "y_id": "obj_001", "relation": "over"})
-    with pytest.raises(InputError, match=r"assets/obj_009.obj"):
-        TableEnv(scene, {"x_id": "obj_009", "y_id": "obj_001", "relation": "on"})
     for wrong in ({"reward": "shaped"}, {"render_mode": "human"}, {"max_objects": 2}, {"robot": "pandora"}):
         with pytest.raises(ConfigError):
             TableEnv(scene, "task_000", **wrong)

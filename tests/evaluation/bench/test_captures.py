@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tableverse_factory.evaluation.bench.captures import list_captures
+from schemas.manifest import SceneKind
+from tableverse_factory.core.errors import InputError
+from tableverse_factory.evaluation.bench.captures import list_captures, make_row
 from tableverse_factory.sources.synthetic.synthesize import synthesize_captures
 
 NEEDED = (("seg.png", "masks.png"), ("color.png",))
@@ -32,3 +34,8 @@ def test_a_single_capture_is_measured(tmp_path, run, name) -> None:
     code, said, errors = run("bench", name, capture)
     assert code == 0, errors
     assert (f"\n{capture.name} " if name != "placement" else "not placed:") in said
+
+
+def test_a_name_that_is_not_utf_8_is_said() -> None:
+    with pytest.raises(InputError, match="name is not UTF-8: rename it"):
+        make_row(SceneKind.CAPTURE, Path("bad\udcff"), "bad")

@@ -255,3 +255,54 @@ def test_materials_of_one_file_have_its_picture_once(tmp_path):
 def test_pictures_of_too_many_pixels_together_are_refused():
     with pytest.raises(GeometryError, match="all textures of 5242880 pixels; at most 4800000"):
         read_mesh(paint_many(20, 512), "many.glb", max_pixels=1_200_000)
+
+
+def embed(picture: bytes, **image: object) -> bytes:
+    """A GLB of a triangle with this picture."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    binary = corners + np.array([[0, 0], [1, 0], [0, 1]], "<f4").tobytes()
+    views = [(0, 36), (36, 24), (60, len(picture))]
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}],
+        "images": [image or {"bufferView": 2, "mimeType": "image/png"}],
+        "accessors": [
+            {"bufferView": k, "componentType": 5126, "count": 3, "type": kind}
+            for k, kind in enumerate(("VEC3", "VEC2"))
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": size} for start, size in views],
+        "buffers": [{"byteLength": len(binary) + len(picture)}],
+    }
+    return glb(document, binary + picture + b"\0" * (-len(binary + picture) % 4))
+
+
+def make_png(*size: int) -> bytes:
+    data = io.BytesIO()
+    Image.new("1", size, 1).save(data, "PNG")
+    return data.getvalue()
+
+
+def test_a_glb_shows_its_picture():
+    mesh = read_mesh(embed(make_png(8, 8)), "good.glb")
+    assert mesh.texture is not None
+    assert (mesh.texture.picture == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        pytest.param(embed(b"\x89PNG\r\n\x1a\nnothing"), "cannot identify image", id="damaged"),
+        pytest.param(embed(make_png(14_000, 14_000)), "exceeds limit", id="a bomb"),
+        pytest.param(embed(make_png(8_000, 8_000)), "a texture of 64000000 pixels", id="too large"),
+        pytest.param(embed(b"", uri="beside.png"), "lies in another file", id="outside"),
+        pytest.param(embed(b"", uri="data:image/png;base64,AAAA"), "cannot identify image", id="a damaged address"),
+    ],
+)
+def test_a_picture_that_cannot_be_shown_is_not_left_out_in_silence(data, said):
+    with pytest.raises(GeometryError, match=said):
+        read_mesh(data, "picture.glb")

@@ -46,6 +46,13 @@ def test_status_names_the_build_that_runs_and_gives_no_advice_for_a_second_one(r
     assert "wait for it" not in text
 
 
+def test_status_of_a_build_that_has_just_begun_says_so(run, tmp_path):
+    with create_writer_lock(tmp_path / "out" / ".work" / "lock"):
+        code, _, errors = run("status", tmp_path / "out")
+    assert code == 1
+    assert f"a build begins there just now, by process {os.getpid()}" in errors
+
+
 def test_failures_say_why_and_retry_puts_exactly_those_back(run, out):
     code, text, _ = run("failures", out)
     assert code == 0

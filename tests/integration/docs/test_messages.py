@@ -123,7 +123,7 @@ ELSEWHERE = {
     "… finished scenes do not read …": "tests/integration/builds/test_growing_dataset.py",
     "damaged, as by a loss of power: …": "tests/integration/builds/test_growing_dataset.py",
     "… not built yet": "tests/evaluation/test_verify.py",
-    "… is being written by process …": "tests/integration/s3/test_store_builds.py",
+    "… is being written by …": "tests/integration/s3/test_store_builds.py",
     "… there is no bucket …": "tests/core/storage/test_files.py",
     "… no credentials: …": "tests/core/storage/test_files.py",
     "… access denied …": "tests/core/storage/test_files.py",
