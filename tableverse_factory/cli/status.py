@@ -38,25 +38,25 @@ def status(
     Example: `tableverse status out --json | jq .remaining` and `tableverse status out --watch --every 30`
     """
     from tableverse_factory.core.storage.files import list_names, parse_path
+    from tableverse_factory.dataset.journals import WORK
+    from workers.state.lock import LOCK, describe_writer
 
     place = parse_path(out)
+    if "run.json" not in list_names(place) and (writer := describe_writer(place / WORK / LOCK)):
+        raise BuildError(f"{out}: a build begins there just now, by {writer}: ask again in a few seconds")
     if watch:
         if as_json:
             raise typer.BadParameter("--watch is for people; run `status --json` as often as you like")
         _follow(place, every)
         return
     from tableverse_factory.dataset.doubtful_scales import SCALE_COLUMNS, list_doubtful_scales
-    from tableverse_factory.dataset.journals import WORK
     from tableverse_factory.dataset.judge_summary import JUDGEMENT_COLUMNS, summarize_judgements
     from tableverse_factory.dataset.model_costs import COST_COLUMNS, sum_model_costs
     from tableverse_factory.dataset.provisional import find_cut_scenes
     from tableverse_factory.dataset.trajectory_summary import summarize_trajectories
     from workers.progress.build_state import OUTCOME_COLUMNS, read_build_state
     from workers.state.cost_log import sum_costs
-    from workers.state.lock import LOCK, describe_writer
 
-    if "run.json" not in list_names(place) and (writer := describe_writer(place / WORK / LOCK)):
-        raise BuildError(f"{out}: a build begins there just now, by {writer}: ask again in a few seconds")
     columns = dict.fromkeys((*OUTCOME_COLUMNS, *JUDGEMENT_COLUMNS, *COST_COLUMNS, *SCALE_COLUMNS))
     state = read_build_state(place, [*columns], ["stage", "cpu_s"])
     verdicts, motions = summarize_judgements(state.stored), summarize_trajectories(place, state.published)

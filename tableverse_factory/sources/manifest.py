@@ -1,6 +1,7 @@
 """Image manifest: a row per entry with an id from its content, also for entries that cannot be used."""
 
 import os
+import posixpath
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,6 +35,7 @@ from tableverse_factory.sources.urls.lists import COLUMN_ALIASES, MAX_LICENCE_CH
 
 MAX_SIDECAR_BYTES = 64 * 1024
 _SLUG_CHARS = 40
+_FINE = ("", "")  # of a mesh that is not refused
 _SOURCE_KEYS = [name for name in COLUMN_ALIASES if name != "url"]
 
 
@@ -139,7 +141,7 @@ class _EntryChecker:
         self.known_length = known_length
         self.ignored: Counter[str] = Counter()
         self.digests: dict[str, str] = {}
-        self.refused: dict[str, InputError | None] = {}
+        self.refused: dict[tuple[str, str], tuple[str, str]] = {}
 
     def make_row(self, entry: ManifestEntry, origin: Origin, measure: bool) -> tuple[ImageRow, ImageStats | None]:
         digest, source, licence = "", origin.source, origin.licence
@@ -186,24 +188,25 @@ class _EntryChecker:
         if entry.kind is SceneKind.CAPTURE:
             return read_capture(entry.uri, self.bounds).color
         for mesh in sorted({item.mesh for item in read_layout_file(entry.uri).objects}):
-            uri = resolve_mesh_uri(entry.uri, mesh)
-            if uri not in self.refused:
-                self.refused[uri] = self._try_mesh(entry.uri, mesh)
-            if (error := self.refused[uri]) is not None:
-                raise error
+            # Its pictures may lie no farther up than the layout allows.
+            key = posixpath.dirname(entry.uri), resolve_mesh_uri(entry.uri, mesh)
+            if key not in self.refused:
+                self.refused[key] = self._explain_refusal(entry.uri, mesh)
+            if self.refused[key] != _FINE:
+                raise InputError(*self.refused[key])
         return None
 
-    def _try_mesh(self, layout: str, mesh: str) -> InputError | None:
-        """Read a mesh of a layout with its pictures; returns the error that refuses it, None if it can be read."""
+    def _explain_refusal(self, layout: str, mesh: str) -> tuple[str, str]:
+        """Read a mesh of a layout with its pictures; returns why it is refused and its reason, or `_FINE`."""
         locate = partial(resolve_mesh_uri, layout)
         try:
             data = read_bytes(locate(mesh), self.bounds.max_file_bytes, "missing_mesh")
             read_mesh_with_colors(mesh, data, locate, self.bounds)
         except InputError as error:
-            return error
+            return str(error), error.reason
         except GeometryError as error:
-            return InputError(str(error), "bad_mesh")
-        return None
+            return str(error), "bad_mesh"
+        return _FINE
 
 
 def _make_scene_id(entry: ManifestEntry, digest: str) -> str:

@@ -22,8 +22,8 @@ BOUNDS = ObserveConfig()
 SHEET = {"kind": "a4", "pixels": [[782.7, 1119.6], [1539.2, 891.0], [1289.8, 563.4], [652.6, 716.5]]}
 
 
-def configure(focal_px: float) -> ObserveConfig:
-    return ObserveConfig(focal_px=focal_px)
+def choose(path, focal_px=None, known_length=""):
+    return read_rgb_image(str(path), BOUNDS).choose_focal(focal_px, known_length)
 
 
 EXIF_IFD, MM, MM_35, WIDTH, HEIGHT, PER_UNIT, UNIT = 0x8769, 0x920A, 0xA405, 0xA002, 0xA003, 0xA20E, 0xA210
@@ -159,7 +159,7 @@ def test_a_turned_picture_stands_upright_and_keeps_its_focal_length(tmp_path, or
     path.write_bytes(jpeg(orientation=orientation, mm_35=26))
     photo = read_rgb_image(str(path), BOUNDS)
     assert photo.color.shape == ((300, 400, 3) if orientation < 5 else (400, 300, 3))
-    assert photo.focal_px == pytest.approx(26 * 500 / 43.2666, rel=1e-4)
+    assert photo.exif_px == pytest.approx(26 * 500 / 43.2666, rel=1e-4)
 
 
 def test_a_large_picture_is_made_smaller_and_its_focal_length_with_it(tmp_path):
@@ -167,40 +167,40 @@ def test_a_large_picture_is_made_smaller_and_its_focal_length_with_it(tmp_path):
     path.write_bytes(jpeg(size=(4096, 1024), mm_35=50))
     photo = read_rgb_image(str(path), BOUNDS)
     assert photo.color.shape == (512, MAX_SIDE_PX, 3)
-    assert photo.focal_px == pytest.approx(50 * np.hypot(4096, 1024) / 43.2666 / 2, rel=1e-4)
+    assert photo.exif_px == pytest.approx(50 * np.hypot(4096, 1024) / 43.2666 / 2, rel=1e-4)
     path.write_bytes(jpeg(size=(4096, 1024)))
-    assert read_rgb_image(str(path), configure(3000.0)).focal_px == pytest.approx(1500.0)
+    assert choose(path, 3000.0).px == pytest.approx(1500.0)
 
 
 def test_exif_goes_before_what_is_configured_for_all_and_that_before_the_usual_angle(tmp_path):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg(mm_35=26))
-    photo = read_rgb_image(str(path), configure(1234.0))
-    assert (photo.focal_px, photo.intrinsics_source) == (pytest.approx(300.46, rel=1e-3), "exif")
+    focal = choose(path, 1234.0)
+    assert (focal.px, focal.source) == (pytest.approx(300.46, rel=1e-3), "exif")
     path.write_bytes(jpeg())
-    photo = read_rgb_image(str(path), configure(1234.0))
-    assert (photo.focal_px, photo.intrinsics_source) == (1234.0, "assumed")
+    focal = choose(path, 1234.0)
+    assert (focal.px, focal.source) == (1234.0, "assumed")
 
 
 def test_a_sheet_tells_what_neither_file_nor_configuration_do(tmp_path):
     path, known = tmp_path / "photo.jpg", json.dumps(SHEET)
     path.write_bytes(jpeg(size=(2000, 1500)))
-    told = read_rgb_image(str(path), BOUNDS, known)
-    assert (told.focal_px, told.intrinsics_source) == (pytest.approx(1750.0, rel=0.03), "sheet")
-    assert 0.0 < told.focal_sigma < 0.1
-    assert read_rgb_image(str(path), configure(2000.0), known).intrinsics_source == "assumed"
+    told = choose(path, None, known)
+    assert (told.px, told.source) == (pytest.approx(1750.0, rel=0.03), "sheet")
+    assert 0.0 < told.sigma < 0.1
+    assert choose(path, 2000.0, known).source == "assumed"
     path.write_bytes(jpeg(size=(4000, 3000)))  # read at half of its size
     twice = json.dumps({**SHEET, "pixels": [[2 * x + 0.5, 2 * y + 0.5] for x, y in SHEET["pixels"]]})
-    assert read_rgb_image(str(path), BOUNDS, twice).focal_px == pytest.approx(1.024 * told.focal_px, rel=0.01)
+    assert choose(path, None, twice).px == pytest.approx(1.024 * told.px, rel=0.01)
     path.write_bytes(jpeg(size=(2000, 1500), mm_35=26))
-    assert read_rgb_image(str(path), BOUNDS, known).intrinsics_source == "exif"
+    assert choose(path, None, known).source == "exif"
 
 
 def test_corners_outside_of_the_picture_are_refused(tmp_path):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg())
     with pytest.raises(InputError, match="lies outside: the upright picture has 400 x 300") as caught:
-        read_rgb_image(str(path), BOUNDS, json.dumps(SHEET))
+        choose(path, None, json.dumps(SHEET))
     assert caught.value.reason == "bad_known_length"
 
 
@@ -209,7 +209,7 @@ def test_a_focal_length_that_no_camera_has_is_refused_by_its_name(tmp_path, foca
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg())
     with pytest.raises(InputError, match=r"observe\.focal_px: fx = .* give pixels, for 1° to 160°") as caught:
-        read_rgb_image(str(path), configure(focal_px))
+        choose(path, focal_px)
     assert caught.value.reason == "bad_intrinsics"
 
 
@@ -217,7 +217,7 @@ def test_a_focal_length_that_no_camera_has_is_refused_by_its_name(tmp_path, foca
 def test_without_any_focal_length_the_longer_side_shows_58_degrees(tmp_path, orientation):
     path = tmp_path / "photo.jpg"
     path.write_bytes(jpeg(orientation=orientation))
-    focal_px = read_rgb_image(str(path), BOUNDS).focal_px
+    focal_px = choose(path).px
     assert np.degrees(2 * np.arctan(200.0 / focal_px)) == pytest.approx(58.0)
 
 

@@ -70,7 +70,7 @@ def connect(address: str | None) -> None:
     except Exception as error:  # Ray raises a plain one where a node does not start in time
         where, remedy = f"the Ray cluster at {redact_uri(address or '')} cannot be reached", ""
         if not address:
-            where, remedy = "Ray does not start on this machine", "; is its disk full? --executor local does without"
+            where, remedy = "Ray does not start on this machine", "; --executor local does without it"
         raise BuildError(f"{where}: {describe_loss(error)}{remedy}") from error
 
 

@@ -17,7 +17,7 @@ from schemas.trajectories import Numbers
 from tableverse_factory.core.errors import ConfigError, InputError
 from tableverse_factory.core.text import sanitize_line
 from tableverse_factory.dataset.dataset import Scene
-from tableverse_factory.dataset.scene_meta import read_object_phrases
+from tableverse_factory.dataset.scene_meta import read_object_names, read_object_phrases
 from tableverse_factory.delivery.episodes.instructions import read_instruction, write_instruction
 from tableverse_factory.delivery.episodes.observation import order_objects
 from tableverse_factory.delivery.episodes.subtasks import SUBTASKS, estimate_phase
@@ -211,9 +211,9 @@ def _compute_box(mesh: TriangleMesh) -> tuple[Vector3, Vector3]:
 def _check_task(scene: Scene, task: Mapping[str, Any]) -> None:
     """Refuse a task of one's own with a misspelt key, an unknown object, or an instruction that is no text."""
     for key in sorted(str(key) for key in task.keys() - TASK_KEYS):
-        if close := get_close_matches(key, TASK_KEYS, n=1, cutoff=0.8):
+        if close := get_close_matches(key.casefold(), TASK_KEYS, n=1, cutoff=0.7):
             raise InputError(f"task: {sanitize_line(key, 60)!r} is no key: did you mean {close[0]}?", "bad_task")
-    known = [str(item["object_id"]) for item in scene.meta.get("objects", ())]
+    known = [*read_object_names(scene.meta)]
     for key in ("x_id", "y_id"):
         if known and task.get(key) not in known:
             given, there = sanitize_line(repr(task.get(key)), 60), sanitize_line(", ".join(known[:10]), 200)

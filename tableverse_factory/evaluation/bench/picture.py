@@ -148,7 +148,9 @@ def score_picture(
     depth = resize_nearest(found.observation.depth, sensor.depth.shape)
     error, log_scale = compare_depth(depth, sensor.depth, wanted)
     if with_sheet:
-        measured = _compare_with_sheet(color, config, mark_sheet(truth, config.run.seed), sensor, wanted)
+        measured = _compare_with_sheet(
+            color, config, mark_sheet(truth, make_rng(config.run.seed, capture.name, "sheet")), sensor, wanted
+        )
     else:
         measured = compare_measured_depth(found.observation, sensor, wanted)
     plane = measure_angle_deg(get_table_normal(found), get_table_normal(truth))

@@ -76,12 +76,25 @@ def _read_paints(meshes: Sequence[trimesh.Trimesh], max_pixels: int) -> list[_Pa
     for some, count, most in (("a texture", max(pixels, default=0), 1), ("all textures", sum(pixels), MOST_PICTURES)):
         if count > most * max_pixels:
             raise GeometryError(f"{some} of {count} pixels; at most {most * max_pixels} are decoded")
-    tinted = {
-        (digests[id(m)], repr(getattr(m.visual.material, "baseColorFactor", None))) for m in meshes if id(m) in images
-    }
-    side = min(MAX_SIDE, max(1, MAX_SHEET // max(1, math.ceil(math.sqrt(len(tinted))))))
+    sizes = {}  # of a picture once for each tint
+    for mesh in meshes:
+        if (image := images.get(id(mesh))) is not None:
+            sizes[f"{digests[id(mesh)]} {getattr(mesh.visual.material, 'baseColorFactor', None)}"] = image.size[::-1]
+    side = _choose_side(sizes)
     pictures = {digest: _shrink(image.convert("RGB"), side) for digest, image in distinct.items()}
     return [_read_paint(mesh, pictures.get(digests.get(id(mesh), ""))) for mesh in meshes]
+
+
+def _choose_side(sizes: Mapping[str, tuple[int, int]]) -> int:
+    """Choose the longest side to which pictures of these heights and widths are reduced, so that all fit."""
+    side = MAX_SIDE
+    while side > 1:
+        shares = {key: min(1.0, side / max(size)) for key, size in sizes.items()}
+        reduced = {k: (math.ceil(h * shares[k]), math.ceil(w * shares[k])) for k, (h, w) in sizes.items()}
+        if not reduced or _arrange_pictures(reduced)[1].max() <= MAX_SHEET:
+            break
+        side = side * 15 // 16
+    return side
 
 
 def _hash_picture(image: Image.Image) -> str:
@@ -156,7 +169,7 @@ def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | Non
     ]
     keys = [content_hash(repr(picture.shape).encode(), picture.tobytes()) for picture in pictures]
     unique = dict(zip(keys, pictures, strict=True))
-    places, sheet_size = _arrange_pictures(unique)
+    places, sheet_size = _arrange_pictures({key: picture.shape[:2] for key, picture in unique.items()})
     sheet = np.zeros((sheet_size[1], sheet_size[0], 3), dtype=np.uint8)
     corners = []
     for part, paint, picture, key in zip(parts, paints, pictures, keys, strict=True):
@@ -171,14 +184,14 @@ def _merge_textures(parts: Sequence[MaterialPart], paints: Sequence[_Paint | Non
     return Texture(sheet, np.concatenate(corners))
 
 
-def _arrange_pictures(pictures: Mapping[str, Picture]) -> tuple[dict[str, tuple[int, int]], np.ndarray]:
-    """Arrange pictures in rows, the highest first; returns the left upper pixel of each, and width and height.
+def _arrange_pictures(sizes: Mapping[str, tuple[int, int]]) -> tuple[dict[str, tuple[int, int]], np.ndarray]:
+    """Arrange pictures of these heights and widths in rows, the highest first, no wider than the sheet.
 
-    Of n pictures that are no plain colours there are as many rows as columns at most.
+    Returns the left upper pixel of each, and width and height.
     """
-    sizes = {key: picture.shape[:2] for key, picture in pictures.items()}
-    columns = math.ceil(math.sqrt(sum(size != (1, 1) for size in sizes.values())))
-    across = max(1, columns) * max(width for _, width in sizes.values())
+    widest, area = max(width for _, width in sizes.values()), sum(height * width for height, width in sizes.values())
+    square = max(widest, math.ceil(math.sqrt(area)))
+    across = min(-(-square // widest) * widest, max(widest, MAX_SHEET))
     places, left, top, right, bottom = {}, 0, 0, 0, 0
     for key, (height, width) in sorted(sizes.items(), key=lambda each: (-each[1][0], -each[1][1])):
         if left + width > across:

@@ -63,6 +63,7 @@ def test_a_task_of_ones_own_is_worded_as_those_of_the_factory(scene):
     ("change", "said"),
     [
         ({"instrution": "Tidy up"}, "'instrution' is no key: did you mean instruction"),
+        ({"X_Id": "obj_000"}, "'X_Id' is no key: did you mean x_id"),
         ({"x_id": "obj_999"}, "x_id 'obj_999' is no object of s-0; there are obj_000, obj_001"),
         ({"y_id": "table"}, "y_id 'table' is no object"),
         ({"y_id": None}, "y_id None is no object"),

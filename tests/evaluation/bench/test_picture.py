@@ -187,7 +187,7 @@ def test_a_sheet_is_marked_where_nothing_stands_and_as_large_as_it_is(tmp_path: 
     seen, _ = look([thing])
     truth = perceive(seen, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(truth, Done), truth
-    known = mark_sheet(truth.value, seed=0)
+    known = mark_sheet(truth.value, np.random.default_rng(0))
     assert known is not None
     camera, pose = seen.camera, truth.value.camera_to_table
     offsets = (np.array(known.pixels) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
@@ -203,4 +203,4 @@ def test_a_small_table_has_no_room_for_a_sheet(tmp_path: Path) -> None:
     seen, _ = look([Box(0.0, 0.0, (0.08, 0.08, 0.1))], table_half=(0.14, 0.1))
     truth = perceive(seen, GEOMETRIC, np.random.default_rng(0), Services(tmp_path))
     assert isinstance(truth, Done), truth
-    assert mark_sheet(truth.value, seed=0) is None
+    assert mark_sheet(truth.value, np.random.default_rng(0)) is None

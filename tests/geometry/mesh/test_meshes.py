@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import struct
 
 import numpy as np
@@ -16,6 +17,7 @@ from tableverse_factory.core.errors import GeometryError
 from tableverse_factory.geometry.math.aabb import aabb
 from tableverse_factory.geometry.math.transforms import quaternion_about_z
 from tableverse_factory.geometry.mesh.mass_integrals import compute_signed_volume
+from tableverse_factory.geometry.mesh.mesh_colors import MAX_SHEET, MAX_SIDE, _arrange_pictures, _choose_side
 from tableverse_factory.geometry.mesh.meshes import (
     MAX_FACES,
     box_center,
@@ -217,26 +219,45 @@ def paint_many(count: int, side: int, plain: int = 0) -> bytes:
     return scene.export(file_type="glb")
 
 
+def read_colors(mesh: TriangleMesh) -> np.ndarray:
+    """The red of the picture in the middle of each face, in the order of the squares."""
+    assert mesh.texture is not None
+    height, width = mesh.texture.picture.shape[:2]
+    middles = mesh.texture.corner_uv.mean(axis=1)
+    columns, rows = np.int64(middles[:, 0] * width), np.int64((1.0 - middles[:, 1]) * height)
+    order = np.argsort(mesh.vertices[mesh.faces][:, :, 0].min(axis=1))
+    return mesh.texture.picture[rows, columns, 0].astype(int)[order]
+
+
 @pytest.mark.parametrize("plain", [0, 2])
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 13, 20])
 def test_many_pictures_fit_into_one_sheet_and_stay_sharp(count, plain):
     mesh = read_mesh(paint_many(count, 512, plain), "many.glb")
     assert mesh.texture is not None
     height, width = mesh.texture.picture.shape[:2]
-    assert max(height, width - plain) <= 512 * int(np.ceil(np.sqrt(count))) + min(plain, 1)
+    assert max(height, width) <= 4096
     assert height * width >= count * 512 * 512  # none was reduced
-    middles = mesh.texture.corner_uv.mean(axis=1)
-    columns, rows = np.int64(middles[:, 0] * width), np.int64((1.0 - middles[:, 1]) * height)
-    own = np.int64(mesh.vertices[mesh.faces][:, :, 0].min(axis=1) + 1e-6)
-    painted = own < count
-    shown = mesh.texture.picture[rows, columns, 0].astype(int)
-    assert np.abs(shown - 9 * own)[painted].max() <= 1
+    given = 9 * np.arange(count + plain) / 255.0
+    linear = np.where(given <= 0.0031308, 12.92 * given, 1.055 * given ** (1 / 2.4) - 0.055)  # as glTF gives a factor
+    wanted = 255.0 * np.where(np.arange(count + plain) < count, given, linear)
+    assert np.abs(read_colors(mesh) - wanted).max() <= 1
 
 
-def test_pictures_larger_than_the_sheet_together_are_reduced_alike():
-    mesh = read_mesh(paint_many(5, 1600, plain=1), "many.glb")
-    assert mesh.texture is not None
-    assert 4000 <= max(mesh.texture.picture.shape[:2]) <= 4097
+def test_a_large_picture_beside_small_ones_keeps_its_size():
+    sizes = {"large": (2048, 2048), **{f"small {k}": (64, 64) for k in range(100)}}
+    assert _choose_side(sizes) == MAX_SIDE
+
+
+@pytest.mark.parametrize("count", range(1, 26))
+def test_pictures_of_any_number_fit_into_the_sheet(count):
+    sizes = {str(k): (2048, 2048) for k in range(count)}
+    side = _choose_side(sizes)
+    assert _arrange_pictures(dict.fromkeys(sizes, (side, side)))[1].max() <= MAX_SHEET
+    assert side >= 0.9 * min(MAX_SIDE, MAX_SHEET // math.ceil(math.sqrt(count)))
+
+
+def test_plain_colours_alone_make_a_square():
+    assert _arrange_pictures({str(k): (1, 1) for k in range(5000)})[1].max() <= 71
 
 
 def test_materials_of_one_file_have_its_picture_once(tmp_path):

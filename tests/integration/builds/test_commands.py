@@ -46,9 +46,10 @@ def test_status_names_the_build_that_runs_and_gives_no_advice_for_a_second_one(r
     assert "wait for it" not in text
 
 
-def test_status_of_a_build_that_has_just_begun_says_so(run, tmp_path):
+@pytest.mark.parametrize("option", [(), ("--watch",), ("--json",)])
+def test_status_of_a_build_that_has_just_begun_says_so(run, tmp_path, option):
     with create_writer_lock(tmp_path / "out" / ".work" / "lock"):
-        code, _, errors = run("status", tmp_path / "out")
+        code, _, errors = run("status", tmp_path / "out", *option)
     assert code == 1
     assert f"a build begins there just now, by process {os.getpid()}" in errors
 

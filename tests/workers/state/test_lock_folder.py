@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from tableverse_factory.core.errors import BuildError
-from workers.state import lock
+from workers.state import lock as lock_module
 from workers.state.lock import FileLock, describe_writer
 from workers.state.lock_owner import LockOwner, encode_owner
 
@@ -42,7 +42,7 @@ def test_a_look_at_the_lock_refuses_no_build(tmp_path, monkeypatch):
     looking = os.open(path, os.O_RDWR)
     fcntl.flock(looking, fcntl.LOCK_SH)  # as `describe_writer` does, until the build waits for it
     waiting = SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: os.close(looking))
-    monkeypatch.setattr(lock, "time", waiting)
+    monkeypatch.setattr(lock_module, "time", waiting)
     with FileLock(path):
         assert describe_writer(path) == f"process {os.getpid()} on {platform.node()}"
 
@@ -60,9 +60,7 @@ def test_a_lock_that_cannot_be_written_is_not_held(tmp_path):
     script = f"""
 import resource, signal
 from pathlib import Path
-from types import SimpleNamespace
 from tableverse_factory.core.errors import BuildError
-from workers.state import lock
 from workers.state.lock import FileLock
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -86,9 +84,7 @@ def test_commands_that_end_and_begin_at_once_are_refused_by_name_alone(tmp_path)
     script = f"""
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from tableverse_factory.core.errors import BuildError
-from workers.state import lock
 from workers.state.lock import FileLock
 until = time.monotonic() + 2.0
 while time.monotonic() < until:

@@ -24,13 +24,14 @@ SIDE_PX = 518  # side to which the model's own processor scales
 
 
 def estimate_depth_anything_2(item: ImageRow, config: Config) -> Capture:
-    """Estimate metric depth; the focal length comes as `RgbImage` tells it."""
-    photo = read_rgb_image(item.uri, config.observe, item.known_length)
+    """Estimate metric depth; the focal length comes as `RgbImage.choose_focal` tells it."""
+    photo = read_rgb_image(item.uri, config.observe)
+    focal = photo.choose_focal(config.observe.focal_px, item.known_length)
     depth = predict_metric_depth(
         photo.color, config.observe.depth_weights or DEFAULT_WEIGHTS[NAME], select_device(config.models)
     )
-    camera = create_centered_camera(photo.focal_px, photo.color.shape, depth.shape)
-    estimate = DepthEstimate(depth, camera, intrinsics_source=photo.intrinsics_source)
+    camera = create_centered_camera(focal.px, photo.color.shape, depth.shape)
+    estimate = DepthEstimate(depth, camera, intrinsics_source=focal.source)
     return build_capture(photo.color, estimate, config.observe)
 
 

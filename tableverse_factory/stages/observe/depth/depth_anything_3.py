@@ -39,13 +39,14 @@ _Map = Float[np.ndarray, "h w"]
 
 
 def estimate_depth_anything_3(item: ImageRow, config: Config) -> Capture:
-    """Estimate depth with the metric model (Apache-2.0); the focal length is as `RgbImage` tells it."""
-    photo = read_rgb_image(item.uri, config.observe, item.known_length)
+    """Estimate depth with the metric model (Apache-2.0); the focal length is as `RgbImage.choose_focal` tells it."""
+    photo = read_rgb_image(item.uri, config.observe)
+    focal = photo.choose_focal(config.observe.focal_px, item.known_length)
     depth, sky, confidence, _ = _predict_maps(photo.color, config, "depth_anything_3")
     if depth is None:
         raise AnswerInvalidError("Depth Anything 3 gave no depth", "depth_answer_invalid")
-    estimate = scale_to_metres(depth, sky, confidence, photo.focal_px, photo.color.shape)
-    estimate = replace(estimate, intrinsics_source=photo.intrinsics_source)
+    estimate = scale_to_metres(depth, sky, confidence, focal.px, photo.color.shape)
+    estimate = replace(estimate, intrinsics_source=focal.source)
     return build_capture(photo.color, estimate, config.observe)
 
 

@@ -31,15 +31,16 @@ def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
     Raises:
         AnswerInvalidError: reasons `no_table`, `table_out_of_bounds`.
     """
-    bounds, photo = config.observe, read_rgb_image(item.uri, config.observe, item.known_length)
-    tried = [_predict(photo, photo.focal_px, bounds)]
-    if photo.is_guessed and UNSURE_PROBABILITY <= tried[0][1].table_probability < bounds.min_table_probability:
+    bounds, photo = config.observe, read_rgb_image(item.uri, config.observe)
+    focal = photo.choose_focal(bounds.focal_px, item.known_length)
+    tried = [_predict(photo, focal.px, bounds)]
+    if focal.is_guessed and UNSURE_PROBABILITY <= tried[0][1].table_probability < bounds.min_table_probability:
         tried += [_predict(photo, photo.get_field_px(field), bounds) for field in NARROWER_FIELDS_DEG]
     camera, found = max(tried, key=lambda each: each[1].table_probability)
-    source = photo.intrinsics_source if camera is tried[0][0] else "model"
+    source = focal.source if camera is tried[0][0] else "model"
     check_table(found, bounds)
     capture = build_capture(photo.color, DepthEstimate(found.depth, found.camera, intrinsics_source=source), bounds)
-    sigma = math.hypot(SIGMA_FACTOR * found.scale_sigma, photo.focal_sigma)  # the scale grows with the focal length
+    sigma = math.hypot(SIGMA_FACTOR * found.scale_sigma, focal.sigma)  # the scale grows with the focal length
     return replace(capture, camera=camera, scale_sigma=sigma)
 
 

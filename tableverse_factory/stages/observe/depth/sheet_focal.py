@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from schemas.known_length import Pixel, get_pixel_std
 
-MAX_COST = 25.0  # sum of squared deviations of corners that make a sheet: it has two degrees of freedom
+CENTER_STD = 0.03  # standard deviation of the principal point from the middle of a picture, in longer sides
+MAX_COST = 10.0  # of corners that make a sheet; 1 % of true ones have 9.2 and more, with two degrees of freedom
 MIN_ADVANTAGE = 9.0  # by which the other side must fit worse as the longer one, else nobody knows which it is
 MAX_SIGMA = 0.75  # of what is known without the sheet: one that is small, or seen from straight above, tells nothing
 
@@ -29,28 +30,34 @@ def estimate_sheet_focal(
 ) -> SheetFocal | None:
     """Estimate the focal length with which the corners of a sheet span its sides; None where they do not tell.
 
-    The corners lie in a picture of `size` (width, height), whose principal point is central, and are off by
-    `get_pixel_std`; `usual` is what is known without them. The most probable pose and focal length explain both.
+    The corners lie in a picture of `size` (width, height), and are off by `get_pixel_std`; `usual` is what is known
+    without them. The most probable pose, focal length and principal point explain both.
     """
-    std = get_pixel_std(size)
+    std, center_std = get_pixel_std(size) / usual.px, CENTER_STD * max(size) / usual.px
     corners = (np.array(pixels) - (np.array(size) - 1) / 2) / usual.px
-    fits = [_fit(corners, sides, std / usual.px, usual.sigma) for sides in (sides_m, sides_m[::-1])]
+    prior = np.array([usual.sigma, center_std, center_std])
+    fits = [_fit(corners, sides, std, prior) for sides in (sides_m, sides_m[::-1])]
     (log_ratio, sigma, cost), (*_, other) = sorted(fits, key=lambda fit: fit[2])
     if cost > MAX_COST or other < cost + MIN_ADVANTAGE or not sigma <= MAX_SIGMA * usual.sigma:
         return None
     return SheetFocal(usual.px * float(np.exp(log_ratio)), sigma)
 
 
-def _fit(corners: Corners, sides_m: tuple[float, float], std: float, prior: float) -> tuple[float, float, float]:
-    """Fit the logarithm of the focal length, in usual ones; returns it, its standard deviation and the cost."""
+def _fit(
+    corners: Corners, sides_m: tuple[float, float], std: float, prior: Float64[np.ndarray, "3"]
+) -> tuple[float, float, float]:
+    """Fit the logarithm of the focal length, in usual ones; returns it, its standard deviation and the cost.
+
+    `prior` holds the deviations of that logarithm and of the principal point, `std` that of the corners.
+    """
     sheet = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2 * [*sides_m, 0.0]
 
-    def deviate(state: Float64[np.ndarray, "7"]) -> Float64[np.ndarray, "9"]:
-        points = Rotation.from_rotvec(state[1:4]).apply(sheet) + state[4:]
-        seen = np.exp(state[0]) * points[:, :2] / points[:, 2:]
-        return np.append((seen - corners).ravel() / std, state[0] / prior)
+    def deviate(state: Float64[np.ndarray, "9"]) -> Float64[np.ndarray, "11"]:
+        points = Rotation.from_rotvec(state[3:6]).apply(sheet) + state[6:]
+        seen = np.exp(state[0]) * points[:, :2] / points[:, 2:] + state[1:3]
+        return np.append((seen - corners).ravel() / std, state[:3] / prior)
 
-    found = least_squares(deviate, np.append(0.0, _find_pose(corners, sheet)))
+    found = least_squares(deviate, np.append(np.zeros(3), _find_pose(corners, sheet)))
     covariance = np.linalg.pinv(found.jac.T @ found.jac)
     return float(found.x[0]), float(np.sqrt(covariance[0, 0])), 2.0 * float(found.cost)
 
