@@ -18,6 +18,7 @@ from tableverse_factory.core.storage.files import redact_uri
 from workers.executors.ray_address import parse_host_port
 from workers.sandbox.error_text import sanitize_error_text
 
+_NO_RAY = (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError)
 OBJECT_STORE_BYTES = 1024**3
 CONNECT_TIMEOUT_S = 10.0
 
@@ -67,7 +68,10 @@ def connect(address: str | None) -> None:
             log_to_driver=False,
             **({} if address else local),
         )
-    except Exception as error:  # Ray raises a plain one where a node does not start in time
+    except Exception as error:
+        # A plain one is that of a node that does not start in time; of other types, what is none of Ray's is ours.
+        if not isinstance(error, _NO_RAY) and type(error) is not Exception:
+            raise
         where, remedy = f"the Ray cluster at {redact_uri(address or '')} cannot be reached", ""
         if not address:
             where, remedy = "Ray does not start on this machine", "; --executor local does without it"

@@ -8,6 +8,7 @@ from schemas.known_length import SHEET_SIZES_M, KnownSheet, get_pixel_std
 from schemas.objects import PerceivedObjects
 from tableverse_factory.geometry.math.camera import project
 from tableverse_factory.geometry.math.transforms import invert_pose, quaternion_about_z, transform_points
+from tableverse_factory.stages.observe.depth.sheet_focal import make_sheet
 
 STEP_M = 0.05  # between the places that are tried
 HEADINGS_DEG = (0.0, 35.0, 70.0, 105.0, 140.0)
@@ -22,7 +23,7 @@ def mark_sheet(truth: PerceivedObjects, rng: np.random.Generator) -> KnownSheet 
     The table and the camera are those of the sensor; the corners are off by `get_pixel_std`.
     """
     table, camera, to_camera = truth.table, truth.observation.camera, invert_pose(truth.camera_to_table)
-    sheet = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2 * [*SHEET_SIZES_M["a4"], 0.0]
+    sheet = make_sheet(SHEET_SIZES_M["a4"])
     reach = np.arange(-float(table.half_size_xy.max()), float(table.half_size_xy.max()) + STEP_M, STEP_M)
     places = sorted(((x, y) for x in reach for y in reach), key=lambda place: (np.hypot(*place), place))
     for x, y in places:

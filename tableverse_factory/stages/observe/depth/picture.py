@@ -23,7 +23,7 @@ UNSURE_PROBABILITY = 0.5  # from which a picture gets these looks, which cost as
 
 
 def estimate_picture_depth(item: ImageRow, config: Config) -> Capture:
-    """Estimate depth; the focal length is as `RgbImage` tells it.
+    """Estimate depth; the focal length is as `RgbImage.choose_focal` tells it.
 
     Where it is a guess, and the net is unsure of the table, narrower fields of view are tried, and the one with which
     it is surest is taken: a wrong field distorts what it sees.

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -10,29 +9,15 @@ from PIL import Image
 from schemas.config import ObserveConfig
 from schemas.geometry import Camera, Frozen, Picture
 from schemas.known_length import KnownSheet
-from schemas.observation import IntrinsicsSource
 from tableverse_factory.core.storage.untrusted import open_image, read_bytes
 from tableverse_factory.sources.focal import check_field_of_view, read_exif_focal
 from tableverse_factory.sources.image_file import decode_upright
 from tableverse_factory.sources.known_length import check_pixels, read_known_length, rescale_pixels
-from tableverse_factory.stages.observe.depth.sheet_focal import SheetFocal, estimate_sheet_focal
+from tableverse_factory.stages.observe.depth.sheet_focal import Focal, estimate_sheet_focal
 
 MAX_SIDE_PX = 2048  # larger pictures are resized: depth models see 500 pixels, and later stages pay for the rest
 USUAL_FIELD_DEG = 58.0  # angle over the longer side where nothing tells it: between phones and web cameras
 FOCAL_SIGMA = 0.2  # standard deviation of the logarithm of a focal length that nothing tells
-
-
-class Focal(NamedTuple):
-    """A focal length [px], the standard deviation of its logarithm, 0 where it is told, and where it comes from."""
-
-    px: float
-    sigma: float
-    source: IntrinsicsSource
-
-    @property
-    def is_guessed(self) -> bool:
-        """Whether nothing tells it."""
-        return self.source == "assumed" and self.sigma > 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,14 +45,13 @@ class RgbImage(Frozen):
             centered = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
             check_field_of_view(centered, "observe.focal_px")
             return Focal(focal, 0.0, "assumed")
-        usual = SheetFocal(self.get_field_px(USUAL_FIELD_DEG), FOCAL_SIGMA)
+        usual = Focal(self.get_field_px(USUAL_FIELD_DEG), FOCAL_SIGMA, "assumed")
         known = read_known_length(known_length, "known_length") if known_length else None
         if isinstance(known, KnownSheet):
             check_pixels(known, *self.file_size)
             pixels = rescale_pixels(known, self.file_size, (width, height)).pixels
-            if (told := estimate_sheet_focal(pixels, known.size_m, (width, height), usual)) is not None:
-                return Focal(*told, "sheet")
-        return Focal(*usual, "assumed")
+            return estimate_sheet_focal(pixels, known.size_m, (width, height), usual) or usual
+        return usual
 
     def get_field_px(self, field_deg: float) -> float:
         """Return the focal length for `color` [px] with which its longer side spans an angle."""

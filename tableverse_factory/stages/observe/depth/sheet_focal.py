@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from schemas.known_length import Pixel, get_pixel_std
+from schemas.observation import IntrinsicsSource
 
 CENTER_STD = 0.03  # standard deviation of the principal point from the middle of a picture, in longer sides
 MAX_COST = 10.0  # of corners that make a sheet; 1 % of true ones have 9.2 and more, with two degrees of freedom
@@ -18,16 +19,27 @@ MAX_SIGMA = 0.75  # of what is known without the sheet: one that is small, or se
 Corners = Float64[np.ndarray, "4 2"]
 
 
-class SheetFocal(NamedTuple):
-    """A focal length [px], and the standard deviation of its logarithm."""
+class Focal(NamedTuple):
+    """A focal length [px], the standard deviation of its logarithm, 0 where it is told, and where it comes from."""
 
     px: float
     sigma: float
+    source: IntrinsicsSource
+
+    @property
+    def is_guessed(self) -> bool:
+        """Whether nothing tells it."""
+        return self.source == "assumed" and self.sigma > 0.0
+
+
+def make_sheet(sides_m: tuple[float, float]) -> Float64[np.ndarray, "4 3"]:
+    """Make the corners of a sheet about its middle, once around, at z = 0 [m]."""
+    return np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2 * [*sides_m, 0.0]
 
 
 def estimate_sheet_focal(
-    pixels: Sequence[Pixel], sides_m: tuple[float, float], size: tuple[int, int], usual: SheetFocal
-) -> SheetFocal | None:
+    pixels: Sequence[Pixel], sides_m: tuple[float, float], size: tuple[int, int], usual: Focal
+) -> Focal | None:
     """Estimate the focal length with which the corners of a sheet span its sides; None where they do not tell.
 
     The corners lie in a picture of `size` (width, height), and are off by `get_pixel_std`; `usual` is what is known
@@ -40,7 +52,7 @@ def estimate_sheet_focal(
     (log_ratio, sigma, cost), (*_, other) = sorted(fits, key=lambda fit: fit[2])
     if cost > MAX_COST or other < cost + MIN_ADVANTAGE or not sigma <= MAX_SIGMA * usual.sigma:
         return None
-    return SheetFocal(usual.px * float(np.exp(log_ratio)), sigma)
+    return Focal(usual.px * float(np.exp(log_ratio)), sigma, "sheet")
 
 
 def _fit(
@@ -50,7 +62,7 @@ def _fit(
 
     `prior` holds the deviations of that logarithm and of the principal point, `std` that of the corners.
     """
-    sheet = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) / 2 * [*sides_m, 0.0]
+    sheet = make_sheet(sides_m)
 
     def deviate(state: Float64[np.ndarray, "9"]) -> Float64[np.ndarray, "11"]:
         points = Rotation.from_rotvec(state[3:6]).apply(sheet) + state[6:]

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from schemas.known_length import SHEET_SIZES_M
-from tableverse_factory.stages.observe.depth.sheet_focal import SheetFocal, estimate_sheet_focal
+from tableverse_factory.stages.observe.depth.sheet_focal import Focal, estimate_sheet_focal
 
 SIZE = (640, 480)
-USUAL = SheetFocal(577.0, 0.2)
+USUAL = Focal(577.0, 0.2, "assumed")
 
 
 def see_sheet(sides_m, focal_px, pitch_deg, heading_deg=20.0, noise_px=0.0, seed=0, distance_m=0.7):
